@@ -24,7 +24,7 @@ from mcaptrack.sources.foreign import MessageType, picture_decoder
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video.decode import RAW_ENCODINGS, PixelLayout, raw_bgr, raw_with
-from mcaptrack.viewing.blur.mosaic import hide
+from mcaptrack.viewing.blur.people import hide
 from mcaptrack.viewing.blur.recording import picture_replacer
 from tests.commands import call, printed
 from tests.logs import add_rows

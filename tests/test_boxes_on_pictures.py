@@ -21,7 +21,7 @@ from mcaptrack.foxglove import class_colour
 from mcaptrack.foxglove.views import Drawing, MovingCamera
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.pinhole import Lens
-from mcaptrack.pipeline.write import Made, write
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing.blur.people import outlines
@@ -189,7 +189,7 @@ def with_tracks(path: Path, frames: list[Frame] | None = None) -> tuple[dict[str
     frames = frames or [Frame(ns(10 + n / 10), n, rows((7, 3, 14.0 + n, 2.0, 0.0))) for n in range(PICTURES)]
     made = {"/lidar/retracks": Made.of(TRACKS, frames, Provenance("retrack", {}, frame_id="map"))}
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as warned:
-        layouts = write(opened, "/lidar", made, (), {}, None)
+        layouts = write(RunState(opened, "/lidar", made), (), {}, None)
     return layouts, [one.message for one in warned]
 
 

@@ -19,7 +19,7 @@ from mcaptrack.geometry.ground_correction import MODELS, Corrector, Feet, moved,
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.refining import Refined, Refiner, Watched
+from mcaptrack.pipeline.calibrating import Refined, Refiner, Watched
 from mcaptrack.schema import GROUND_PLANE
 from mcaptrack.schema.encodings import PROTOBUF, record_of
 from mcaptrack.sources.cameras import camera_at

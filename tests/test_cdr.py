@@ -15,8 +15,20 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaptrack.schema import COUNTS, DETECTIONS, EVENTS, SCHEMAS, TRACKS, Frame, Rows, Schema
-from mcaptrack.schema.cdr import CdrCodec, RosField, is_ros_topic, read_definition, ros_name, schema_of_ros
-from mcaptrack.schema.encodings import CDR, cdr_codec, encoded, reader_of, record_of, schema_name_of
+from mcaptrack.schema.encodings import (
+    CDR,
+    CdrCodec,
+    RosField,
+    cdr_codec,
+    encoded,
+    is_ros_topic,
+    read_definition,
+    reader_of,
+    record_of,
+    ros_name,
+    schema_name_of,
+    schema_of_ros,
+)
 
 EVERY = pytest.mark.parametrize("schema", SCHEMAS.values(), ids=lambda schema: schema.name)
 

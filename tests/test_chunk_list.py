@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack import log
-from mcaptrack.log.chunk_list import ChunkList
+from mcaptrack.log.index import ChunkList
 from mcaptrack.log.records import ChunkIndexRecord
 
 NUMBERS = st.integers(0, 2**64 - 1)

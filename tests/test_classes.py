@@ -17,7 +17,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
 from mcaptrack.transforms.retrack.offline import settle_classes
-from tests.worlds import assert_same_rows, noisy_tracks, ns
+from tests.worlds import assert_same_rows, noisy_tracks, ns, table_to_frames
 
 TRACKERS = {"sort": Sort(), "metres apart": Sort(cost="pixels"), "bytetrack": ByteTrack(), "ocsort": OcSort()}
 every_tracker = pytest.mark.parametrize("tracker", TRACKERS.values(), ids=TRACKERS)
@@ -330,12 +330,12 @@ def test_classes_of_detections_are_given_by_name():
 def test_tables_without_a_class_column_are_read_as_before(tmp_path):
     rows = TRACKS.rows(track_id=[1], x_m=[1.0], y_m=[2.0], observed=[True], source_id=[-1], class_id=[3])
     frames = [Frame(1, 0, rows)]
-    new = tables.rows_table(TRACKS, {"/a": frames}, {"/a": {3: "cart"}})
+    new = tables.rows_in_pieces(TRACKS, {"/a": frames}, {"/a": {3: "cart"}}).table()
     old = new.drop_columns(["class_id", "class"])
     assert new.to_pylist()[0]["class"] == "cart"
     places = tables.frames_table({"/a": tables.Pointers("f", *(np.array([n]) for n in (1, 0, 1, 0, 0)))})
-    assert tables.table_to_frames(TRACKS, old, places, "/a")[0].rows["class_id"].tolist() == [0]
-    assert tables.table_to_frames(TRACKS, new, places, "/a")[0].rows["class_id"].tolist() == [3]
+    assert table_to_frames(TRACKS, old, places, "/a")[0].rows["class_id"].tolist() == [0]
+    assert table_to_frames(TRACKS, new, places, "/a")[0].rows["class_id"].tolist() == [3]
 
 
 def test_names_that_cant_be_are_refused(tmp_path):

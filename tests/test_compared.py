@@ -87,21 +87,21 @@ def test_exported_tables_are_scored(tmp_path):
     truth = [Frame(ns(n / 10), n, boxed({1: (10 + n, 10)})) for n in range(10)]
     tracks = [Frame(ns(n / 10), n, boxed({7: (11 + n, 10)})) for n in range(10)]
     path = tmp_path / "part-0.parquet"
-    tables.write(path, tables.rows_table(TRACKS, {"/camera/truth": truth, "/camera/tracks": tracks}), {})
+    tables.write(path, tables.rows_in_pieces(TRACKS, {"/camera/truth": truth, "/camera/tracks": tracks}).table(), {})
     row, _ = scores(path, path)
     assert (row["MOTA"], row["GT"]) == (1.0, 1)
     gt = write(tmp_path / "gt.txt", *((n + 1, 1, 10 + n, 10, 10, 20, 1, -1, -1, -1) for n in range(10)))
     row, _ = scores(path, gt)  # a table counts frames from 0, MOTChallenge from 1
     assert row["MOTA"] == 1.0
     more = {"/camera/tracks": tracks, "/camera/samples": tracks[::4]}
-    tables.write(path, tables.rows_table(TRACKS, more), {})
+    tables.write(path, tables.rows_in_pieces(TRACKS, more).table(), {})
     with pytest.raises(McaptrackError, match=r"holds /camera/samples, /camera/tracks; choose one with `topic=`"):
         scores(path, gt)
     assert scores(path, gt, topics=("/camera/tracks",))[0]["MOTA"] == 1.0
     alone = tmp_path / "alone.parquet"  # ground truth may have any name where it is all there is
-    tables.write(alone, tables.rows_table(TRACKS, {"/lidar/people": truth}), {})
+    tables.write(alone, tables.rows_in_pieces(TRACKS, {"/lidar/people": truth}).table(), {})
     assert scores(path, alone, topics=("/camera/tracks",))[0]["MOTA"] == 1.0
-    tables.write(alone, tables.rows_table(TRACKS, {"/lidar/people": truth, "/lidar/dogs": truth}), {})
+    tables.write(alone, tables.rows_in_pieces(TRACKS, {"/lidar/people": truth, "/lidar/dogs": truth}).table(), {})
     with pytest.raises(McaptrackError, match="holds /lidar/dogs, /lidar/people; none of them is truth"):
         scores(path, alone, topics=("/camera/tracks",))
     (tmp_path / "points.txt").write_text("0 7 1.5 2.5\n12 7 1.6 2.5\n24 7 1.7 2.5\n")

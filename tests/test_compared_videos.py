@@ -15,7 +15,7 @@ from mcaptrack import log, notices
 from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline.write import Made, write
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import comparing, from_above, heat_map
@@ -63,7 +63,7 @@ def crossing_log(path: Path) -> Path:
         for name, how in (("tracks", "track"), ("retracks", "retrack"))
     }
     with log.read(path) as opened, notices.listening(lambda _: None):
-        write(opened, "/lidar", made, (), {}, None)
+        write(RunState(opened, "/lidar", made), (), {}, None)
     return path
 
 

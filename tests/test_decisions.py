@@ -18,8 +18,7 @@ from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import linking as join_steps
 from mcaptrack.transforms.retrack.linking import cut_joins, find_joins, tracked_of
 from mcaptrack.transforms.retrack.motion_model import MotionModel
-from mcaptrack.viewing.report.doubts import Doubt, find_doubtful_tracks
-from mcaptrack.viewing.report.identity_events import IdentityEvent
+from mcaptrack.viewing.report.identity_events import Doubt, IdentityEvent, find_doubtful_tracks
 from tests.commands import done
 from tests.references.offline import Motion, cut, joins
 from tests.test_offline_reference import tracks_of as assigned

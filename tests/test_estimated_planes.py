@@ -28,7 +28,7 @@ from mcaptrack.pipeline.planes import (
     plane_in_words,
     planes_to_json,
 )
-from mcaptrack.pipeline.write import Made
+from mcaptrack.pipeline.write import Made, RunState
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import Sort
@@ -184,7 +184,7 @@ def made_from(
     """The provenance of the plane that is made from boxes of this origin."""
     frames = detections() if frames is None else frames
     with log.read(written(path, provenance, frames)) as opened:
-        _, made = make_plane(opened, "/camera", frames, ("/camera/detections", "x"), more, choice)
+        _, made = make_plane(RunState(opened, "/camera", more), frames, ("/camera/detections", "x"), choice, "")
     assert made is not None
     return made.provenance
 
@@ -246,7 +246,7 @@ def test_a_scale_is_that_of_people_where_there_are_other_things(tmp_path):
     assert alone.parameters["refused"].endswith("120 are needed")
     for one in (frames, mixed):
         with log.read(tmp_path / "a.mcap") as opened:
-            planes, _ = make_plane(opened, "/camera", one, ("/camera/detections", ""), {})
+            planes, _ = make_plane(RunState(opened, "/camera", {}), one, ("/camera/detections", ""), AS_BEFORE, "")
         assert planes is not None
         assert planes[0][1].homography[0] == pytest.approx(1.7 / np.median(np.concatenate(BOXES[:20])[:, 3]), rel=0.1)
 
@@ -402,7 +402,7 @@ class TestBesideThePictures:
     @staticmethod
     def found(path: Path, provenance: Provenance, job: Any = MOTION, made: dict[str, Made] = {}) -> Any:  # noqa: B006
         with log.read(written(path, provenance, detections())) as opened:
-            return side_inputs(opened, "/camera", job, made)
+            return side_inputs(RunState(opened, "/camera", made), job)
 
     def test_they_are_those_of_the_log_by_the_time_of_their_picture(self, tmp_path):
         values, references = self.found(tmp_path / "a.mcap", LEARNED)

@@ -21,7 +21,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.ingest.labels.content import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
-from mcaptrack.tables.exchange import _HOLDS, _WRITERS
+from mcaptrack.tables.exchange import _FORMATS
 from mcaptrack.tables.exchange.boxes import BoxTable
 from mcaptrack.tables.exchange.cvat import KEYFRAME_PX, describe_classes
 from mcaptrack.tables.exchange.text import describe_merged
@@ -70,6 +70,8 @@ CVAT_EXAMPLE = """<?xml version="1.0" encoding="utf-8"?>
   </track>
 </annotations>
 """
+
+_WRITERS = {name: form.write for name, form in _FORMATS.items() if form.write}
 
 
 def box(frame: int, left: float, outside: int = 0, more: str = "", inner: str = "") -> str:
@@ -133,9 +135,9 @@ def test_what_is_written_is_read_again(form, table, tmp_path):
     assert (labels.frame - first).tolist() == table.frame[order].tolist()
     assert labels.id.tolist() == table.id[order].tolist()
     np.testing.assert_allclose(labels.boxes_px, table.boxes[order], rtol=0, atol=1e-9)
-    if "scores" in _HOLDS[form]:
+    if "scores" in _FORMATS[form].holds:
         assert labels.score.astype(np.float32).tolist() == table.score[order].tolist()
-    if "names" in _HOLDS[form]:
+    if "names" in _FORMATS[form].holds:
         names = [labels.classes[one] for one in labels.class_id.tolist()]
         in_kitti = {1: "Pedestrian", 2: "bicycle", 3: "traffic_light", 7: "a_b_c_d"}
         assert names == [(in_kitti if form == "kitti" else NAMES)[one] for one in table.class_id[order].tolist()]

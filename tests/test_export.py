@@ -183,7 +183,7 @@ def test_names_of_logs_never_climb_out_of_the_folder():
 def test_no_reader_takes_the_name_of_a_log_for_something_else(tmp_path, stem):
     name = recording_name(tmp_path / f"{stem}.mcap")
     path = tmp_path / "t" / f"recording={name}" / "part-0.parquet"
-    tables.write(path, tables.rows_table(TRACKS, {"/a": [Frame(1, 0, tracks_at({1: (0, 0)}))]}), {})
+    tables.write(path, tables.rows_in_pieces(TRACKS, {"/a": [Frame(1, 0, tracks_at({1: (0, 0)}))]}).table(), {})
     assert ask("select recording from '@/t/*/*.parquet'", tmp_path) == [(name,)]
     assert pl.read_parquet(tmp_path / "t", hive_partitioning=True)["recording"].to_list() == [name]
     assert pq.read_table(tmp_path / "t").column("recording").to_pylist() == [name]

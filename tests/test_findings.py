@@ -14,7 +14,8 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.pipeline.planes import make_plane
+from mcaptrack.pipeline.planes import AS_BEFORE, make_plane
+from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS, KnnDetector
@@ -148,8 +149,9 @@ def test_a_guessed_scale_covers_all_boxes_and_begins_with_the_first_frame(path):
     rows = DETECTIONS.rows(**boxes, score=[1.0, 1.0], class_id=[1, 1])
     frames = [Frame(ns(3), 0, DETECTIONS.empty()), Frame(ns(4), 1, rows)]
     with log.read(path) as opened:
-        planes, made = make_plane(opened, "/other", frames, ("/other/detections", ""), {})
-        assert make_plane(opened, "/other", frames[:1], ("/other/detections", ""), {}) == (None, None)
+        state, source = RunState(opened, "/other", {}), ("/other/detections", "")
+        planes, made = make_plane(state, frames, source, AS_BEFORE, "")
+        assert make_plane(state, frames[:1], source, AS_BEFORE, "") == (None, None)
     assert planes is not None
     assert made is not None
     (((start, plane),), (frame,)) = planes, made.frames

@@ -17,10 +17,9 @@ import pytest
 
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import child, claims, digests
+from mcaptrack.fleet import child, ledger
 from mcaptrack.fleet.child import Child, WorkerLimits
-from mcaptrack.fleet.claims import Claims, claim_name
-from mcaptrack.fleet.ledger import Ledger
+from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.fleet.worker import Reply, Request
 from tests import fleet_tasks
 from tests.awaiting import until
@@ -286,7 +285,7 @@ class TestClaims:
         path = tmp_path / claim_name("x")
         path.write_text(json.dumps({"host": "other", "pid": os.getpid(), "started": "1"}))
         assert not Claims().take("x", tmp_path).is_mine
-        os.utime(path, (0, time.time() - claims.STALE_S - 1))
+        os.utime(path, (0, time.time() - ledger.STALE_S - 1))
         assert Claims().take("x", tmp_path).is_mine
 
     def test_life_is_shown_and_only_own_claims_are_given_up(self, tmp_path, monkeypatch):
@@ -296,7 +295,7 @@ class TestClaims:
         os.utime(path, (0, 0))
         mine.beat()
         assert path.stat().st_mtime == 0
-        monkeypatch.setattr(claims, "BEAT_S", 0.0)
+        monkeypatch.setattr(ledger, "BEAT_S", 0.0)
         mine.beat()
         assert path.stat().st_mtime > 1e9
         path.write_text(json.dumps({"host": "other", "pid": 1, "started": None}))
@@ -313,7 +312,7 @@ class TestClaims:
         def full(*_):
             raise OSError(errno.ENOSPC, "no space left")
 
-        monkeypatch.setattr(claims.os, "write", full)
+        monkeypatch.setattr(ledger.os, "write", full)
         assert Claims().take("x", tmp_path) == (True, "")
         assert not path.exists()
 
@@ -325,15 +324,15 @@ def test_settings_are_the_same_in_every_process_and_differ_with_every_value(tmp_
     file = tmp_path / "plane.txt"
     file.write_text("1")
     given = {"b": 1, "a": (1.5, None), "path": file, "set": {"x", "y"}}
-    script = "from tests.test_fleet import digests; from pathlib import Path; import sys; " + (
-        "print(digests.digest_of_settings({'set': {'y', 'x'}, 'a': [1.5, None], 'b': 1, 'path': Path(sys.argv[1])}))"
+    script = "from mcaptrack.fleet import ledger; from pathlib import Path; import sys; " + (
+        "print(ledger.digest_of_settings({'set': {'y', 'x'}, 'a': [1.5, None], 'b': 1, 'path': Path(sys.argv[1])}))"
     )
-    found = digests.digest_of_settings(given)
+    found = ledger.digest_of_settings(given)
     again = subprocess.run([sys.executable, "-c", script, file], capture_output=True, text=True, check=True)
     assert again.stdout.strip() == found
-    assert len({found, *(digests.digest_of_settings(given | {key: 7}) for key in given)}) == 5
+    assert len({found, *(ledger.digest_of_settings(given | {key: 7}) for key in given)}) == 5
     file.write_text("2")
-    assert digests.digest_of_settings(given) != found
+    assert ledger.digest_of_settings(given) != found
 
 
 def test_a_function_of_a_script_is_refused():

@@ -210,6 +210,9 @@ def test_what_is_kept_of_comparing_changes_nothing(tmp_path: Path, monkeypatch: 
     path = write_log(tmp_path / "scene.mcap", CAMERAS[:3], people=0.8)
     mcaptrack.fuse(path)
     kept = fused(path)
+    monkeypatch.setattr("mcaptrack.pipeline.fusing._KEPT_BYTES", 1500)  # some frames only
+    monkeypatch.setattr("mcaptrack.transforms.fuse.view._BLOCK", 40)
+    monkeypatch.setattr("mcaptrack.pipeline.fusing._TOGETHER", 3)
     monkeypatch.setattr("mcaptrack.pipeline.gathering._KEPT_BYTES", 1500)  # some frames only
     monkeypatch.setattr("mcaptrack.transforms.fuse._BLOCK", 40)
     monkeypatch.setattr("mcaptrack.pipeline.gathering._TOGETHER", 3)

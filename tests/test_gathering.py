@@ -10,7 +10,7 @@ import pytest
 
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline import gathering
+from mcaptrack.pipeline import fusing
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, Shared
 
@@ -35,7 +35,7 @@ def source(
         )  # fmt: skip
         frames.append(Frame(round(t_s * S), number + 50, rows))
     t_ns = np.array([frame.t_ns for frame in frames]) - round(late_s * S)
-    return gathering.Source(f"/{name}", frames, t_ns, CameraView(name=name, planes=((0, plane),)))
+    return fusing.Source(f"/{name}", frames, t_ns, CameraView(name=name, planes=((0, plane),)))
 
 
 @pytest.mark.parametrize(
@@ -44,13 +44,13 @@ def source(
 )
 @pytest.mark.parametrize("together", [64, 3])
 def test_boxes_of_all_cameras_are_at_the_times_of_the_slowest(steps_s, late_s, within_s, together, monkeypatch):
-    monkeypatch.setattr(gathering, "_TOGETHER", together)
+    monkeypatch.setattr(fusing, "_TOGETHER", together)
     sources = [
         source("fast", np.arange(0.0, 8.0, steps_s[1]) + 0.03, plane=PLANES[1], seed=1),
         source("slow", np.arange(0.0, 8.0, steps_s[0]), late_s, seed=2),
     ]
     fuser = FootFuser(noise=0.05, noise_m=0.2)
-    found = gathering.Gathered(sources, fuser)
+    found = fusing.Gathered(sources, fuser)
     slow = next(one for one in sources if len(one.frames) == min(len(each.frames) for each in sources))
     assert found.at.topic == slow.topic or steps_s[0] == steps_s[1]
     at = [(int(t_ns), frame.index) for t_ns, frame in zip(found.at.t_ns, found.at.frames, strict=True)]
@@ -96,7 +96,7 @@ def test_boxes_of_all_cameras_are_at_the_times_of_the_slowest(steps_s, late_s, w
 def test_of_single_frames_pictures_count_that_are_a_quarter_of_a_second_away():
     for apart_s, count in ((0.25, 2), (0.26, 1)):
         sources = [source("one", [3.0], seed=4), source("other", [3.0 + apart_s], seed=4)]
-        found = gathering.Gathered(sources, FootFuser())
+        found = fusing.Gathered(sources, FootFuser())
         assert len(found) == 1
         (frame,) = found
         assert len(np.unique(frame.rows["camera"])) == count
@@ -127,9 +127,9 @@ def test_clocks_are_set_one_at_a_time_the_worst_first(late, given, offset_s, cal
         starts.append([sum(len(block.frames) for block in blocks)])
         return views, offsets_of(*((one, 99) for one in late[len(taken) - 1])), Shared(9, 9)
 
-    monkeypatch.setattr(gathering, "compare", compare)
+    monkeypatch.setattr(fusing, "compare", compare)
     sources = [source("a", np.arange(2, 8, 0.5)), source("b", np.arange(2, 8, 0.5), plane=PLANES[1])]
-    gathered, fuser, offsets, found, shared = gathering.compared_cameras(sources, FootFuser(), given)
+    gathered, fuser, offsets, found, shared = fusing.compared_cameras(sources, FootFuser(), given)
     assert found == pytest.approx(offset_s)
     assert len(taken) == calls
     assert taken[0] == [round(given.get(name, 0.0) * S) for name in ("a", "b")]
@@ -147,7 +147,7 @@ def said(
 ) -> list[tuple[str, str]]:
     views = [CameraView(name="a", planes=()), *[CameraView(name="b", planes=())] * others]
     with collected() as notices:
-        gathering.warn_disagreeing(
+        fusing.warn_disagreeing(
             "a.mcap", views, [offset, *offsets_of((0.0, 60)) * others], {"a": taken_s, "b": 0.0}, given or {}
         )
     return [(notice.code, notice.message) for notice in notices]

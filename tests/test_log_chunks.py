@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from mcaptrack import log
-from mcaptrack.log import chunks, located, records
+from mcaptrack.log import chunks, messages, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.chunks import checksum_at, message_heads_at, open_chunk, read_index_entries
 from mcaptrack.log.messages import Messages
@@ -156,7 +156,7 @@ def test_a_chunk_that_is_larger_than_its_index_says_is_not_read(tmp_path, monkey
     with log.read(path) as one:
         number = next(n for n, channel in one.index.channels.items() if channel.topic == "b")
         source = ByteSource.of(OpenFile.at(path))
-        (batch,) = located.MessageBatches(source, one.index, [number], (None, None))
+        (batch,) = messages.MessageBatches(source, one.index, [number], (None, None))
         content, offset = Messages(source, one.index)._open(batch)
         heads = message_heads_at(content, number, batch.t_ns, offset)
         payloads = [bytes(content[a:b]) for a, b in zip(heads.start.tolist(), heads.end.tolist(), strict=True)]

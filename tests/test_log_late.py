@@ -13,8 +13,8 @@ import pytest
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import parse_ns
-from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.chunks import LOG_MAX_NS, MAX_NS
+from mcaptrack.log.index import ChunkList
 from mcaptrack.schema import Frame
 from mcaptrack.schema.resampling import resample
 from mcaptrack.sources.pictures import Pictures

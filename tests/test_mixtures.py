@@ -14,7 +14,7 @@ from mcaptrack.foxglove.views.people import ellipses, forecasts
 from mcaptrack.geometry.mixtures import Tails, half_radius, mass_within, normal_tails, squared_radius
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
-from mcaptrack.schema.cdr import CdrCodec, fields_of
+from mcaptrack.schema.encodings import CdrCodec, fields_of
 from mcaptrack.schema.predictions import forecast_to_rows, tails_of
 
 WEIGHTS = st.floats(0.01, 0.9)

@@ -181,7 +181,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says("evaluate", "LOG", "--smoothed"),
     "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/following.py:_check_camera:run": Scene.followed,
-    "pipeline/gathering.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,
+    "pipeline/fusing.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,
     "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
@@ -200,7 +200,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "evaluate", "LOG", "--truth", "truth.txt"
     ),
     "log/journal.py:recover_command:recover": Scene.damaged,
-    "log/snapshot.py:reporting_bad_times:drop": Scene.late,
+    "log/reader.py:reporting_bad_times:drop": Scene.late,
     "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
     "transforms/detect/onnx/session.py:check:get_model": Scene.with_other_weights,
     "transforms/detect/onnx/session.py:stored:get_model": lambda s: s.says("detect", "LOG", "--detector", "yolox-nano"),
@@ -238,7 +238,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "zones", "draw", "LOG"
     ),
     "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
-    "viewing/report/summary.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
+    "viewing/report/__init__.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
     "viewing/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(

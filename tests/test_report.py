@@ -22,13 +22,12 @@ from mcaptrack.evaluation.people import Interval, Intervals
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
-from mcaptrack.viewing.report import ELEMENT, charts, data, gather, page, statistics
+from mcaptrack.viewing.report import ELEMENT, change_text, charts, data, gather, page, statistics, verdict
 from mcaptrack.viewing.report.charts import Axis, Bars, Line
 from mcaptrack.viewing.report.formatting import environment, plain
 from mcaptrack.viewing.report.headline import rules_text
 from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, most_important, summarize_events
 from mcaptrack.viewing.report.scene_map import SceneBackground, TrackPath, ground_map, heat_map, picture_map, simplified
-from mcaptrack.viewing.report.summary import change_text, verdict
 from tests.commands import call, done, printed
 from tests.logs import add_rows, write_channels
 from tests.worlds import ns, tracks_at, walk

@@ -23,9 +23,8 @@ from mcaptrack.schema import Frame
 from mcaptrack.viewing.links import is_about, with_links
 from mcaptrack.viewing.report import LogReport, gather, page
 from mcaptrack.viewing.report.charts import Line
-from mcaptrack.viewing.report.doubts import find_doubts
-from mcaptrack.viewing.report.identity_events import summarize_events
-from mcaptrack.viewing.report.identity_timeline import counts_over_time, identity_timeline, mean_numbers, pieces
+from mcaptrack.viewing.report.figures import counts_over_time, identity_timeline, mean_numbers, pieces
+from mcaptrack.viewing.report.identity_events import find_doubts, summarize_events
 from tests.worlds import crossing_tracks, ns, tracks_at, write_eventful
 
 

@@ -35,7 +35,7 @@ from mcaptrack.tables.messages import messages_table
 from tests.commands import call
 from tests.strategies import columns
 from tests.tiers import one_in
-from tests.worlds import ns, tracks_at
+from tests.worlds import ns, table_to_frames, tracks_at
 
 ROOT = Path(__file__).parent.parent
 ALL = st.sampled_from(sorted(SCHEMAS.values(), key=lambda schema: schema.name))
@@ -52,7 +52,7 @@ def pointers(frames):
 
 def some_tracks(people):
     """A table of tracks, a frame a dictionary of people."""
-    return tables.rows_table(TRACKS, {"/a": [Frame(n, n, tracks_at(who)) for n, who in enumerate(people)]})
+    return tables.rows_in_pieces(TRACKS, {"/a": [Frame(n, n, tracks_at(who)) for n, who in enumerate(people)]}).table()
 
 
 #: Columns, each of which differs from the first of its line in one value, or in which rows are null.
@@ -102,14 +102,14 @@ def test_rows_and_empty_frames_survive_files_to_the_bit(tmp_path_factory, data):
     for topic in ("/a", "/b/c"):
         times = sorted(data.draw(st.lists(st.integers(0, 2**62), max_size=4)))  # one time may come twice
         channels[topic] = [Frame(t, n, schema.rows(**data.draw(columns(schema, 4)))) for n, t in enumerate(times)]
-    table = tables.rows_table(schema, channels)
+    table = tables.rows_in_pieces(schema, channels).table()
     tables.write(folder / "rows", table, {}, tables.table_of(schema).order, form)
     tables.write(folder / "frames", tables.frames_table({t: pointers(f) for t, f in channels.items()}), {}, (), form)
     read = pq.read_table if form == "parquet" else lambda path: pa.ipc.open_file(pa.memory_map(str(path))).read_all()
     rows, frames = (read(folder / name) for name in ("rows", "frames"))
     assert rows.schema.remove_metadata() == table.schema.remove_metadata()
     for topic, wanted in channels.items():
-        found = tables.table_to_frames(schema, rows, frames, topic)
+        found = table_to_frames(schema, rows, frames, topic)
         assert [(f.t_ns, f.index, schema.codec.encode(f.rows)) for f in found] == [
             (f.t_ns, f.index, schema.codec.encode(f.rows)) for f in wanted
         ]
@@ -128,7 +128,7 @@ def test_other_libraries_read_the_same_bits_and_nanoseconds(tmp_path_factory, gi
             rows[name] = np.nan
         rows["source_id"] = np.iinfo(np.int64).min
         frames.append(Frame(t_ns, number, rows))
-    tables.write(path, tables.rows_table(TRACKS, {"/a": frames}), {})
+    tables.write(path, tables.rows_in_pieces(TRACKS, {"/a": frames}).table(), {})
     wanted = [
         (f.t_ns, f.rows["x_m"].view("<u8")[0], None if np.isnan(f.rows["y_m"][0]) else f.rows["y_m"].view("<u8")[0])
         for f in frames
@@ -158,10 +158,10 @@ def test_other_libraries_read_the_same_bits_and_nanoseconds(tmp_path_factory, gi
 def test_missing_is_null_and_null_is_missing_whatever_bits_a_nan_has():
     rows = tracks_at({1: (0.0, 0.0), 2: (0.0, 0.0)}).copy()
     rows["x_m"] = np.array([0x7FF8_0000_DEAD_BEEF, 0xFFF0_0000_0000_0001], np.uint64).view(float)
-    table = tables.rows_table(TRACKS, {"/a": [Frame(1, 0, rows)]})
+    table = tables.rows_in_pieces(TRACKS, {"/a": [Frame(1, 0, rows)]}).table()
     assert table.column("x_m").null_count == 2
     assert table.column("y_m").null_count == 0
-    (frame,) = tables.table_to_frames(TRACKS, table, tables.frames_table({"/a": pointers([Frame(1, 0, rows)])}), "/a")
+    (frame,) = table_to_frames(TRACKS, table, tables.frames_table({"/a": pointers([Frame(1, 0, rows)])}), "/a")
     assert np.isnan(frame.rows["x_m"]).all()
 
 
@@ -300,7 +300,7 @@ def test_summaries_are_what_duckdb_makes_of_the_rows(data):
         st.integers(0, 3), st.tuples(*[st.floats(-50, 50) | st.just(float("nan"))] * 2), max_size=4
     )
     frames = [Frame(ns(n), n, tracks_at(who)) for n, who in enumerate(data.draw(st.lists(people, max_size=8)))]
-    rows = tables.rows_table(TRACKS, {"/a": frames})  # noqa: F841  # DuckDB finds it by name
+    rows = tables.rows_in_pieces(TRACKS, {"/a": frames}).table()  # noqa: F841  # DuckDB finds it by name
     summary = tables.summary_table({"/a": collect(TRACKS, frames)})
     wanted = duckdb.sql("""
         with known as (select *, lag(x_m) over w as px, lag(y_m) over w as py, lag(t_ns) over w as pt from rows
@@ -475,9 +475,9 @@ def test_rows_about_tracks_have_the_class_of_the_track_or_of_the_object_that_is_
     rows = EVENTS.empty(4)
     rows["kind"], rows["track_id"], rows["truth_id"] = 5, [3, -1, 4, -1], [-1, 3, 9, 8]
     named = tables.TrackNames({3: "car", 9: "bus"}, {3: "dog", 9: "cat"})
-    table = tables.rows_table(
+    table = tables.rows_in_pieces(
         EVENTS, {"/b/events": [Frame(1, 0, rows)], "/a/events": [Frame(1, 0, rows)]}, {}, {"/b/events": named}
-    )
+    ).table()
     found = {(row["topic"], row["row"]): row["class"] for row in table.to_pylist()}
     assert [found["/b/events", n] for n in range(4)] == ["car", "dog", None, None]
     assert {found["/a/events", n] for n in range(4)} == {None}

@@ -7,15 +7,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 
 import mcaptrack
-from mcaptrack import log
+from mcaptrack import log, tables
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema.framing import split_rows
 from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.demo import Block, Pedestrian, SyntheticScene
 
@@ -307,3 +309,19 @@ def write_channels(path: Path, made_by: str = "ingest", **channels: Sequence[Fra
 def replace_channel(path: Path, topic: str, frames: Sequence[Frame], made_by: str = "ingest") -> None:
     with log.read(path) as opened, log.extend(opened, drop=[topic]) as writer:
         _add_messages(writer, topic, frames, made_by)
+
+
+def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[Frame]:
+    """The frames of one channel, also empty ones, from its table of rows and the table of frames."""
+    rows, frames = tables.rows_of_topic(rows, topic), tables.rows_of_topic(frames, topic)
+    order = np.argsort(rows.column("row").to_numpy(), kind="stable")
+    columns = {}
+    for column in schema.columns:
+        if column.since and column.name not in rows.column_names:  # an older table
+            continue
+        values = rows.column(column.name).combine_chunks()
+        values = values.fill_null(column.missing) if column.optional else values
+        columns[column.name] = values.to_numpy(zero_copy_only=False)[order]
+    members = schema.rows(**columns)
+    times, numbers, counts = (frames.column(name).to_pylist() for name in ("t_ns", "frame", "rows"))
+    return split_rows(times, numbers, members, np.cumsum(counts))

@@ -23,8 +23,7 @@ from mcaptrack.location import Location
 from mcaptrack.notices import Notice
 
 if TYPE_CHECKING:
-    from mcaptrack.pipeline.calibrating import CorrectedPlanes
-    from mcaptrack.pipeline.refining import Refined
+    from mcaptrack.pipeline.calibrating import CorrectedPlanes, Refined
     from mcaptrack.pipeline.several import Say
     from mcaptrack.sources.fixed_frame import BoxesRead
 

@@ -28,7 +28,7 @@ LIST: Final = "-"
 # Find the logs that the URL of a store names: an object, a prefix, or a pattern.
 
 
-_IN_STORE_SUFFIX: Final = ".mcap"
+_SUFFIX: Final = ".mcap"
 
 
 def logs_in_store(url: Url, leave_out: str) -> Iterator[tuple[Url, Path]]:
@@ -43,10 +43,10 @@ def logs_in_store(url: Url, leave_out: str) -> Iterator[tuple[Url, Path]]:
             raise McaptrackError(f"no object matches {url}")
         yield from members
         return
-    is_log = url.suffix.lower() == _IN_STORE_SUFFIX and not url.endswith("/")
+    is_log = url.suffix.lower() == _SUFFIX and not url.endswith("/")
     members = [] if is_log else [*_below(url, leave_out)]
     if not members and (url.endswith("/") or not url.key):
-        raise McaptrackError(f"{url} has no log: no object below it ends with {_IN_STORE_SUFFIX}")
+        raise McaptrackError(f"{url} has no log: no object below it ends with {_SUFFIX}")
     yield from members or [(url, Path(url.name))]
 
 
@@ -73,7 +73,7 @@ def _in_store_matching(pattern: Url, leave_out: str) -> Iterator[tuple[Url, Path
 
 
 def _is_log(url: Url, leave_out: str) -> bool:
-    return url.suffix.lower() == _IN_STORE_SUFFIX and not (leave_out and url.endswith(leave_out))
+    return url.suffix.lower() == _SUFFIX and not (leave_out and url.endswith(leave_out))
 
 
 def _fits(names: Sequence[str], parts: Sequence[str]) -> bool:
@@ -83,9 +83,6 @@ def _fits(names: Sequence[str], parts: Sequence[str]) -> bool:
     if parts[0] == "**":
         return any(_fits(names[start:], parts[1:]) for start in range(len(names) + 1))
     return bool(names) and fnmatchcase(names[0], parts[0]) and _fits(names[1:], parts[1:])
-
-
-_SUFFIX: Final = ".mcap"
 
 
 @dataclass(frozen=True)

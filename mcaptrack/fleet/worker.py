@@ -24,7 +24,7 @@ from typing import Any, Final, NoReturn
 
 from mcaptrack.environment import hush_libraries, share_allocator
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet.digests import digest_of_log
+from mcaptrack.fleet.ledger import digest_of_log
 from mcaptrack.fleet.results import State
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, about, listening

@@ -20,30 +20,3 @@ from mcaptrack.foxglove.messages import (
 from mcaptrack.foxglove.palette import class_colour, colour, colours
 from mcaptrack.foxglove.ros import messages_in, record_in
 from mcaptrack.foxglove.scenes import CuboidMarker, Cuboids, PersonMarker, SceneMessages
-
-__all__ = [
-    "ANNOTATIONS",
-    "CALIBRATION",
-    "IMAGE",
-    "LOG",
-    "SCENE",
-    "TRANSFORM",
-    "VIDEO",
-    "Annotations",
-    "CuboidMarker",
-    "Cuboids",
-    "PersonMarker",
-    "SceneMessages",
-    "class_colour",
-    "colour",
-    "colours",
-    "message_class",
-    "messages_in",
-    "pack_log",
-    "pack_picture",
-    "pack_stamped",
-    "pack_transform",
-    "record_in",
-    "schema_record",
-    "unpack",
-]

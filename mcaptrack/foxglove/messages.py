@@ -45,31 +45,22 @@ def schema_record(schema_name: str) -> tuple[str, str, bytes]:
     return schema_name, "protobuf", files.SerializeToString(deterministic=True)
 
 
-def _stamp(message: Any, t_ns: int) -> None:
-    message.timestamp.seconds, message.timestamp.nanos = divmod(t_ns, NS_PER_S)
-
-
 def pack_picture(schema_name: str, t_ns: int, frame_id: str, image_format: str, data: bytes) -> bytes:
     """A CompressedVideo or CompressedImage message."""
-    message = message_class(schema_name)(frame_id=frame_id, format=image_format, data=data)
-    _stamp(message, t_ns)
-    payload: bytes = message.SerializeToString(deterministic=True)
-    return payload
+    return pack_stamped(message_class(schema_name)(frame_id=frame_id, format=image_format, data=data), t_ns)
 
 
 def pack_transform(t_ns: int, parent_frame_id: str, frame_id: str) -> bytes:
     """A FrameTransform message: a frame with the pose of its parent."""
     message = message_class(TRANSFORM)(parent_frame_id=parent_frame_id, child_frame_id=frame_id)
-    _stamp(message, t_ns)
     message.translation.SetInParent()
     message.rotation.w = 1.0
-    payload: bytes = message.SerializeToString(deterministic=True)
-    return payload
+    return pack_stamped(message, t_ns)
 
 
 def pack_stamped(message: Any, t_ns: int) -> bytes:
     """A message of a Foxglove schema with this time."""
-    _stamp(message, t_ns)
+    message.timestamp.seconds, message.timestamp.nanos = divmod(t_ns, NS_PER_S)
     payload: bytes = message.SerializeToString(deterministic=True)
     return payload
 
@@ -77,10 +68,7 @@ def pack_stamped(message: Any, t_ns: int) -> bytes:
 def pack_log(t_ns: int, level: str, name: str, text: str) -> bytes:
     """A Log message; ``level`` is "DEBUG", "INFO", "WARNING" or "ERROR", ``name`` is that of the source."""
     kind = message_class(LOG)
-    message = kind(level=kind.Level.Value(level), name=name, message=text)
-    _stamp(message, t_ns)
-    payload: bytes = message.SerializeToString(deterministic=True)
-    return payload
+    return pack_stamped(kind(level=kind.Level.Value(level), name=name, message=text), t_ns)
 
 
 def unpack(schema_name: str, payload: bytes) -> Any:

@@ -9,16 +9,26 @@ Letters: F instants, N people, P points of each.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.foxglove.annotations import by_length
+from mcaptrack.foxglove.annotations import (
+    STAMP,
+    Each,
+    Slot,
+    StampedMessages,
+    Template,
+    TextSlot,
+    by_length,
+    joined,
+    paint,
+    short,
+)
 from mcaptrack.foxglove.messages import SCENE, message_class
-from mcaptrack.foxglove.template import STAMP, Each, MessageParts, Slot, Template, TextSlot, group, joined, stamps
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 
@@ -72,17 +82,15 @@ class Cuboids(NamedTuple):
         return np.asarray(self.centre_m[:, 2] - self.size_m[:, 2] / 2, np.float64)
 
 
-class SceneMessages:
+class SceneMessages(StampedMessages):
     """The scenes of F instants in one coordinate frame. Objects name their instant by its index (N,), rising.
 
     Everything disappears ``lifetime_ns`` after its instant.
     """
 
     def __init__(self, t_ns: Ints, frame_id: str, lifetime_ns: int) -> None:
-        self._count = len(t_ns)
+        super().__init__(t_ns)
         self._frame_id, self._lifetime_ns = frame_id, lifetime_ns
-        self._seconds, self._nanos = stamps(t_ns)
-        self._groups: list[MessageParts] = []
         self._add(np.arange(self._count), _head())
 
     def people(
@@ -184,14 +192,9 @@ class SceneMessages:
         for frame in range(self._count):
             yield joined(self._groups, frame)
 
-    def _add(self, frame: Ints, template: Template, **columns: Any) -> None:
-        if len(frame):
-            stamp = {"seconds": self._seconds[frame], "nanos": self._nanos[frame]}
-            self._groups.append(group(template.filled(len(frame), **stamp, **columns), frame, self._count))
-
 
 def _short(values: Floats, parts: int = PER_M) -> Floats:
-    return np.rint(values * parts) / parts
+    return short(values, parts)
 
 
 def _shades(front: str, rgb: Floats) -> dict[str, Floats]:
@@ -216,10 +219,6 @@ def _template(content: dict[str, Any]) -> Template:
     return Template(message_class(SCENE).DESCRIPTOR, content)
 
 
-def _paint(front: str = "") -> dict[str, Slot]:
-    return {name: Slot(front + name) for name in "rgba"}
-
-
 @cache
 def _head() -> Template:
     return _template({"deletions": {"timestamp": STAMP, "type": _ALL}})
@@ -235,18 +234,26 @@ def _entity(frame_id: str, lifetime_ns: int, name: Any, **content: Any) -> Templ
 def _lines(count: int, thickness_px: float, in_pieces: bool = False, is_high: bool = False) -> list[dict[str, Any]]:
     if count < 2:
         return []
-    axes = "xyz" if is_high else "xy"
-    return [
-        {
-            "type": _LINE_LIST if in_pieces else _LINE_STRIP,
-            "pose": {"position": {}, "orientation": _UPRIGHT},
-            "thickness": thickness_px,
-            "scale_invariant": True,
-            "points": Each("points", count, {name: Slot(name) for name in axes}),
-            "color": {},
-            "colors": Each("colours", count, _paint()),
-        }
-    ]
+    points = _each("points", count, "xyz" if is_high else "xy")
+    kind = _LINE_LIST if in_pieces else _LINE_STRIP
+    return [_one_line(kind, thickness_px, points, {}) | {"colors": Each("colours", count, paint())}]
+
+
+def _one_line(
+    kind: int, thickness_px: float, points: Any, colour: Mapping[str, Any], height_m: float = 0.0
+) -> dict[str, Any]:
+    return {
+        "type": kind,
+        "pose": {"position": {"z": height_m} if height_m else {}, "orientation": _UPRIGHT},
+        "thickness": thickness_px,
+        "scale_invariant": True,
+        "points": points,
+        "color": colour,
+    }
+
+
+def _each(name: str, count: int, axes: str) -> Each:
+    return Each(name, count, {axis: Slot(axis) for axis in axes})
 
 
 @cache
@@ -256,7 +263,7 @@ def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, 
         "size": {"x": marker.width_m, "y": marker.width_m, "z": marker.height_m},
         "bottom_scale": 1.0,
         "top_scale": 1.0,
-        "color": _paint(),
+        "color": paint(),
     }
     name = _label(length, Slot("text_z"))
     lines = _lines(points, marker.thickness_px, marker.in_pieces)
@@ -270,7 +277,7 @@ def _label(length: int, height: float | Slot) -> dict[str, Any]:
         "billboard": True,
         "font_size": 14.0,
         "scale_invariant": True,
-        "color": {**_paint("text_"), "a": 1.0},
+        "color": {**paint("text_"), "a": 1.0},
         "text": TextSlot("label", length),
     }
 
@@ -281,16 +288,9 @@ def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, point
     body = {
         "pose": {"position": {name: Slot(name) for name in "xyz"}, "orientation": turn},
         "size": {"x": Slot("long"), "y": Slot("wide"), "z": Slot("high")},
-        "color": _paint(),
+        "color": paint(),
     }
-    ahead = {
-        "type": _LINE_STRIP,
-        "pose": {"position": {}, "orientation": _UPRIGHT},
-        "thickness": 2.0,
-        "scale_invariant": True,
-        "points": Each("ahead", 2, {name: Slot(name) for name in "xyz"}),
-        "color": {**_paint("ahead_"), "a": 1.0},
-    }
+    ahead = _one_line(_LINE_STRIP, 2.0, _each("ahead", 2, "xyz"), {**paint("ahead_"), "a": 1.0})
     lines = [ahead, *_lines(points, line.thickness_px, line.in_pieces, is_high=True)]
     name = _label(length, Slot("text_z"))
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cubes=[body], texts=[name], lines=lines)
@@ -309,7 +309,7 @@ def _forecast(
         "bottom_scale": 1.0,
         "top_scale": 1.0,
         # Ellipses are large, those of vehicles more so, and many lie over one another.
-        "color": {**_paint(), "a": 0.0625 if is_high else 0.125},
+        "color": {**paint(), "a": 0.0625 if is_high else 0.125},
     }
     lines, discs = _lines(points, thickness_px, is_high=is_high), [disc] if has_ellipse else []
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=discs, lines=lines)
@@ -326,18 +326,8 @@ def _zone(
     rgba: tuple[float, float, float, float],
     height_m: float,
 ) -> Template:
-    up = {"z": height_m} if height_m else {}
-    lines = [
-        {
-            "type": _LINE_LOOP if is_closed else _LINE_STRIP,
-            "pose": {"position": up, "orientation": _UPRIGHT},
-            "thickness": 3.0,
-            "scale_invariant": True,
-            "points": [{"x": x, "y": y} for x, y in ring],
-            "color": dict(zip("rgba", rgba, strict=True)),
-        }
-        for ring in rings
-    ]
+    kind, colour = _LINE_LOOP if is_closed else _LINE_STRIP, dict(zip("rgba", rgba, strict=True))
+    lines = [_one_line(kind, 3.0, [{"x": x, "y": y} for x, y in ring], colour, height_m) for ring in rings]
     return _entity(frame_id, lifetime_ns, name, lines=lines, texts=[_label(length, _DISC_M + height_m)])
 
 
@@ -345,12 +335,5 @@ def _zone(
 def _outline(
     frame_id: str, lifetime_ns: int, name: str, points: int, rgba: tuple[float, float, float, float]
 ) -> Template:
-    line = {
-        "type": _LINE_LOOP,
-        "pose": {"position": {}, "orientation": _UPRIGHT},
-        "thickness": 2.0,
-        "scale_invariant": True,
-        "points": Each("points", points, {"x": Slot("x"), "y": Slot("y")}),
-        "color": dict(zip("rgba", rgba, strict=True)),
-    }
+    line = _one_line(_LINE_LOOP, 2.0, _each("points", points, "xy"), dict(zip("rgba", rgba, strict=True)))
     return _entity(frame_id, lifetime_ns, name, lines=[line])

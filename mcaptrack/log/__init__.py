@@ -14,48 +14,17 @@ from mcaptrack import objects
 from mcaptrack.files import temporary_folder
 from mcaptrack.location import Location, Url
 from mcaptrack.log import records
-from mcaptrack.log.check import CheckResult, ClockJump, check, clock_jumps, jumps_text
+from mcaptrack.log.check import CheckResult, check, clock_jumps, jumps_text
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.chunks import message_head, open_chunk
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
-from mcaptrack.log.messages import ChannelRows, Message, MessageLocations
+from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Channel, Log
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, refuse_non_mcap, results_path, split_files_in
 from mcaptrack.log.records import MAGIC, Bytes, Opcode, Record, walk
-from mcaptrack.log.recover import RecoverResult, recover
+from mcaptrack.log.recover import recover
 from mcaptrack.log.writer import LIBRARY, LogWriter, create
 from mcaptrack.objects import AbsentError
-
-__all__ = [
-    "LIBRARY",
-    "Channel",
-    "ChannelRows",
-    "CheckResult",
-    "ClockJump",
-    "Finding",
-    "Log",
-    "LogWriter",
-    "Message",
-    "MessageLocations",
-    "RecoverResult",
-    "check",
-    "clock_jumps",
-    "copy_attachments_and_metadata",
-    "create",
-    "extend",
-    "find_results",
-    "header",
-    "jumps_text",
-    "read",
-    "recover",
-    "refuse_non_mcap",
-    "refuse_to_replace_recorded",
-    "results_path",
-    "split_files_in",
-    "stream",
-    "topics_with_schema",
-]
-
 
 # Opening logs, with their sidecars, and finding channels in them.
 

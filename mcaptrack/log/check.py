@@ -31,18 +31,17 @@ from mcaptrack.log.chunks import (
     read_index_entries,
     scan_entries,
 )
-from mcaptrack.log.index import Index, attachment_entry, ends_with_magic, metadata_entry, starts_with_magic
-from mcaptrack.log.journal import changed, find_journal, journal_of, load_old_content
-from mcaptrack.log.records import (
-    MAGIC,
-    Bytes,
-    ChunkIndexRecord,
-    Damaged,
-    Opcode,
-    Reader,
-    Record,
-    walk,
+from mcaptrack.log.index import (
+    Index,
+    attachment_entry,
+    count_messages,
+    edges_of,
+    ends_with_magic,
+    metadata_entry,
+    starts_with_magic,
 )
+from mcaptrack.log.journal import changed, find_journal, journal_of, load_old_content
+from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Reader, Record, walk
 
 if TYPE_CHECKING:
     from mcaptrack.log.reader import Log
@@ -235,7 +234,7 @@ def _spans(part: Log) -> Iterator[Span]:
             yield from spans_of(span, entries)
     loose = {channel: listed for channel, listed in index.loose.items() if len(listed)}
     if loose:
-        edges = [int(edge) for listed in loose.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
+        edges = edges_of(loose)
         yield from spans_of((min(edges), max(edges)), loose)
 
 
@@ -383,7 +382,7 @@ class _Checker:
 
     def _add_spans(self, entries: Mapping[int, Entries], where: int) -> None:
         """Keep the spans of time of messages: those of one record, by channel."""
-        edges = [int(edge) for listed in entries.values() for edge in (listed[:, 0].min(), listed[:, 0].max())]
+        edges = edges_of(entries)
         for span in spans_of((min(edges), max(edges)), entries) if edges else ():
             if self._spans and (both := joined(self._spans[-1], span)):
                 self._spans[-1] = both
@@ -436,10 +435,10 @@ class _Checker:
 
     def _count(self, entries: Mapping[int, Entries], where: int) -> None:
         """Add messages, in file order, to ``found``."""
-        self._add_spans({channel: listed for channel, listed in entries.items() if len(listed)}, where)
+        entries = {channel: listed for channel, listed in entries.items() if len(listed)}
+        self._add_spans(entries, where)
+        count_messages(self.found, entries)
         for channel, listed in entries.items():
-            if not len(listed):
-                continue
             if channel not in self.found.channels:
                 self._find("no-channel", where, f"messages of channel {channel}, which was not described before")
             t_ns = listed[:, 0]
@@ -455,8 +454,3 @@ class _Checker:
                 text = f"messages of {topic} later than the year 2262, which are kept, but nothing is computed with"
                 self._find("late", where, text, "warning", int(late.sum()))
             self._latest[channel] = max(latest, int(t_ns.max()))
-            if not self.found.counts:
-                self.found.start_ns = int(t_ns.min())
-            self.found.start_ns = min(self.found.start_ns, int(t_ns.min()))
-            self.found.end_ns = max(self.found.end_ns, int(t_ns.max()))
-            self.found.counts[channel] = self.found.counts.get(channel, 0) + len(listed)

@@ -15,15 +15,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.checksums import crc_of
-from mcaptrack.log.records import (
-    Bytes,
-    ChunkHead,
-    ChunkIndexRecord,
-    Damaged,
-    Opcode,
-    Record,
-    walk,
-)
+from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Opcode, Record, walk
 
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]

@@ -27,17 +27,7 @@ from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.in_place import rewrite_tail
 from mcaptrack.log.index import Index
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import (
-    BLOCK,
-    MAGIC,
-    Bytes,
-    ChannelRecord,
-    ChunkIndexRecord,
-    Damaged,
-    Opcode,
-    Record,
-    walk,
-)
+from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, Record, walk
 from mcaptrack.log.remote import publish_object, refuse_replaced
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance

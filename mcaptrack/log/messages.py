@@ -14,22 +14,25 @@ from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.ragged import ragged_range, run_starts
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import GAP_BYTES, ByteSource
 from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import (
+    MAX_NS,
+    Entries,
     checksum_at,
     chunk_record,
     is_left_in_file,
     message_head,
     message_heads_at,
     open_chunk_with_checksum,
+    read_index_entries,
 )
 from mcaptrack.log.index import Index
-from mcaptrack.log.located import MessageBatch, MessageBatches, Span, to_int64
 from mcaptrack.log.records import (
     BLOCK,
     CHUNK_HEAD_BYTES,
@@ -161,6 +164,193 @@ def _take(total: hashlib._Hash, buffer: Bytes, start: int, end: int) -> None:
         total.update(buffer[at : min(at + BLOCK, end)])
 
 
+def _in_order_of_time(channel: ChannelRows) -> ChannelRows:
+    """Put messages, and their rows, in the order of their times."""
+    rows, t_ns, sequence, counts = channel
+    order = np.argsort(t_ns, kind="stable")
+    if (np.diff(order) != 1).any():
+        rows = rows[ragged_range((np.cumsum(counts) - counts)[order], counts[order])]
+    return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
+
+
+# Where the messages of channels are, in batches that are read together; held as columns, 16 bytes a message.
+#
+# Letters: M messages, B batches.
+
+
+Times = NDArray[np.uint64]
+Span = tuple[int | None, int | None]
+
+_NO_ENTRIES: Final[Entries] = np.empty((0, 2), "<u8")
+_OUTSIDE: Final = -1
+
+
+class TimeOutOfRange(Exception):
+    """``count`` messages of a channel are later than ``MAX_NS``, the first of them at ``t_ns``."""
+
+    def __init__(self, count: int, t_ns: int) -> None:
+        super().__init__(count, t_ns)
+        self.count, self.t_ns = count, t_ns
+
+
+class MessageBatch(NamedTuple):
+    """Messages of one channel that are read together, in time order, (M,) each: of one chunk, or near each other.
+
+    ``is_direct``: the messages are read from the file itself, because they are outside of chunks or in an uncompressed
+    chunk that is too large for memory.
+    """
+
+    channel: int
+    chunk: ChunkIndexRecord | None
+    is_direct: bool
+    t_ns: Times
+    offset: Ints
+
+    @property
+    def size(self) -> int:
+        """The memory in bytes that the open batch takes."""
+        if self.chunk is not None and not self.is_direct:
+            return self.chunk.uncompressed_size
+        return int(self.offset.max() - self.offset.min()) if len(self.offset) else 0
+
+
+class MessageBatches:
+    """The batches of channels that have messages in a span of times, in the order of channels, chunks and the file.
+
+    Raises Damaged if the message indexes contradict the index of the log.
+    """
+
+    def __init__(self, source: ByteSource, index: Index, channels: Sequence[int], span: Span) -> None:
+        self._index, self._span = index, span
+        self._found = array("Q"), array("Q")  # log times and offsets of all messages
+        self._ends = array("Q", [0])
+        self._chunk = array("q")  # the number of the chunk of each batch
+        self._channel, self._direct = array("H"), array("B")
+        for channel in channels:
+            self._locate(source, channel)
+        self.t_ns, self._offset = (np.frombuffer(column, np.uint64) for column in self._found)
+        self.edges = np.frombuffer(self._ends, np.uint64).astype(np.int64)  # (B + 1,)
+
+    def _locate(self, source: ByteSource, channel_id: int) -> None:
+        """Add the batches of a channel in the chunks that overlap the span."""
+        index, (first, last), listed = self._index, self._span, 0
+        for row in index.chunks.rows_with([channel_id]).tolist():
+            chunk = index.chunks[row]
+            if not overlaps(chunk, self._span):
+                continue
+            at = chunk.message_index_offsets[channel_id]
+            entries = read_index_entries(source, at, channel_id) if at else index.entries[chunk.offset][channel_id]
+            listed += len(entries)
+            if is_left_in_file(chunk.compression, chunk.compressed_size):
+                self._add_pieces(channel_id, row, entries)
+            else:
+                self._add(channel_id, row, False, entries)
+        loose = index.loose.get(channel_id, _NO_ENTRIES)
+        self._add_pieces(channel_id, _OUTSIDE, loose)
+        listed += len(loose)
+        declared = index.counts.get(channel_id, 0)
+        if first is None and last is None and listed != declared:
+            raise Damaged(f"its indexes list {listed} messages of channel {channel_id}, and there are {declared}")
+
+    def _add(self, channel_id: int, row: int, is_direct: bool, entries: Entries) -> None:
+        first, last = self._span
+        t_ns, offset = entries.astype(np.uint64).T
+        if first is not None or last is not None:
+            inside = np.ones(len(t_ns), bool) if first is None or first <= 0 else t_ns >= first
+            if last is not None:
+                inside &= t_ns < max(last, 0)
+            t_ns, offset = t_ns[inside], offset[inside]
+        order = np.argsort(t_ns, kind="stable") if len(t_ns) > 1 else slice(None)
+        for column, values in zip(self._found, (t_ns, offset), strict=True):
+            column.frombytes(values[order].tobytes())
+        self._ends.append(len(self._found[0]))
+        self._chunk.append(row)
+        self._channel.append(channel_id)
+        self._direct.append(is_direct)
+
+    def _add_pieces(self, channel_id: int, row: int, entries: Entries) -> None:
+        """Add messages that are read from the file itself, as batches of nearby ones."""
+        if not len(entries):
+            return
+        in_file = entries[np.argsort(entries[:, 1], kind="stable")]
+        starts = np.flatnonzero(run_starts(in_file[:, 1] // BLOCK))
+        for piece in np.split(in_file, starts[1:]):
+            self._add(channel_id, row, True, piece)
+
+    def __len__(self) -> int:
+        return len(self._chunk)
+
+    def __getitem__(self, number: int) -> MessageBatch:
+        low, high = self.edges[number], self.edges[number + 1]
+        row = self._chunk[number]
+        chunk = None if row == _OUTSIDE else self._index.chunks[row]
+        part = slice(low, high)
+        return MessageBatch(
+            self._channel[number],
+            chunk,
+            bool(self._direct[number]),
+            self.t_ns[part],
+            self._offset[part].astype(np.int64),
+        )
+
+    def __iter__(self) -> Iterator[MessageBatch]:
+        return map(self.__getitem__, range(len(self)))
+
+    @property
+    def times(self) -> Ints:
+        """The times of all messages, (M,) ns. Raises TimeOutOfRange if one doesn't fit into int64."""
+        return to_int64(self.t_ns)
+
+    @property
+    def offset(self) -> Ints:
+        """The offsets of all messages in their uncompressed chunks, (M,); outside of chunks those in the file."""
+        return self._offset.astype(np.int64)
+
+    @property
+    def batch(self) -> Ints:
+        """The number of each message's batch, (M,)."""
+        return group_index(np.diff(self.edges))
+
+    @property
+    def chunk_offset(self) -> Ints:
+        """The offset of each message's chunk in the file, (M,); -1 outside of chunks."""
+        rows = np.frombuffer(self._chunk, np.int64)
+        offsets = np.append(self._index.chunks.offsets.astype(np.int64), -1)  # the last one is that of _OUTSIDE
+        return np.repeat(offsets[rows], np.diff(self.edges))
+
+    def in_order(self) -> Iterator[list[MessageBatch]]:
+        """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
+        numbers = np.flatnonzero(np.diff(self.edges))
+        first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
+        order = np.argsort(first_ns, kind="stable")
+        group: list[int] = []
+        last = (-1, -1)  # time and number of the last message and batch so far
+        for first, until, number in zip(
+            first_ns[order].tolist(), last_ns[order].tolist(), numbers[order].tolist(), strict=True
+        ):
+            if group and (first, number) > last:
+                yield [self[member] for member in sorted(group)]
+                group = []
+            group.append(number)
+            last = max(last, (until, max(group)))
+        if group:
+            yield [self[member] for member in sorted(group)]
+
+
+def overlaps(chunk: ChunkIndexRecord, span: Span) -> bool:
+    """Whether a chunk may have messages in a span of times."""
+    first, last = span
+    return (first is None or chunk.end_ns >= first) and (last is None or chunk.start_ns < last)
+
+
+def to_int64(t_ns: Times) -> Ints:
+    """Times as int64, as all arithmetic needs them. Raises TimeOutOfRange if one doesn't fit."""
+    late = t_ns[t_ns > np.uint64(MAX_NS)]
+    if len(late):
+        raise TimeOutOfRange(len(late), int(late.min()))
+    return t_ns.astype(np.int64)
+
+
 class Messages:
     """The messages of a log. All methods raise Damaged where the bytes contradict the index.
 
@@ -243,46 +433,38 @@ class Messages:
         sequence, counts = np.empty_like(t_ns), np.empty_like(t_ns)
         rows, done, taken = schema.empty(), 0, 0
         for batch in batches:
-            content, offset = self._open(batch)
-            message_heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
-            decoded = reader.decode_at(np.frombuffer(content, np.uint8), message_heads.start, message_heads.end)
+            decoded = self._decoded(batch, reader)
             if decoded is None:
                 return None
-            part, counts_of = decoded
-            until = done + len(batch.t_ns)
-            sequence[done:until], counts[done:until] = message_heads.head["sequence"], counts_of
+            part, until = decoded[0], done + len(batch.t_ns)
+            sequence[done:until], counts[done:until] = decoded[1:]
             if taken + len(part) > len(rows):  # room for the rest, if it has as many rows a message as so far
                 share = (len(t_ns) - done) / max(until - done, 1)
                 rows = schema.codec.longer(rows, taken, taken + int(len(part) * share * 1.02) + 1)
             schema.codec.put(rows, taken, part)
             done, taken = until, taken + len(part)
-        rows = rows[:taken]
-        order = np.argsort(t_ns, kind="stable")
-        if (np.diff(order) != 1).any():
-            rows = rows[ragged_range((np.cumsum(counts) - counts)[order], counts[order])]
-        rows.flags.writeable = False
-        return ChannelRows(rows, t_ns[order], sequence[order], counts[order])
+        out = _in_order_of_time(ChannelRows(rows[:taken], t_ns, sequence, counts))
+        out.rows.flags.writeable = False
+        return out
 
     def parts(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> Iterator[ChannelRows | None]:
         """Yield the rows that ``columns`` returns, chunk by chunk; None where a message has another layout."""
         for group in self._located(channels, (None, None)).in_order():
             t_ns = to_int64(np.concatenate([batch.t_ns for batch in group]))
-            rows, sequence, counts = [], [], []
-            for batch in group:
-                content, offset = self._open(batch)
-                message_heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
-                decoded = reader.decode_at(np.frombuffer(content, np.uint8), message_heads.start, message_heads.end)
-                if decoded is None:
-                    yield None
-                    return
-                rows.append(decoded[0])
-                counts.append(decoded[1])
-                sequence.append(message_heads.head["sequence"].astype(np.int64))
-            members, numbers, sizes = schema.joined(rows), np.concatenate(sequence), np.concatenate(counts)
-            order = np.argsort(t_ns, kind="stable")
-            if (np.diff(order) != 1).any():
-                members = members[ragged_range((np.cumsum(sizes) - sizes)[order], sizes[order])]
-            yield ChannelRows(members, t_ns[order], numbers[order], sizes[order])
+            decoded = [part for batch in group if (part := self._decoded(batch, reader)) is not None]
+            if len(decoded) < len(group):
+                yield None
+                return
+            rows, sequence, counts = zip(*decoded, strict=True)
+            members = schema.joined(rows)
+            yield _in_order_of_time(ChannelRows(members, t_ns, np.concatenate(sequence), np.concatenate(counts)))
+
+    def _decoded(self, batch: MessageBatch, reader: RowReader) -> tuple[Rows, Ints, Ints] | None:
+        """The rows of a batch, and sequence number and number of rows of each message; None for another layout."""
+        content, offset = self._open(batch)
+        heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
+        decoded = reader.decode_at(np.frombuffer(content, np.uint8), heads.start, heads.end)
+        return None if decoded is None else (decoded[0], heads.head["sequence"].astype(np.int64), decoded[1])
 
     def fingerprint(self, channel_id: int | None = None) -> str:
         """The fingerprint of a channel, or of the whole log; computed once."""
@@ -309,11 +491,9 @@ class Messages:
         """
         if not self.source.is_remote:
             return MessageBatches(self.source, self.index, channels, span)
-        first, last = span
         indexes, wholes = [], []
         for chunk in self.index.chunks.with_channels(channels):
-            is_before = first is not None and chunk.end_ns < first
-            if is_before or (last is not None and chunk.start_ns >= last):
+            if not overlaps(chunk, span):
                 continue
             end = chunk.offset + chunk.length  # its message indexes follow
             indexes.append((end, end + chunk.message_index_length))

@@ -25,9 +25,8 @@ from mcaptrack.files import publish_stream
 from mcaptrack.log import journal, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.checksums import crc_of
-from mcaptrack.log.chunk_list import ChunkList
 from mcaptrack.log.chunks import LOG_MAX_NS
-from mcaptrack.log.index import Index, SummaryEntry, attachment_entry, metadata_entry, read_index
+from mcaptrack.log.index import ChunkList, Index, SummaryEntry, attachment_entry, metadata_entry, read_index
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord
 

@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.pipeline.checks import Job
-from mcaptrack.pipeline.drawing import RobotPath, Shown, find_views, robot_path
+from mcaptrack.pipeline.checks import Job, cameras_named
+from mcaptrack.pipeline.drawing import RobotPath, find_views, robot_path
 from mcaptrack.pipeline.events import Watch
 from mcaptrack.pipeline.following import Before, Continued, begins_here
 from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
@@ -19,7 +19,7 @@ from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
 from mcaptrack.pipeline.run import Report, input_of, outdated_by, run, warn_clock_jumps
 from mcaptrack.pipeline.summary import Summary, summarise
 from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
-from mcaptrack.pipeline.zones import CountedZones, ZoneWatch, counted_zones
+from mcaptrack.pipeline.zones import ZoneWatch, counted_zones
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import (
     Camera,
@@ -33,48 +33,6 @@ from mcaptrack.sources.cameras import (
 )
 from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.transforms import STAGES
-
-__all__ = [
-    "AS_BEFORE",
-    "LAYOUTS",
-    "Before",
-    "Camera",
-    "Continued",
-    "CountedZones",
-    "Job",
-    "PlaneChoice",
-    "Report",
-    "RobotPath",
-    "Shown",
-    "Summary",
-    "Watch",
-    "ZoneWatch",
-    "attachment_of",
-    "begins_here",
-    "begins_with",
-    "camera_at",
-    "camera_to_name",
-    "choose_cameras",
-    "counted_zones",
-    "find_camera",
-    "find_views",
-    "fusable",
-    "fuse_again",
-    "fuse_cameras",
-    "input_of",
-    "is_stale",
-    "layout_path",
-    "outdated_by",
-    "plan_all",
-    "plan_stage",
-    "read_planes",
-    "robot_path",
-    "run",
-    "scenes_of",
-    "summarise",
-    "warn_clock_jumps",
-]
-
 
 # The cameras that a run of a whole log works on, and the scenes that they are fused to.
 
@@ -102,11 +60,7 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
     """
     every, scenes = cameras(opened), scenes_of(opened)
     if names:
-        named = {name.strip("/"): camera for camera in every for name in camera.names}
-        for name in names:
-            if name.strip("/") not in named:
-                raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(named)) or 'none'}")
-        wanted = list(dict.fromkeys(named[name.strip("/")] for name in names))
+        wanted = cameras_named(opened, names, every)
         wanted_scenes = tuple(camera.prefix for camera in wanted if camera.prefix in scenes)
         wanted = [camera for camera in wanted if camera.prefix not in scenes]
     else:

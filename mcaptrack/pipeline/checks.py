@@ -17,7 +17,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import USUAL, chain_of, provenance_of
+from mcaptrack.sources.cameras import USUAL, Camera, chain_of, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
@@ -55,6 +55,15 @@ def superseded(opened: log.Log, job: Job) -> list[str]:
     before = (topic for topic in opened.channels if topic not in now and topic.startswith(job.target + "/"))
     own = (topic for topic in before if may_replace(opened, topic, stage))
     return sorted(topic for topic in own if main_topic(opened, stage, topic) == job.target)
+
+
+def cameras_named(opened: log.Log, names: Sequence[str], among: Sequence[Camera]) -> list[Camera]:
+    """Return the cameras with these names. Raises McaptrackError for names that none of ``among`` has."""
+    by_name = {name.strip("/"): camera for camera in among for name in camera.names}
+    for name in names:
+        if name.strip("/") not in by_name:
+            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(by_name)) or 'none'}")
+    return list(dict.fromkeys(by_name[name.strip("/")] for name in names))
 
 
 def main_topic(opened: log.Log, stage: str, topic: str) -> str:
@@ -164,6 +173,13 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
                     f"{opened.path}: {job.stage} would replace {name}, which {describe_origin(opened, name)}; "
                     "write to another channel with `to=`"
                 )
+
+
+def conflict_of(opened: log.Log, topics: Sequence[str], stage: str) -> str:
+    """Return the first of these topics that a stage and its views may not replace, with its origin; "" if none."""
+    made_by = {topic: VIEW if "/view/" in topic else stage for topic in topics}
+    taken = next((topic for topic, transform in made_by.items() if not may_replace(opened, topic, transform)), "")
+    return f"{taken}, which {describe_origin(opened, taken)}" if taken else ""
 
 
 def may_replace(opened: log.Log, topic: str, transform: str) -> bool:

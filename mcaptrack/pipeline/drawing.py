@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
-from mcaptrack.foxglove.views import layouts
+from mcaptrack.foxglove.views import MovingCamera, layouts
 from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.camera_path import CameraPath
@@ -202,72 +203,65 @@ class View(NamedTuple):
     messages: Iterator[tuple[int, int, bytes]]
 
 
+@dataclass
 class ViewFactory:
     """Draws the channels of a camera: in its pictures, and in the frame of their metres.
 
-    ``frames`` are the coordinate frames that no transform of the log names; None for that of the ground plane alone.
+    ``frames`` are the coordinate frames that no transform of the log names.
     ``cameras`` are calibrated ones by the topics of their pictures, for tracks with 3D boxes; ``scene`` has the cameras
     that a scene was fused of.
     """
 
-    def __init__(
-        self,
-        prefix: str,
-        picture_ns: Ints,
-        stamp_ns: Ints,
-        planes: Planes,
-        path: CameraPath | None = None,
-        frames: Sequence[str] | None = None,
-        cameras: Mapping[str, views.MovingCamera] = {},
-        scene: SceneOnPictures | None = None,
-    ) -> None:
-        self._scene = scene
-        self._prefix, self._picture_ns, self._stamp_ns, self._planes = prefix, picture_ns, stamp_ns, planes
-        self._path, self._cameras = path, cameras
-        self._frames = (views.ground.frame_of(prefix),) if frames is None else frames
+    prefix: str
+    picture_ns: Ints
+    stamp_ns: Ints
+    planes: Planes
+    path: CameraPath | None
+    frames: Sequence[str]
+    cameras: Mapping[str, MovingCamera]
+    scene: SceneOnPictures
 
     def views(self, shown: Mapping[str, ChannelToDraw], start_ns: int) -> Iterator[View]:
         """Yield the views of these channels, and, once, the transforms to the frames that no other names."""
         for topic, channel in shown.items():
             made_from = Provenance(VIEW, {}, topic, channel.digest)
             group = channel.made_by
-            frame_id = frame_of(self._prefix, channel)
-            if topic == f"{self._prefix}/ground_plane":
-                outline = views.ground.outlines(self._planes, start_ns, frame_id)
+            frame_id = frame_of(self.prefix, channel)
+            if topic == f"{self.prefix}/ground_plane":
+                outline = views.ground.outlines(self.planes, start_ns, frame_id)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
             if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
                 continue  # another channel shows the same tracks at more times
             is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
             frames, names = channel.frames, channel.classes
-            drawing = views.Drawing(topic, channel.schema, frames, self._planes, is_retracked, names, self._path)
+            drawing = views.Drawing(topic, channel.schema, frames, self.planes, is_retracked, names, self.path)
             is_solid = channel.is_solid()
-            if len(self._picture_ns) and not is_solid:
-                drawn = drawing.on_pictures(self._picture_ns, self._stamp_ns)
+            if len(self.picture_ns) and not is_solid:
+                drawn = drawing.on_pictures(self.picture_ns, self.stamp_ns)
                 yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
-            for pictures, camera in self._cameras.items() if is_solid and channel.schema is not DETECTIONS else ():
+            for pictures, camera in self.cameras.items() if is_solid and channel.schema is not DETECTIONS else ():
                 seen = drawing.on_camera(camera, channel.bodies)
                 yield View(topic + views.SUFFIX + pictures, foxglove.ANNOTATIONS, made_from, group, seen)
-            if self._scene is not None and channel.schema is not DETECTIONS:
-                for member in self._scene.cameras:
-                    rows, planes = self._scene.on_camera(member, channel.schema, frames, is_true=not channel.made_by)
-                    on_picture = views.Drawing(topic, channel.schema, rows, planes, is_retracked, names)
-                    seen = on_picture.on_pictures(member.clock.t_ns, member.clock.stamp_ns)
-                    yield View(topic + views.SUFFIX + member.pictures, foxglove.ANNOTATIONS, made_from, group, seen)
+            for member in self.scene.cameras if channel.schema is not DETECTIONS else ():
+                rows, planes = self.scene.on_camera(member, channel.schema, frames, is_true=not channel.made_by)
+                on_picture = views.Drawing(topic, channel.schema, rows, planes, is_retracked, names)
+                seen = on_picture.on_pictures(member.clock.t_ns, member.clock.stamp_ns)
+                yield View(topic + views.SUFFIX + member.pictures, foxglove.ANNOTATIONS, made_from, group, seen)
             if channel.is_on_ground():
                 own_ns = frame_times(channel.frames)
-                t_ns = self._picture_ns if len(self._picture_ns) and not is_solid else own_ns
+                t_ns = self.picture_ns if len(self.picture_ns) and not is_solid else own_ns
                 scene = drawing.on_ground(t_ns, frame_id, channel.bodies)
                 yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
         on_ground = {topic: channel for topic, channel in shown.items() if channel.is_on_ground()}
-        if on_ground and self._frames:
+        if on_ground and self.frames:
             transforms = [
-                (start_ns, number, foxglove.pack_transform(start_ns, views.ground.world_of(self._prefix), frame_id))
-                for number, frame_id in enumerate(self._frames)
+                (start_ns, number, foxglove.pack_transform(start_ns, views.ground.world_of(self.prefix), frame_id))
+                for number, frame_id in enumerate(self.frames)
             ]
-            self._frames = ()
+            self.frames = ()
             topic, channel = next(iter(on_ground.items()))
             made_from = Provenance(VIEW, {}, topic, channel.digest)
-            yield View(frame_topic(self._prefix), foxglove.TRANSFORM, made_from, "", iter(transforms))
+            yield View(frame_topic(self.prefix), foxglove.TRANSFORM, made_from, "", iter(transforms))
 
 
 def frame_topic(prefix: str) -> str:

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple, get_args
@@ -23,21 +23,11 @@ from mcaptrack.evaluation.event_text import SUFFIX, log_messages, nouns_of
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.checks import describe_origin, may_replace
+from mcaptrack.pipeline.checks import conflict_of, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with
-from mcaptrack.pipeline.plan import is_stale
-from mcaptrack.pipeline.write import Made, digest_of
-from mcaptrack.schema import (
-    COUNTS,
-    EVENT_KINDS,
-    EVENTS,
-    FORECAST_ERRORS,
-    FORECAST_SCORES,
-    PREDICTIONS,
-    TRACKS,
-    Frame,
-    Schema,
-)
+from mcaptrack.pipeline.plan import is_outdated
+from mcaptrack.pipeline.write import Made, RunState, digest_of
+from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.schema.provenance import VIEW, Provenance
@@ -72,46 +62,41 @@ def outputs(topic: str) -> tuple[str, ...]:
     return topic + _EVENTS, topic + _EVENTS + SUFFIX, topic + _COUNTS
 
 
-def make_events(opened: log.Log, prefix: str, results: Mapping[str, Made], watch: Watch) -> dict[str, Made]:
+def make_events(state: RunState, watch: Watch) -> dict[str, Made]:
     """Find the events of tracks and the errors of forecasts that are missing or out of date.
 
-    ``results`` are those of this run, by topic. Returns the channels that it makes by topic. A channel that can't
-    be compared with the ground truth is left out, with a warning. Raises McaptrackError for given topics that hold no
-    tracks.
+    Returns the channels that it makes by topic. A channel that can't be compared with the ground truth is left out,
+    with a warning. Raises McaptrackError for given topics that hold no tracks.
     """
+    opened, prefix, _ = state
     out: dict[str, Made] = {}
-    topics = watch.topics or _default_topics(opened, prefix, results)
+    topics = watch.topics or _default_topics(state)
     if watch.again and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
 
     @cache
     def truth() -> _GroundTruth:
-        return _read_truth(opened, prefix, results)
+        return _read_truth(state)
 
     for topic in topics:
         options = watch.options if watch.again else _options_for(opened, topic, watch.options)
         has_same_options = _options_for(opened, topic, EventOptions()) == options
-        is_up_to_date = has_same_options and not _is_outdated(opened, outputs(topic), results)
+        is_up_to_date = has_same_options and not is_outdated(state, outputs(topic))
         if is_up_to_date and not (watch.again or watch.force):
             continue
-        conflict = _find_conflict(opened, outputs(topic))
-        if conflict:
+        if conflict := conflict_of(opened, outputs(topic), STAGE):
             if watch.topics:
                 raise McaptrackError(f"{opened.path}: events would replace {conflict}")
             warn(f"no events of {topic}: they would replace {conflict}", "left-out")
             continue
-        frames, tracks_digest = _rows(opened, topic, results)
-        names = class_names(
-            results[topic].provenance.to_metadata() if topic in results else opened.channel(topic).metadata
-        )
-        classes = (truth().classes, names)
-        origin = results[topic].provenance if topic in results else provenance_of(opened, topic)
-        frames = repaired_tracks(frames, origin)
+        tracks = state.results[topic].frames if topic in state.results else opened.frame_columns(topic, TRACKS)
+        classes = (truth().classes, state.classes(topic))
+        frames = repaired_tracks(tracks, state.provenance(topic))
         track_events = find_events(frames, truth().frames, options, opened.path.stem, topic, classes)
         for note in track_events.notes:
             warn(note, "not-compared")
         parameters = track_events.parameters(options)
-        provenance = Provenance(STAGE, parameters, topic, tracks_digest, references=truth().digests)
+        provenance = Provenance(STAGE, parameters, topic, state.digest(topic), references=truth().digests)
         out[topic + _EVENTS] = events = Made.of(EVENTS, track_events.events, provenance)
         nouns = nouns_of(truth().frames or (), frames, classes)
         text = list(log_messages(track_events.events, topic, opened.start_ns, track_events.frame_interval_s, nouns))
@@ -120,39 +105,32 @@ def make_events(opened: log.Log, prefix: str, results: Mapping[str, Made], watch
         out[topic + _COUNTS] = Made.of(COUNTS, track_events.counts, provenance)
     if not watch.topics:
         for name in FORECAST_INPUTS:
-            out |= _forecast_errors(opened, prefix, name, results, watch.again or watch.force, truth)
+            out |= _forecast_errors(state, name, watch.again or watch.force, truth)
     return out
 
 
-def _forecast_errors(
-    opened: log.Log,
-    prefix: str,
-    name: str,
-    results: Mapping[str, Made],
-    again: bool,
-    truth: Callable[[], _GroundTruth],
-) -> dict[str, Made]:
+def _forecast_errors(state: RunState, name: str, again: bool, truth: Callable[[], _GroundTruth]) -> dict[str, Made]:
     """Find the errors of the forecasts in one channel, if the channel exists and its errors are missing or outdated."""
-    topic, tracks, later = (f"{prefix}/{part}" for part in (name, FORECAST_INPUTS[name], _OFFLINE))
-    if not _has_rows(opened, topic, results, PREDICTIONS) or not _has_rows(opened, tracks, results):
+    topic, tracks, later = (f"{state.prefix}/{part}" for part in (name, FORECAST_INPUTS[name], _OFFLINE))
+    if not state.holds(topic, PREDICTIONS) or not state.holds(tracks, TRACKS):
         return {}
-    later = later if _has_rows(opened, later, results) else tracks
+    later = later if state.holds(later, TRACKS) else tracks
     topics = (topic + _ERRORS, topic + _SCORES)
-    if not again and not _is_outdated(opened, topics, results) and later in _input_digests(opened, topics[0]):
+    if not again and not is_outdated(state, topics) and later in _inputs_of(state.opened, topics[0]):
         return {}
-    conflict = _find_conflict(opened, topics)
-    if conflict:
+    if conflict := conflict_of(state.opened, topics, STAGE):
         warn(f"no errors of {topic}: they would replace {conflict}", "left-out")
         return {}
-    forecasts, digest_of_forecasts = _rows(opened, topic, results, PREDICTIONS)
-    (history, of_tracks), (offline, of_later) = (_rows(opened, each, results) for each in (tracks, later))
+    history, offline = state.frames(tracks), state.frames(later)
     try:
-        forecast_errors = find_forecast_errors(forecasts, history, truth().frames, offline, topic)
+        forecast_errors = find_forecast_errors(
+            state.frames(topic, PREDICTIONS), history, truth().frames, offline, topic
+        )
     except McaptrackError as error:
         warn(f"no errors of forecasts: {error}", "not-compared")
         return {}
-    references = truth().digests | {tracks: of_tracks, later: of_later}
-    provenance = Provenance(STAGE, {}, topic, digest_of_forecasts, references=references)
+    references = truth().digests | {each: state.digest(each) for each in (tracks, later)}
+    provenance = Provenance(STAGE, {}, topic, state.digest(topic), references=references)
     return {
         topics[0]: Made.of(FORECAST_ERRORS, forecast_errors.errors, provenance),
         topics[1]: Made.of(FORECAST_SCORES, forecast_errors.scores, provenance),
@@ -182,29 +160,30 @@ class _GroundTruth(NamedTuple):
     classes: Mapping[int, str] = {}
 
 
-def _read_truth(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> _GroundTruth:
-    topic = camera_at(opened, prefix).truth
+def _read_truth(state: RunState) -> _GroundTruth:
+    opened = state.opened
+    topic = camera_at(opened, state.prefix).truth
     if topic not in opened.channels:
         return _GroundTruth(None, {topic: ""})
-    if not _has_rows(opened, topic):
+    if not opened.channels[topic].holds(TRACKS):
         return _GroundTruth(None, {})
     try:
         names = class_names(opened.channel(topic).metadata)
-        return _GroundTruth(ground_truth_with(opened, prefix, results), {topic: digest_of(opened, topic)}, names)
+        return _GroundTruth(ground_truth_with(state), {topic: digest_of(opened, topic)}, names)
     except McaptrackError as error:
         warn(f"no misses, false tracks and switches: {error}", "not-compared")
         return _GroundTruth(None, {})
 
 
-def _default_topics(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> list[str]:
+def _default_topics(state: RunState) -> list[str]:
     """Return the default channels of tracks, and those of the camera that have events already."""
-    topics = [f"{prefix}/{name}" for name in WATCHED]
+    topics = [f"{state.prefix}/{name}" for name in WATCHED]
     topics += [
         topic.removesuffix(_EVENTS)
-        for topic in sorted(camera_at(opened, prefix).topics)
-        if topic.endswith(_EVENTS) and may_replace(opened, topic, STAGE)
+        for topic in sorted(camera_at(state.opened, state.prefix).topics)
+        if topic.endswith(_EVENTS) and may_replace(state.opened, topic, STAGE)
     ]
-    return [topic for topic in dict.fromkeys(topics) if _has_rows(opened, topic, results)]
+    return [topic for topic in dict.fromkeys(topics) if state.holds(topic, TRACKS)]
 
 
 def _options_for(opened: log.Log, topic: str, requested: EventOptions) -> EventOptions:
@@ -224,41 +203,7 @@ def _is_gate(value: Any) -> bool:
     return isinstance(value, float | int) and not isinstance(value, bool) and value > 0
 
 
-def _is_outdated(opened: log.Log, topics: Sequence[str], results: Mapping[str, Made]) -> bool:
-    """Return whether one of these topics is missing, or an input of the first one has changed since."""
-    if not all(topic in opened.channels for topic in topics) or is_stale(opened, topics[0]):
-        return True
-    then = _input_digests(opened, topics[0])
-    return not then or any(
-        name in results and results[name].provenance.digest != digest for name, digest in then.items()
-    )
-
-
-def _input_digests(opened: log.Log, topic: str) -> dict[str, str]:
+def _inputs_of(opened: log.Log, topic: str) -> dict[str, str]:
     """Return the digests of a channel's inputs when it was made, by topic."""
-    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    provenance = provenance_of(opened, topic)
     return provenance.made_from() if provenance else {}
-
-
-def _find_conflict(opened: log.Log, topics: Sequence[str]) -> str:
-    """Return the first of these topics that events may not replace, with its origin, as text; "" if there is none."""
-    made_by = {topic: VIEW if topic.endswith(SUFFIX) else STAGE for topic in topics}
-    taken = [topic for topic, transform in made_by.items() if not may_replace(opened, topic, transform)]
-    return f"{taken[0]}, which {describe_origin(opened, taken[0])}" if taken else ""
-
-
-def _has_rows(opened: log.Log, topic: str, results: Mapping[str, Made] = {}, schema: Schema = TRACKS) -> bool:
-    """Return whether a channel of the log or of this run has the given schema."""
-    if topic in results:
-        return results[topic].schema is schema
-    channel = opened.channels.get(topic)
-    return channel is not None and channel.holds(schema)
-
-
-def _rows(
-    opened: log.Log, topic: str, results: Mapping[str, Made], schema: Schema = TRACKS
-) -> tuple[Sequence[Frame], str]:
-    """Return the frames of a channel, and the digest of its messages."""
-    if topic in results:
-        return results[topic].frames, results[topic].provenance.digest
-    return opened.frame_columns(topic, schema), digest_of(opened, topic)

@@ -12,8 +12,8 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, fits, read_frames
-from mcaptrack.pipeline.write import Made, digest_of
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame, Schema
+from mcaptrack.pipeline.write import RunState
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame
 from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import motion_topic, path_of, read_ground_truth
@@ -74,77 +74,69 @@ def detects_motion(provenance: Provenance | None) -> bool:
     return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
 
 
-def side_inputs(opened: log.Log, prefix: str, job: Job, results: Mapping[str, Made]) -> SideInputs:
-    """Return the inputs of a job beside its main one. ``results`` are the channels that jobs before it made."""
+def side_inputs(state: RunState, job: Job) -> SideInputs:
+    """Return the inputs of a job beside its main one."""
     names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
     if "camera_path" in names and uses_motion(job.transform):
-        return _path(opened, prefix, job, results)
+        return _path(state, job)
     if "known_boxes" in names and getattr(job.transform, "mask_boxes", False):
-        return _boxes(opened, prefix, results)
+        return _boxes(state)
     return SideInputs({}, {})
 
 
-def _path(opened: log.Log, prefix: str, job: Job, results: Mapping[str, Made]) -> SideInputs:
+def _path(state: RunState, job: Job) -> SideInputs:
     """Return the path of the camera, if its motion is known."""
-    topic = motion_topic(prefix)
-    motion_read = _read(opened, topic, CAMERA_MOTION, results)
-    if motion_read is None:
+    topic = motion_topic(state.prefix)
+    if not state.holds(topic, CAMERA_MOTION):
         if getattr(job.transform, "camera_motion", "") == "on":
             warn(f"the motion of the camera is not known: {topic} needs pictures of it in the log", "option-not-used")
         return SideInputs({}, {})
-    frames, digest = motion_read
+    frames = state.frames(topic, CAMERA_MOTION)
     try:
         path = frames_to_path(frames)
     except McaptrackError as error:
-        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
-    return SideInputs({"camera_path": path}, {topic: digest})
+        raise McaptrackError(f"{state.opened.path}: {topic}: {error}") from None
+    return SideInputs({"camera_path": path}, {topic: state.digest(topic)})
 
 
-def path_with(
-    opened: log.Log, prefix: str, topic: str, results: Mapping[str, Made]
-) -> tuple[CameraPath | None, Mapping[str, str]]:
+def path_with(state: RunState, topic: str) -> tuple[CameraPath | None, Mapping[str, str]]:
     """Return what ``path_of`` does, with the channels of this run."""
-    return path_of(opened, prefix, topic, *_of_run(results))
+    return path_of(state.opened, state.prefix, topic, *_of_run(state))
 
 
-def ground_truth_with(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> list[Frame]:
+def ground_truth_with(state: RunState) -> list[Frame]:
     """Return what ``read_ground_truth`` does, with the channels of this run."""
-    return read_ground_truth(opened, prefix, *_of_run(results))
+    return read_ground_truth(state.opened, state.prefix, *_of_run(state))
 
 
-def _of_run(results: Mapping[str, Made]) -> tuple[dict[str, Provenance], dict[str, Sequence[Frame]]]:
-    return {topic: channel.provenance for topic, channel in results.items()}, {
-        topic: channel.frames for topic, channel in results.items()
-    }
+def _of_run(state: RunState) -> tuple[dict[str, Provenance], dict[str, Sequence[Frame]]]:
+    results = state.results.items()
+    return {topic: channel.provenance for topic, channel in results}, {name: made.frames for name, made in results}
 
 
-def moves(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> bool:
+def moves(state: RunState) -> bool:
     """Whether the camera is known to move, or its pictures to have cuts."""
-    motion_read = _read(opened, motion_topic(prefix), CAMERA_MOTION, results)
+    topic = motion_topic(state.prefix)
+    frames = state.frames(topic, CAMERA_MOTION)
     try:
-        return motion_read is not None and frames_to_path(motion_read[0]).matters
+        return state.holds(topic, CAMERA_MOTION) and frames_to_path(frames).matters
     except McaptrackError:
         return False
 
 
-def _boxes(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> SideInputs:
+def _boxes(state: RunState) -> SideInputs:
     """The boxes of people, by the time of their picture."""
-    usual = f"{prefix}/{next(s.output_topic for s in STAGES.values() if s.writes[''] is DETECTIONS)}"
-    topic = usual if usual in results or usual in opened.channels else camera_at(opened, prefix).boxes
-    boxes_read = None if topic is None else _read(opened, topic, DETECTIONS, results)
-    if topic is None or boxes_read is None or _needs_still_camera(opened, topic, ()):
+    opened = state.opened
+    usual = f"{state.prefix}/{next(s.output_topic for s in STAGES.values() if s.writes[''] is DETECTIONS)}"
+    is_usual = usual in state.results or usual in opened.channels
+    topic = usual if is_usual else camera_at(opened, state.prefix).boxes
+    if topic is None or _needs_still_camera(opened, topic, ()):
         return SideInputs({}, {})
-    boxes = {frame.t_ns: columns_to_boxes(frame.rows) for frame in boxes_read[0] if len(frame.rows)}
-    return SideInputs({"known_boxes": boxes}, {topic: boxes_read[1]})
-
-
-def _read(
-    opened: log.Log, topic: str, schema: Schema, results: Mapping[str, Made]
-) -> tuple[Sequence[Frame], str] | None:
-    """The frames of a channel and their digest; None if it isn't there or holds something else."""
-    if topic in results:
-        return results[topic].frames, results[topic].provenance.digest
-    channel = opened.channels.get(topic)
-    if channel is None or not fits(channel, schema)[1]:
-        return None
-    return read_frames(opened, topic, schema), digest_of(opened, topic)
+    if topic in state.results:
+        frames = state.frames(topic, DETECTIONS)
+    elif fits(opened.channels[topic], DETECTIONS)[1]:
+        frames = read_frames(opened, topic, DETECTIONS)
+    else:
+        return SideInputs({}, {})
+    boxes = {frame.t_ns: columns_to_boxes(frame.rows) for frame in frames if len(frame.rows)}
+    return SideInputs({"known_boxes": boxes}, {topic: state.digest(topic)})

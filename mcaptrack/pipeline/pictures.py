@@ -26,7 +26,7 @@ from mcaptrack.geometry.colour_histograms import LENGTH, at_border, describe, is
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.schema.framing import frame_times, has_any
+from mcaptrack.schema.framing import frame_times, has_any, nearest_times
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
@@ -262,12 +262,8 @@ def _nearest(picture_ns: Ints, sample_ns: Ints) -> Ints:
     """The number of the picture that shows each sample time, or -1."""
     if len(picture_ns) == 0:
         return np.full(len(sample_ns), -1)
-    after = np.clip(np.searchsorted(picture_ns, sample_ns), 1, max(len(picture_ns) - 1, 1))
-    pair = np.stack([after - 1, np.minimum(after, len(picture_ns) - 1)])
-    off = np.abs(picture_ns[pair] - sample_ns)
-    best = off.argmin(axis=0)
-    columns = np.arange(len(sample_ns))
-    return np.where(off[best, columns] <= _NEAR_NS, pair[best, columns], -1)
+    number = nearest_times(picture_ns, sample_ns)
+    return np.where(np.abs(picture_ns[number] - sample_ns) <= _NEAR_NS, number, -1)
 
 
 def _described(

@@ -7,7 +7,7 @@ transform with the same parameters, or left as it is, with a warning, if that is
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +20,7 @@ from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
-from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.pipeline.write import RunState, digest_of
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
@@ -94,8 +94,8 @@ def plan_all(
     ``plan_stage`` does, and if the class that made a channel is not installed.
     """
     sources = {first_stage(opened, source): source} if source else {}
-    planner = _Planner(opened, prefix, sources, defaults, force, chosen, shared, plane, frame_id)
-    planner.take_as_changed(changed, renewed)
+    changes = dict.fromkeys(changed, True)
+    planner = _Planner(opened, prefix, sources, defaults, force, chosen, shared, plane, frame_id, renewed, changes)
     warn_unused(opened, prefix, plane)
     read = {stage.input_topic for stage in STAGES.values()}
     for stage in STAGES.values():
@@ -133,23 +133,8 @@ def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
 
 
 def tracker_of(space: str) -> str:
-    """Return the name of the first tracker of a space. Raises McaptrackError if there is none."""
-    names = _trackers_of(space)
-    if not names:
-        raise McaptrackError(f"no tracker takes {_BOXES[space]}; `tracker=` names one of your own")
-    return names[0]
-
-
-def _trackers_of(space: str) -> list[str]:
-    return [name for name, cls in STAGES["track"].built_in().items() if traits_of(cls).space == space]
-
-
-def suited_tracker(opened: log.Log, stage: Stage, source: str) -> str:
-    """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
-    if stage.reads is not DETECTIONS:
-        return ""
-    spaces, default = spaces_of_boxes(opened, source), traits_of(STAGES["track"].default).space
-    return tracker_of(next(iter(sorted(spaces)))) if spaces and default not in spaces else ""
+    """Return the name of the first built-in tracker of a space."""
+    return next(name for name, cls in STAGES["track"].built_in().items() if traits_of(cls).space == space)
 
 
 def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: str = "") -> None:
@@ -168,10 +153,10 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
         spaces, space = spaces_of_boxes(opened, job.source), traits_of(job.transform).space
         if spaces and space not in spaces:
             has = " and ".join(_BOXES[name_of_space] for name_of_space in sorted(spaces))
-            name, others = STAGES["track"].choice(job.transform), _trackers_of(next(iter(sorted(spaces))))
-            other = f"`tracker={others[0]!r}` takes these" if others else "no built-in one takes these"
+            name, other = STAGES["track"].choice(job.transform), tracker_of(min(spaces))
             raise McaptrackError(
-                f"{opened.path}: {job.source} has {has}, and the tracker {name} takes {_BOXES[space]}; " + other
+                f"{opened.path}: {job.source} has {has}, and the tracker {name} takes {_BOXES[space]}; "
+                f"`tracker={other!r}` takes these"
             )
 
 
@@ -179,25 +164,7 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
 
 
 #: The stage that takes corrections.
-_STAGE: Final = "sample"
-
-
-def are_new(opened: log.Log, prefix: str, how: Provenance) -> bool:
-    """Whether samples were made before their tracks had corrections."""
-    corrections = (
-        corrections_of(opened, camera_at(opened, prefix).prefix, how.input) if how.transform == _STAGE else None
-    )
-    return corrections is not None and corrections not in how.references
-
-
-def corrected_input(
-    opened: log.Log, prefix: str, job: Job, frames: Sequence[Frame]
-) -> tuple[Sequence[Frame], Mapping[str, str]]:
-    """Return the input of a job, corrected if it is sampled, and the digests of the corrections by topic."""
-    topic = corrections_of(opened, prefix, job.source) if job.stage == _STAGE else None
-    if topic is None:
-        return frames, {}
-    return with_corrections(frames, opened.frame_columns(topic, TRACKS)), {topic: digest_of(opened, topic)}
+CORRECTED_IN: Final = "sample"
 
 
 def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence[Frame]) -> Sequence[Frame]:
@@ -214,7 +181,7 @@ def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequenc
 
 def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
-    if provenance.transform != _STAGE:
+    if provenance.transform != CORRECTED_IN:
         return False
     ending = f"/{CORRECTED}"
     then = {topic: digest for topic, digest in provenance.references.items() if topic.endswith(ending)}
@@ -222,14 +189,13 @@ def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> b
     return then != ({} if corrections is None else {corrections: digest_of(opened, corrections)})
 
 
-def fixed_in(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> tuple[int, ...]:
+def fixed_in(state: RunState, source: str) -> tuple[int, ...]:
     """The ids of corrected tracks in the samples at ``source``; () if they were made without corrections."""
-    how = results[source].provenance if source in results else provenance_of(opened, source)
-    topic = corrections_of(opened, prefix, how.input) if how and how.transform == _STAGE else None
+    how = state.provenance(source)
+    topic = corrections_of(state.opened, state.prefix, how.input) if how and how.transform == CORRECTED_IN else None
     if how is None or topic is None or topic not in how.references:
         return ()
-    tracks = results[how.input].frames if how.input in results else opened.frame_columns(how.input, TRACKS)
-    return fixed_ids(tracks, opened.frame_columns(topic, TRACKS))
+    return fixed_ids(state.frames(how.input), state.opened.frame_columns(topic, TRACKS))
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
@@ -242,80 +208,74 @@ def is_stale(opened: log.Log, topic: str) -> bool:
         planes = read_planes(opened, prefix)
         if planes_to_json(planes or ()) != provenance.parameters["ground_planes"]:
             return True
-    if motion.is_motion_new(opened, prefix, provenance) or are_new(opened, prefix, provenance):
+    if motion.is_motion_new(opened, prefix, provenance) or is_of_corrections(opened, prefix, provenance):
         return True
-    if _has_other_planes(opened, provenance):
-        return True
+    planes_used = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
+    if any(camera_at(opened, name_above(name)).ground_plane != name for name in planes_used):
+        return True  # a plane was corrected, or its correction is gone
     if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
         return True
-    for name, then in provenance.made_from().items():
-        now = provenance_of(opened, name)
-        if now and now.digest and now.digest != then:
-            return True
-    return False
+    now = {name: how for name in provenance.made_from() if (how := provenance_of(opened, name)) and how.digest}
+    return any(how.digest != provenance.made_from()[name] for name, how in now.items())
 
 
-def _has_other_planes(opened: log.Log, provenance: Provenance) -> bool:
-    """Return whether a camera of a scene has a corrected ground plane, or has none any more."""
-    planes = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
-    return any(camera_at(opened, name_above(name)).ground_plane != name for name in planes)
+def is_outdated(state: RunState, topics: Sequence[str]) -> bool:
+    """Return whether one of these topics is missing, or an input of the first one has changed since, also in a run."""
+    if not all(topic in state.opened.channels for topic in topics) or is_stale(state.opened, topics[0]):
+        return True
+    provenance = provenance_of(state.opened, topics[0])
+    then = provenance.made_from() if provenance else {}
+    return not then or any(name in state.results and state.digest(name) != digest for name, digest in then.items())
 
 
+@dataclass
 class _Planner:
     """Collects the jobs that make missing channels, and those that are out of date.
 
     ``sources`` gives inputs and ``defaults`` transforms of stages that differ from the usual ones. With ``force`` all
     stages run, also those that are up to date. A stage also runs if an option in ``chosen`` differs from the one that
-    its channel was made with, or one in ``shared``.
+    its channel was made with, or one in ``shared``, and if its channel is in ``renewed``. ``changes`` says which
+    channels will change.
     """
 
-    def __init__(
-        self,
-        opened: log.Log,
-        prefix: str,
-        sources: Mapping[str, str] = {},
-        defaults: Mapping[str, Transform] = {},
-        force: bool = False,
-        chosen: Collection[str] = (),
-        shared: Mapping[str, object] = {},
-        plane: PlaneChoice = AS_BEFORE,
-        frame_id: str = "",
-    ) -> None:
+    opened: log.Log
+    prefix: str
+    sources: Mapping[str, str] = field(default_factory=dict)
+    defaults: Mapping[str, Transform] = field(default_factory=dict)
+    force: bool = False
+    chosen: Collection[str] = ()
+    shared: Mapping[str, object] = field(default_factory=dict)
+    plane: PlaneChoice = AS_BEFORE
+    frame_id: str = ""
+    renewed: Collection[str] = ()
+    changes: dict[str, bool] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
         self.jobs: list[Job] = []
-        self._opened, self._prefix = opened, prefix
-        self._sources, self._defaults, self._force, self._chosen = sources, defaults, force, chosen
-        self._shared, self._plane, self._frame_id = shared, plane, frame_id
-        self._changes: dict[str, bool] = {}
-        self._renewed: Collection[str] = ()
         self._gone: set[str] = set()
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
         self._is_of_older_version = False
 
-    def take_as_changed(self, topics: Collection[str], renewed: Collection[str]) -> None:
-        """Plan all that is made from these topics, and those in ``renewed``."""
-        self._changes |= dict.fromkeys(topics, True)
-        self._renewed = renewed
-
     def checked(self, say: Say) -> list[Job]:
         """Check the jobs and return them; only after that report which run and why."""
         if self._unnamed:
             raise McaptrackError(self._refusal())
-        check_inputs(self._opened, self._prefix, self.jobs)
-        check_spaces(self._opened, self._prefix, self.jobs, self._frame_id)
+        check_inputs(self.opened, self.prefix, self.jobs)
+        check_spaces(self.opened, self.prefix, self.jobs, self.frame_id)
         for note in self._notes:
             say(note)
         return self.jobs
 
     def source_of(self, stage: str) -> str:
         """Return the topic that a stage reads if it has not run before."""
-        usual = f"{self._prefix}/{STAGES[stage].input_topic}"
+        usual = f"{self.prefix}/{STAGES[stage].input_topic}"
         if STAGES[stage].on_demand and (begun := self._given_pictures()):
             return begun
-        if stage in self._sources or usual in self._opened.channels:
-            return self._sources.get(stage, usual)
-        camera = camera_at(self._opened, self._prefix)
+        if stage in self.sources or usual in self.opened.channels:
+            return self.sources.get(stage, usual)
+        camera = camera_at(self.opened, self.prefix)
         reads = STAGES[stage].reads
         if reads is VIDEO and camera.pictures:
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
@@ -329,42 +289,47 @@ class _Planner:
 
     def suited_tracker(self, stage: str, source: str) -> str:
         """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
-        if name := suited_tracker(self._opened, STAGES[stage], source):
-            self._notes.append(f"{source} has boxes in space: tracking by {name}")
+        if STAGES[stage].reads is not DETECTIONS:
+            return ""
+        spaces = spaces_of_boxes(self.opened, source)
+        if not spaces or traits_of(STAGES["track"].default).space in spaces:
+            return ""
+        name = tracker_of(min(spaces))
+        self._notes.append(f"{source} has boxes in space: tracking by {name}")
         return name
 
     def ensure(self, topic: str) -> bool:
         """Plan the jobs that make ``topic``, if any are needed. Returns whether the topic will change."""
-        if topic not in self._changes:
-            self._changes[topic] = False  # ends the search at a channel that names itself as an input
-            self._changes[topic] = self._plan(topic)
-        return self._changes[topic]
+        if topic not in self.changes:
+            self.changes[topic] = False  # ends the search at a channel that names itself as an input
+            self.changes[topic] = self._plan(topic)
+        return self.changes[topic]
 
     def _plan(self, topic: str) -> bool:
-        usual = USUAL.get(topic.removeprefix(self._prefix + "/"), "") if topic.startswith(self._prefix + "/") else ""
-        provenance = provenance_of(self._opened, topic)
-        if topic not in self._opened.channels:
+        usual = USUAL.get(topic.removeprefix(self.prefix + "/"), "") if topic.startswith(self.prefix + "/") else ""
+        provenance = provenance_of(self.opened, topic)
+        if topic not in self.opened.channels:
             sibling = self._sibling(usual, topic)
             return self._make_again(sibling, usual, topic) if sibling else bool(usual) and self._make(usual, topic)
         if provenance is None or provenance.transform not in STAGES:
-            if usual in self._sources and topic != self._sources[usual]:
+            if usual in self.sources and topic != self.sources[usual]:
                 raise McaptrackError(self._not_made(usual, topic))
             return False  # no stage makes recorded and ingested channels
         return self._make_again(provenance, provenance.transform, topic)
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
         """Return the provenance of another output of the stage that makes ``topic``; None if there is none."""
-        topics = STAGES[stage].outputs(main_topic(self._opened, stage, topic)) if stage else ()
-        provenances = (provenance_of(self._opened, output) for output in topics)
+        topics = STAGES[stage].outputs(main_topic(self.opened, stage, topic)) if stage else ()
+        provenances = (provenance_of(self.opened, output) for output in topics)
         return next((provenance for provenance in provenances if provenance and provenance.transform == stage), None)
 
     def _replace_older(self, provenance: Provenance, stage: str, topic: str) -> bool:
         """With ``force`` plan the stage of a channel of an older version by its defaults; or else say that it stays."""
-        if self._force:
+        if self.force:
             return self._make(stage, topic, f"was made by version {provenance.version}")
         if not self._is_of_older_version:
             self._is_of_older_version = True
-            force = call("run", self._opened.path, force=True)
+            force = call("run", self.opened.path, force=True)
             text = f"made by an older version ({provenance.version}), and left as it is; {force} makes all again"
             warn(f"{topic} was {text}", "out-of-date")
         return False
@@ -374,10 +339,10 @@ class _Planner:
         source = self.source_of(stage)
         self.ensure(source)
         self._notes.append(f"{topic} {why}: running {stage}")
-        chosen = self._defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
+        chosen = self.defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         transform = self._with_choice(chosen)
         self.ensure_motion(transform, source)
-        self.add(Job(stage, transform, source, main_topic(self._opened, stage, topic), frame_id=self._frame_id))
+        self.add(Job(stage, transform, source, main_topic(self.opened, stage, topic), frame_id=self.frame_id))
         return True
 
     def _suited(self, stage: str, source: str) -> Transform | None:
@@ -387,10 +352,10 @@ class _Planner:
         if maker is None or suited is None:
             name = self.suited_tracker(stage, source)
             return STAGES[stage].make(name) if name else None
-        made_by = next(producer for producer in STAGES.values() if f"{self._prefix}/{producer.output_topic}" == source)
+        made_by = next(producer for producer in STAGES.values() if f"{self.prefix}/{producer.output_topic}" == source)
         made_by = FUSION if maker.reads is SIGHTINGS else made_by
         named = f"{made_by.option} {made_by.choice(maker)}"
-        parameters, planes = dict(suited.parameters), read_planes(self._opened, self._prefix)
+        parameters, planes = dict(suited.parameters), read_planes(self.opened, self.prefix)
         if planes and not is_assumed(planes):
             parameters |= suited.on_ground
         try:
@@ -409,14 +374,14 @@ class _Planner:
         for job in self.jobs:
             if topic in job.outputs():
                 return job.transform
-        how = provenance_of(self._opened, topic)
+        how = provenance_of(self.opened, topic)
         if how and how.transform == FUSE:
             return fuser_of(how)[0]
         return self._before(how.transform, how)[0] if how and how.transform in STAGES else None
 
     def _is_made_by_another(self, topic: str) -> bool:
         """Return whether this run makes a channel by another class of transforms than before."""
-        provenance = provenance_of(self._opened, topic)
+        provenance = provenance_of(self.opened, topic)
         jobs = [job for job in self.jobs if topic in job.outputs()]
         if not jobs or provenance is None or provenance.transform not in STAGES:
             return False
@@ -425,34 +390,34 @@ class _Planner:
 
     def _make_again(self, provenance: Provenance, stage: str, topic: str) -> bool:
         """Plan the stage of a channel again if the channel is missing, out of date, or gets another input now."""
-        is_missing = topic not in self._opened.channels
+        is_missing = topic not in self.opened.channels
         had = provenance.input or self.source_of(stage)
-        source = self._sources.get(stage, had)
+        source = self.sources.get(stage, had)
         is_changed = [self.ensure(used) for used in (source, *provenance.references)]
-        is_due = any(is_changed) or is_missing or is_stale(self._opened, topic) or source != had
-        is_due = is_due or topic in self._renewed
+        is_due = any(is_changed) or is_missing or is_stale(self.opened, topic) or source != had
+        is_due = is_due or topic in self.renewed
         before, why_not = self._before(stage, provenance)
         if isinstance(why_not, OlderVersionError):
             return self._replace_older(provenance, stage, topic)
-        main = main_topic(self._opened, stage, topic)
+        main = main_topic(self.opened, stage, topic)
         # A result at another topic keeps the parameters that it was requested with.
-        is_usual = main == f"{self._prefix}/{STAGES[stage].output_topic}"
-        is_open = is_usual and stage not in self._defaults and self._is_made_by_another(source)
+        is_usual = main == f"{self.prefix}/{STAGES[stage].output_topic}"
+        is_open = is_usual and stage not in self.defaults and self._is_made_by_another(source)
         suited = self._suited(stage, source) if is_open else None
-        wanted = self._with_choice(self._defaults.get(stage, suited or before)) if is_usual else before
+        wanted = self._with_choice(self.defaults.get(stage, suited or before)) if is_usual else before
         is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
-        is_replaced = is_replaced or self._frame_id not in ("", provenance.frame_id or self._frame_id)
+        is_replaced = is_replaced or self.frame_id not in ("", provenance.frame_id or self.frame_id)
         is_projected = is_usual and STAGES[stage].needs_scale
-        is_projected = is_projected and is_plane_due(self._opened, self._prefix, source, self._plane)
+        is_projected = is_projected and is_plane_due(self.opened, self.prefix, source, self.plane)
         is_due = is_due or is_projected
-        if wanted and not is_replaced and not self._force:
+        if wanted and not is_replaced and not self.force:
             self._warn_settings(main, differing(before, wanted) if before else str(why_not))
-        if not is_due and not self._force and not is_replaced:
+        if not is_due and not self.force and not is_replaced:
             return False
-        transform = wanted if self._force or is_replaced else before
+        transform = wanted if self.force or is_replaced else before
         if transform and is_missing and topic not in Job(stage, transform, source, main).kept():
             return False  # a class of another package doesn't make all outputs of the built-in ones
-        if source in self._gone or (source not in self._opened.channels and not self._changes[source]):
+        if source in self._gone or (source not in self.opened.channels and not self.changes[source]):
             warn(f"{topic} stays as it is: {source}, which it was made from, is gone", "out-of-date")
             return False
         if transform is None:
@@ -460,7 +425,7 @@ class _Planner:
                 self._unnamed[topic] = why_not
                 return True
             if is_missing or source != had or isinstance(why_not, MissingPluginError):
-                raise McaptrackError(f"{self._opened.path}: {topic} can't be made from {source}: {why_not}")
+                raise McaptrackError(f"{self.opened.path}: {topic} can't be made from {source}: {why_not}")
             why = "is out of date and" if is_due else "is not made again, it"
             warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
             return False
@@ -471,97 +436,97 @@ class _Planner:
             self._notes.append(f"{topic} was made from {had}: running {stage} again, from {source}")
         elif is_replaced:
             is_other = before is None or STAGES[stage].choice(before) != STAGES[stage].choice(transform)
-            others = " or ".join(f"`{name}=`" for name in (*self._shared, "frame"))
+            others = " or ".join(f"`{name}=`" for name in (*self.shared, "frame"))
             by = f"by another {STAGES[stage].option}" if is_other else f"with another {others}"
             self._notes.append(f"{topic} was made {by}: running {stage} again")
         elif is_projected:
             self._notes.append(f"{topic} was made with another ground plane: running {stage} again, as before")
-        elif topic in self._renewed:
+        elif topic in self.renewed:
             self._notes.append(f"{topic} goes on from another log: running {stage} again")
-        elif is_due and not self._force:
-            is_corrected = is_of_corrections(self._opened, self._prefix, provenance)
+        elif is_due and not self.force:
+            is_corrected = is_of_corrections(self.opened, self.prefix, provenance)
             why = f"{topic} was made from an earlier {source}"
             why = f"corrections of {source} have changed" if is_corrected else why
             self._notes.append(f"{why}: running {stage} again, as before")
         all_outputs = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
-        kept = [output == topic or output in self._opened.channels for output in all_outputs]
-        beside = STAGES[stage].beside if topic == main or main in self._opened.channels else ()
+        kept = [output == topic or output in self.opened.channels for output in all_outputs]
+        beside = STAGES[stage].beside if topic == main or main in self.opened.channels else ()
         possible = before.writes if before else (*transform.writes,)[:1]  # what the former class didn't make is new
         kept = [
             is_kept or suffix in beside or suffix not in possible
             for suffix, is_kept in zip(transform.writes, kept, strict=True)
         ]
         keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
-        self.add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self._frame_id))
+        self.add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self.frame_id))
         return True
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""
-        if any(hasattr(wanted, name) and getattr(before, name, None) != now for name, now in self._shared.items()):
+        if any(hasattr(wanted, name) and getattr(before, name, None) != now for name, now in self.shared.items()):
             return True
-        if wanted is None or stage.option not in self._chosen:
+        if wanted is None or stage.option not in self.chosen:
             return False
         return before is None or stage.choice(before) != stage.choice(wanted)
 
     def _before(self, stage: str, provenance: Provenance) -> tuple[Transform | None, McaptrackError | None]:
         """Return the transform that made a channel, with the same parameters; or None, and the reason why not."""
         try:
-            return rebuild(STAGES[stage], provenance, self._defaults), None
+            return rebuild(STAGES[stage], provenance, self.defaults), None
         except McaptrackError as error:
             return None, error
 
     def _refusal(self) -> str:
         """Return the message for channels that can't be made again: all classes to name, and a call that names them."""
-        options: dict[str, Any] = {"force": True} if self._force else {}
-        for name, transform in self._defaults.items():
-            if (option := STAGES[name].option) and option in self._chosen:
+        options: dict[str, Any] = {"force": True} if self.force else {}
+        for name, transform in self.defaults.items():
+            if (option := STAGES[name].option) and option in self.chosen:
                 options[option] = STAGES[name].choice(transform)
         topic_by_fault: dict[str, str] = {}  # by what has to be named, the first channel that it made
         for topic, error in self._unnamed.items():
             topic_by_fault.setdefault(str(error), topic)
             options |= error.options
         why = "; ".join(f"{topic} can't be made again: {error}" for error, topic in topic_by_fault.items())
-        again = call("run", self._opened.path, **options)
-        return f"{self._opened.path}: {why}, as in {again}; another name replaces what it made"
+        again = call("run", self.opened.path, **options)
+        return f"{self.opened.path}: {why}, as in {again}; another name replaces what it made"
 
     def _warn_settings(self, main: str, differing: str) -> None:
         """Warn, once for all outputs of a stage, that they were made with other settings."""
         if main in self._differing or not differing:
             return
         self._differing.add(main)
-        force = call("run", self._opened.path, force=True)
+        force = call("run", self.opened.path, force=True)
         warn(f"{main} was made with other settings than now ({differing}); {force} takes these", "other-settings")
 
     def ensure_motion(self, transform: Transform, source: str) -> None:
         """Plan the motion of the camera if a stage that reads boxes at ``source`` is better with it."""
-        pictures = self._given_pictures() or camera_at(self._opened, self._prefix).pictures
-        if pictures and motion.is_motion_wanted(self._opened, transform, source, self.jobs):
+        pictures = self._given_pictures() or camera_at(self.opened, self.prefix).pictures
+        if pictures and motion.is_motion_wanted(self.opened, transform, source, self.jobs):
             count = len(self.jobs)
-            self.ensure(motion_topic(self._prefix))
+            self.ensure(motion_topic(self.prefix))
             is_asked = getattr(transform, "camera_motion", "") == "on"
             self.jobs[count:] = [job._replace(is_optional=not is_asked) for job in self.jobs[count:]]
 
     def _given_pictures(self) -> str:
         """The topic of the pictures that a run begins with, if it was told which."""
-        return next((topic for name, topic in self._sources.items() if STAGES[name].reads is VIDEO), "")
+        return next((topic for name, topic in self.sources.items() if STAGES[name].reads is VIDEO), "")
 
     def _with_choice(self, transform: Any) -> Any:
         """Return a transform with those of the shared options that it has."""
-        chosen = {name: value for name, value in self._shared.items() if hasattr(transform, name)}
+        chosen = {name: value for name, value in self.shared.items() if hasattr(transform, name)}
         return replace(transform, **chosen) if chosen else transform
 
     def add(self, job: Job) -> None:
         """Plan a job, and say which earlier results go because it makes none of them."""
         self.jobs.append(job)
-        gone, entry = superseded(self._opened, job), STAGES[job.stage].choice(job.transform)
-        self._changes |= dict.fromkeys((*job.kept(), *gone), True)
+        gone, entry = superseded(self.opened, job), STAGES[job.stage].choice(job.transform)
+        self.changes |= dict.fromkeys((*job.kept(), *gone), True)
         self._gone |= {*gone}
         self._notes += [f"{topic} is removed: {job.stage} by {entry} makes none" for topic in gone]
 
     def _not_made(self, stage: str, topic: str) -> str:
-        source = self._sources[stage]
-        other = call(stage, self._opened.path, topic=source, to=f"{topic}_again")
+        source = self.sources[stage]
+        other = call(stage, self.opened.path, topic=source, to=f"{topic}_again")
         return (
-            f"{self._opened.path}: {topic} is there and {describe_origin(self._opened, topic)}; leave `topic=` out to "
+            f"{self.opened.path}: {topic} is there and {describe_origin(self.opened, topic)}; leave `topic=` out to "
             f"go on from it, or run {other}"
         )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
@@ -31,19 +31,10 @@ from mcaptrack.geometry.plane_from_boxes import plane_from_boxes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job
-from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.pipeline.write import Made, RunState, digest_of
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
-from mcaptrack.schema.frame_columns import FrameCollector
-from mcaptrack.schema.framing import (
-    JoinedFrames,
-    filtered_rows,
-    frame_numbers,
-    has_any,
-    join_frames,
-    joined_parts,
-    thinned,
-)
+from mcaptrack.schema.framing import JoinedFrames, filtered_rows, has_any, join_frames, joined_parts, thinned
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
@@ -150,13 +141,6 @@ def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
         warn(f"`ground_frame=` changes nothing here: {why}", "option-not-used")
 
 
-def frame_of_planes(opened: log.Log, prefix: str, results: Mapping[str, Made]) -> str:
-    """Return the frame of the metres of a camera's ground planes; "" if it has none, or they name no frame."""
-    topic = camera_at(opened, prefix).ground_plane
-    how = results[topic].provenance if topic in results else provenance_of(opened, topic)
-    return how.frame_id if how else ""
-
-
 #: The parameter of a plane that says why it doesn't follow from a calibration that the log has.
 _UNCALIBRATED: Final = "uncalibrated"
 
@@ -174,9 +158,7 @@ def _is_recalibrated(opened: log.Log, prefix: str, how: Provenance | None) -> bo
     return how.input != topic or how.input_digest != digest_of(opened, topic)
 
 
-def calibrated_planes(
-    opened: log.Log, prefix: str, choice: PlaneChoice = AS_BEFORE
-) -> tuple[Planes | None, Made | None, str]:
+def calibrated_planes(opened: log.Log, prefix: str, choice: PlaneChoice) -> tuple[Planes | None, Made | None, str]:
     """Return the ground planes that follow from a camera's calibration and the transforms, and their channel.
 
     Both are None if a plane is given, if these planes are in the log already, or if the log has no calibration. The
@@ -206,36 +188,33 @@ def calibrated_planes(
 
 
 def make_plane(
-    opened: log.Log,
-    prefix: str,
-    frames: Sequence[Frame],
-    source: tuple[str, str],
-    results: Mapping[str, Made],
-    choice: PlaneChoice = AS_BEFORE,
-    uncalibrated: str = "",
+    state: RunState, frames: Sequence[Frame], source: tuple[str, str], choice: PlaneChoice, uncalibrated: str
 ) -> tuple[Planes | None, Made | None]:
     """Make a ground plane from boxes, and its channel: an estimated plane, or a scale if boxes don't give one.
 
-    ``source`` is the topic of the boxes and the digest of its messages, ``results`` are the channels of earlier
-    jobs. ``uncalibrated`` says why the plane doesn't follow from a calibration.
-    Both results are None if no frame has boxes in pixels.
+    ``source`` is the topic of the boxes and the digest of its messages. ``uncalibrated`` says why the plane doesn't
+    follow from a calibration. Both results are None if no frame has boxes in pixels.
     """
-    names = next((how.classes for _, how in _chain(opened, source[0], results) if how and how.classes), {})
+    chain = _chain(state, source[0])
+    names = next((how.classes for _, how in chain if how and how.classes), {})
     frames = thinned(frames, _MOST_BOXES)
     boxes, number, score, are_people = _boxes(frames, names)
     if not len(boxes):
         return None, None  # without boxes in pixels there is nothing to convert to metres
-    estimate, person_m = choice.settled(provenance_of(opened, camera_at(opened, prefix).ground_plane))
+    camera = camera_at(state.opened, state.prefix)
+    estimate, person_m = choice.settled(provenance_of(state.opened, camera.ground_plane))
     parameters: dict[str, Any] = {} if person_m == PERSON_HEIGHT_M else {"person_height_m": person_m}
     width, height = (int((boxes[:, at] + boxes[:, at + 2]).max().round()) for at in (0, 1))
     plane: GroundPlane | None = None
     if not estimate:
         parameters["fit_plane"] = False
-    elif why_not := _why_not(opened, prefix, source[0], results):
+    elif why_not := _why_not(state, chain):
         if why_not != _BY_MOTION or choice.estimate:
             parameters["refused"] = why_not
     else:
-        size = _picture_size(opened, prefix, source[0], results) or (width, height)
+        channel = state.opened.channels.get(chain[-1][0])  # the pictures that boxes were found in
+        pictures = channel.topic if channel and foreign.holds_pictures(channel) else camera.pictures
+        size = picture_size(state.opened, pictures) or (width, height)
         try:
             if not are_people.any():
                 raise McaptrackError("none of them is of a person")
@@ -248,38 +227,38 @@ def make_plane(
     transform = _ASSUME if plane is None else _ESTIMATE
     plane = plane or assumed_plane(boxes[are_people if are_people.any() else slice(None), 3], width, height, person_m)
     start = frames[0].t_ns
-    channel = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], Provenance(transform, parameters, *source))
-    return [(start, plane)], channel
+    made = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], Provenance(transform, parameters, *source))
+    return [(start, plane)], made
 
 
 def planes_for(
-    opened: log.Log,
-    prefix: str,
+    state: RunState,
     job: Job,
     frames: Sequence[Frame],
     source: tuple[str, str],
-    results: Mapping[str, Made],
     planes: Planes | None,
     choice: PlaneChoice,
-) -> tuple[Planes | None, dict[str, Made], str]:
-    """Return the ground planes for a job that reads these frames, their channel if it is new, and their frame.
+) -> tuple[Planes | None, str]:
+    """Return the ground planes for a job that reads these frames, and their frame; new ones become a channel.
 
     ``planes`` are those so far. New detections give a new plane; one that was measured is kept. ``source`` is as in
     ``make_plane``.
     """
+    opened, prefix, results = state
     topic, stage, uncalibrated = camera_at(opened, prefix).ground_plane, STAGES[job.stage], ""
     channel: Made | None = None
-    uses_planes = "ground_planes" in {f.name for f in fields(job.transform)}
-    if uses_planes and topic not in results and _has_pixels(frames):
+    uses_planes = "ground_planes" in {f.name for f in fields(job.transform)} and _has_pixels(frames)
+    if uses_planes and topic not in results:
         calibrated, channel, uncalibrated = calibrated_planes(opened, prefix, choice)
         planes = calibrated or planes
     is_usual = job.target == f"{prefix}/{stage.output_topic}"
     is_new = job.transform.reads is DETECTIONS or is_plane_due(opened, prefix, job.source, choice)
     if (is_assumed(planes) and is_usual and is_new) or (planes is None and stage.needs_scale):
-        planes, channel = make_plane(opened, prefix, frames, source, results, choice, uncalibrated)
-    new = {topic: channel} if channel else {}
-    frame = frame_of_planes(opened, prefix, {**results, **new}) if uses_planes and _has_pixels(frames) else ""
-    return planes, new, frame
+        planes, channel = make_plane(state, frames, source, choice, uncalibrated)
+    if channel:
+        results[topic] = channel
+    how = state.provenance(topic) if uses_planes else None
+    return planes, how.frame_id if how else ""
 
 
 def _has_pixels(frames: Sequence[Frame]) -> bool:
@@ -296,16 +275,16 @@ def recorded_planes(transform: Transform) -> dict[str, Any]:
 _BY_MOTION: Final = "boxes of a motion detector have shadows, and several people in one"
 
 
-def _why_not(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> str:
-    """Return why no plane can be estimated from these boxes, as a clause; "" if it can be tried."""
-    if any(motion.detects_motion(provenance) for _, provenance in _chain(opened, source, results)):
+def _why_not(state: RunState, chain: Sequence[tuple[str, Provenance | None]]) -> str:
+    """Return why no plane can be estimated from boxes with these inputs, as a clause; "" if it can be tried."""
+    if any(motion.detects_motion(provenance) for _, provenance in chain):
         return _BY_MOTION
-    return "the camera moves" if motion.moves(opened, prefix, results) else ""
+    return "the camera moves" if motion.moves(state) else ""
 
 
-def _chain(opened: log.Log, topic: str, results: Mapping[str, Made]) -> list[tuple[str, Provenance | None]]:
+def _chain(state: RunState, topic: str) -> list[tuple[str, Provenance | None]]:
     """Return a channel, its input, the input of that and so on, each with its provenance, also of this run."""
-    return list(lineage(opened, topic, {name: channel.provenance for name, channel in results.items()}))
+    return list(lineage(state.opened, topic, {name: made.provenance for name, made in state.results.items()}))
 
 
 # Leave out interpolated and coasting rows of people who are outside of the picture.
@@ -337,31 +316,32 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
         unseen = _find_unseen(frames, picture_size) if schema is TRACKS else None
         if unseen is None:
             continue
-        is_unseen, count = unseen
+        is_seen, count = unseen
         rows = "row is" if count == 1 else "rows are"
         warn(f"{topic}: {count:,} {rows} left out, outside of the picture and without a detection", "left-out")
         stem, _, name = topic.rpartition("/")
         predictions = f"{stem}/predictions"
         if name == "online" and predictions in channels:
             gone: set[tuple[int, int]] = set()
-            for low, _, joined in joined_parts(schema, frames):
-                gone.update(_keys(joined, low, is_unseen(joined.rows)))
-            forecasts = channels[predictions][1]
-            out[predictions] = PREDICTIONS, _without(forecasts, gone)
-        out[topic] = schema, _seen(frames, is_unseen)
+            for _, _, joined in joined_parts(schema, frames):
+                is_gone = ~is_seen(joined)
+                gone.update(key for key, is_this in zip(_keys(joined), is_gone.tolist(), strict=True) if is_this)
+            forecasts = filtered_rows(
+                PREDICTIONS,
+                channels[predictions][1],
+                lambda joined: np.array([key not in gone for key in _keys(joined)], bool),  # noqa: B023
+            )
+            out[predictions] = PREDICTIONS, forecasts
+        out[topic] = schema, filtered_rows(TRACKS, frames, is_seen)
     return out
-
-
-def _seen(frames: Sequence[Frame], is_unseen: Callable[[Rows], Bools]) -> Sequence[Frame]:
-    return filtered_rows(TRACKS, frames, lambda joined: ~is_unseen(joined.rows))
 
 
 def _find_unseen(
     frames: Sequence[Frame], picture_size: Callable[[], PictureSize]
-) -> tuple[Callable[[Rows], Bools], int] | None:
-    """Return a function that masks the rows that are not observed and lie outside of the picture, and their number.
+) -> tuple[Callable[[JoinedFrames], Bools], int] | None:
+    """Return a function that masks rows that are observed or inside of the picture, and the number of the others.
 
-    None if there are none.
+    None if there are no others.
     """
 
     def may_be_unseen(rows: Rows) -> Bools:
@@ -380,30 +360,12 @@ def _find_unseen(
         unseen += int((outer & ~seen).sum())
     if not unseen or outside > _MOST_OUTSIDE * observed:
         return None
-    return lambda rows: np.asarray(is_outside(rows) & ~rows["observed"]), unseen
+    return lambda joined: np.asarray(~is_outside(joined.rows) | joined.rows["observed"]), unseen
 
 
-def _keys(joined: JoinedFrames, low: int, mask: Bools | slice = slice(None)) -> Iterator[tuple[int, int]]:
-    """The number of the frame and the id of each row that ``mask`` chooses; ``low`` is the number of the first one."""
-    return zip((joined.frame[mask] + low).tolist(), joined.rows["track_id"][mask].tolist(), strict=True)
-
-
-def _without(frames: Sequence[Frame], gone: Collection[tuple[int, int]]) -> Sequence[Frame]:
-    """Return forecasts without those of these frames and ids."""
-    out, numbers = FrameCollector(PREDICTIONS), frame_numbers(frames)
-    for low, high, joined in joined_parts(PREDICTIONS, frames):
-        kept = np.array([key not in gone for key in _keys(joined, low)], bool)
-        ends = np.concatenate([[0], kept.cumsum()])[joined.ends]
-        out.extend(joined.t_ns, numbers[low:high], ends, joined.rows[kept])
-    return out.done()
-
-
-def _picture_size(opened: log.Log, prefix: str, source: str, results: Mapping[str, Made]) -> tuple[int, int] | None:
-    """Return width and height of the pictures that boxes were found in, or of their camera; None if there are none."""
-    first = _chain(opened, source, results)[-1][0]
-    channel = opened.channels.get(first)
-    topic = first if channel and foreign.holds_pictures(channel) else camera_at(opened, prefix).pictures
-    return picture_size(opened, topic)
+def _keys(joined: JoinedFrames) -> Iterator[tuple[int, int]]:
+    """The time and the id of each row."""
+    return zip(joined.row_ns.tolist(), joined.rows["track_id"].tolist(), strict=True)
 
 
 def _boxes(frames: Sequence[Frame], names: Mapping[str, str]) -> tuple[Floats, Ints, Floats, Bools]:

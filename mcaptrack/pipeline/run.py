@@ -26,7 +26,7 @@ from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
 from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of, with_descriptors
-from mcaptrack.pipeline.plan import corrected_input, corrected_tracks, fixed_in, without_filled_in
+from mcaptrack.pipeline.plan import CORRECTED_IN, corrected_tracks, fixed_in, without_filled_in
 from mcaptrack.pipeline.planes import (
     AS_BEFORE,
     Channels,
@@ -39,7 +39,7 @@ from mcaptrack.pipeline.planes import (
     without_unseen,
 )
 from mcaptrack.pipeline.rebuild import plugins_of
-from mcaptrack.pipeline.write import Made, digest_of, write
+from mcaptrack.pipeline.write import Made, RunState, digest_of, write
 from mcaptrack.pipeline.zones import STAGE as ZONES_STAGE
 from mcaptrack.pipeline.zones import ZoneWatch, make_zones
 from mcaptrack.predictors import weights_sha256
@@ -50,7 +50,8 @@ from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_times, row_ends, unique_values
 from mcaptrack.schema.provenance import CLOCK, FUSE, VIEW, Provenance
 from mcaptrack.sources.camera_motion import tracks_topic
-from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.corrections import corrections_of, with_corrections
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.pictures import picture_size
 from mcaptrack.transforms import FULL, STAGES, Sample, Transform
@@ -142,6 +143,11 @@ class Report:
         self.frames[topic], self.rows[topic] = len(channel.frames), int(row_ends(channel.frames)[-1])
         if channel.schema is TRACKS:
             self.tracks[topic] = len(unique_values(TRACKS, channel.frames, "track_id"))
+
+    def add(self, stage: str, made: Mapping[str, Made]) -> None:
+        """Count the messages of the channels of a stage, if it made any."""
+        self.frames |= {topic: channel.size() for topic, channel in made.items()}
+        self.stages += [stage] if made else []
 
 
 # Warn about results that are empty or unreliable, and about memory that runs out.
@@ -263,82 +269,62 @@ def run(
 
     The log is replaced as a whole, after everything was computed.
     """
-    with collected() as warnings:
-        if jobs:
-            warn_clock_jumps(opened)
-        report = _run(opened, prefix, jobs, output, progress, watch, plane, boxes or BoxesRead(), zones, fused, before)
-    report.warnings = list(dict.fromkeys(warnings))
-    return report
-
-
-def _run(
-    opened: log.Log,
-    prefix: str,
-    jobs: Sequence[Job],
-    output: Path | None,
-    progress: Progress,
-    watch: Watch | None,
-    choice: PlaneChoice,
-    boxes: BoxesRead,
-    zones: ZoneWatch | None,
-    fused: Mapping[str, Made],
-    before: Before | None,
-) -> Report:
-    results: dict[str, Made] = dict(fused)
+    boxes, results = boxes or BoxesRead(), dict(fused)
+    state = RunState(opened, prefix, results)
     stamps: dict[str, list[int]] = {}
     report = Report(stages=[FUSE] if fused else [])
     for topic, channel in fused.items():
         report.count(topic, channel)
-    planes, part = read_planes(opened, prefix), report.watch.part
-    for job in jobs:
-        with part("read"):
-            job_input = _input(opened, job, results, stamps, progress, boxes, report.watch)
-            source = (job.source, job_input.digest())
-        with part(job.stage):
-            planes, ground, frame_id = planes_for(
-                opened, prefix, job, job_input.frames, source, results, planes, choice
-            )
-        results |= ground
-        job_input = job_input._replace(frame_id=job_input.frame_id or frame_id)
-        if job.transform.reads is DETECTIONS:
-            warn_memory(job_input.frames)
-        try:
+    part = report.watch.part
+    with collected() as warnings:
+        if jobs:
+            warn_clock_jumps(opened)
+        planes = read_planes(opened, prefix)
+        for job in jobs:
+            with part("read"):
+                job_input = _input(state, job, stamps, progress, boxes, report.watch)
+                source = (job.source, job_input.digest())
             with part(job.stage):
-                results |= _run_job(opened, prefix, job, job_input, results, planes or (), before, progress)
-        except McaptrackError as error:
-            if not job.is_optional:
-                raise
-            warn(f"{job.target} is left out: {error}", "left-out")
-            continue
-        for topic in (topic for topic in job.outputs() if topic in results):
-            report.count(topic, results[topic])
-        report.stages.append(job.stage)
-        del job_input
-        release_memory()
-    if watch is not None:
-        with part(EVENTS_STAGE):
-            events = make_events(opened, prefix, results, watch)
-        results |= events
-        report.frames |= {topic: channel.size() for topic, channel in events.items()}
-        report.events = tally(events)
-        report.stages += [EVENTS_STAGE] if events else []
-    if zones is not None:
-        with part(ZONES_STAGE):
-            counted = make_zones(opened, prefix, results, planes or (), zones, stamps)
-        results |= counted
-        report.frames |= {topic: channel.size() for topic, channel in counted.items()}
-        report.stages += [ZONES_STAGE] if counted else []
-        report.has_zones = True
-    gone = _gone(opened, jobs, results)
-    if results or output is not None:
-        with part("write"):
-            path, _ = path_with(opened, prefix, tracks_topic(prefix), results)
-            write(opened, prefix, results, planes or (), stamps, output, path, boxes.in_space(), gone)
-            report.is_written = True
-    provenances = {topic: channel.provenance for topic, channel in results.items()}
-    warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
-    late = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in results.items()})
+                planes, frame_id = planes_for(state, job, job_input.frames, source, planes, plane)
+            job_input = job_input._replace(frame_id=job_input.frame_id or frame_id)
+            if job.transform.reads is DETECTIONS:
+                warn_memory(job_input.frames)
+            try:
+                with part(job.stage):
+                    results |= _run_job(state, job, job_input, planes or (), before, progress)
+            except McaptrackError as error:
+                if not job.is_optional:
+                    raise
+                warn(f"{job.target} is left out: {error}", "left-out")
+                continue
+            for topic in (topic for topic in job.outputs() if topic in results):
+                report.count(topic, results[topic])
+            report.stages.append(job.stage)
+            del job_input
+            release_memory()
+        if watch is not None:
+            with part(EVENTS_STAGE):
+                events = make_events(state, watch)
+            report.add(EVENTS_STAGE, events)
+            report.events = tally(events)
+            results |= events
+        if zones is not None:
+            with part(ZONES_STAGE):
+                counted = make_zones(state, planes or (), zones, stamps)
+            report.add(ZONES_STAGE, counted)
+            report.has_zones = True
+            results |= counted
+        gone = _gone(opened, jobs, results)
+        if results or output is not None:
+            with part("write"):
+                path, _ = path_with(state, tracks_topic(prefix))
+                write(state, planes or (), stamps, output, path, boxes.in_space(), gone)
+                report.is_written = True
+        provenances = {topic: channel.provenance for topic, channel in results.items()}
+        warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
+    late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
     report.stale = [topic for topic in late if topic not in gone]
+    report.warnings = list(dict.fromkeys(warnings))
     return report
 
 
@@ -398,8 +384,11 @@ class _Input(NamedTuple):
 
     def corrected(self, opened: log.Log, prefix: str, job: Job) -> tuple[_Input, Mapping[str, str]]:
         """Return tracks with the corrections of people, and the digests of these by topic."""
-        frames, references = corrected_input(opened, prefix, job, self.frames)
-        return (self._replace(stream=frames, frames=frames) if references else self), references
+        topic = corrections_of(opened, prefix, job.source) if job.stage == CORRECTED_IN else None
+        if topic is None:
+            return self, {}
+        frames = with_corrections(self.frames, opened.frame_columns(topic, TRACKS))
+        return self._replace(stream=frames, frames=frames), {topic: digest_of(opened, topic)}
 
     def in_scene(self, path: CameraPath) -> _Input:
         """Return the same tracks with boxes in pixels of the reference picture."""
@@ -411,10 +400,8 @@ class _Input(NamedTuple):
 
 
 def at_video_rate(
-    opened: log.Log,
-    prefix: str,
+    state: RunState,
     job: Job,
-    results: Mapping[str, Made],
     retracked: Sequence[Frame],
     planes: Planes,
     path: CameraPath | None,
@@ -425,13 +412,10 @@ def at_video_rate(
     ``carry`` gives these tracks the re-tracked ids. Where the camera moves by ``path``, ``planes`` and the boxes of
     ``retracked`` are those of reference pictures.
     """
-    samples = results[job.source].provenance if job.source in results else provenance_of(opened, job.source)
+    opened, prefix, _ = state
+    samples = state.provenance(job.source)
     source = samples.input if samples else ""
-    if source in results:
-        tracks = results[source].frames if results[source].schema is TRACKS else ()
-    else:
-        holds_tracks = source in opened.channels and opened.channels[source].schema_name == TRACKS.name
-        tracks = opened.frame_columns(source, TRACKS) if holds_tracks else ()
+    tracks = state.frames(source)
     tracks = corrected_tracks(opened, prefix, source, tracks) if len(tracks) else tracks
     carried = without_filled_in(opened, prefix, source, carry(to_scene(tracks, path), retracked, planes))
     return to_pictures(carried, path)
@@ -495,20 +479,14 @@ def _clock_start(opened: log.Log, prefix: str) -> int | None:
 
 
 def _run_job(
-    opened: log.Log,
-    prefix: str,
-    job: Job,
-    job_input: _Input,
-    results: Mapping[str, Made],
-    planes: Planes,
-    before: Before | None,
-    progress: Progress,
+    state: RunState, job: Job, job_input: _Input, planes: Planes, before: Before | None, progress: Progress
 ) -> dict[str, Made]:
-    """Run a job, and return its channels by topic. ``results`` are the channels of earlier jobs."""
-    side = side_inputs(opened, prefix, job, results)
+    """Run a job, and return its channels by topic."""
+    opened, prefix, _ = state
+    side = side_inputs(state, job)
     job_input, corrections = job_input.corrected(opened, prefix, job)
     shown = job_input.frames
-    path, motion = path_with(opened, prefix, job.source, results) if job.transform.reads is TRACKS else (None, {})
+    path, motion = path_with(state, job.source) if job.transform.reads is TRACKS else (None, {})
     if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
         job_input, planes = job_input.in_scene(path), scene_planes(planes, path)
     if before is None:
@@ -518,7 +496,7 @@ def _run_job(
         frames = led(lead, job_input.frames, job.transform.reads)
         job_input = job_input._replace(stream=frames, frames=frames)
     context = in_context(opened, prefix, job, job_input.frames, planes, job_input.classes)
-    fixed = fixed_in(opened, prefix, job.source, results) if hasattr(context, "fixed_ids") else ()
+    fixed = fixed_in(state, job.source) if hasattr(context, "fixed_ids") else ()
     transform = replace(context, **side.values, **({"fixed_ids": fixed} if fixed else {}))
     transform = before.in_context(transform) if before and lead else transform
     transform = with_descriptors(transform, opened, prefix, shown, progress, job.keep)
@@ -570,7 +548,7 @@ def _run_job(
     }
     if job.target + FULL in job.kept():
         carry = linked_tracks if traits_of(transform).leaves_unchanged else to_video_rate
-        frames = at_video_rate(opened, prefix, job, results, outputs[0], planes, path, carry)
+        frames = at_video_rate(state, job, outputs[0], planes, path, carry)
         channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
     seen: Channels = channels
     if not traits_of(transform).keeps_unseen:
@@ -622,15 +600,15 @@ def _provenance_of(
 
 
 def _input(
-    opened: log.Log,
+    state: RunState,
     job: Job,
-    results: Mapping[str, Made],
     stamps: dict[str, list[int]],
     progress: Progress,
     boxes: BoxesRead,
     watch: Stopwatch,
 ) -> _Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
+    opened, results = state.opened, state.results
     if job.source not in results and job.transform.reads is VIDEO:
         seen = stamps.setdefault(job.source, [])
         damaged, unreadable = list[int](), list[McaptrackError]()
@@ -680,5 +658,7 @@ def input_of(
     frames, names, _ = read_named_frames(opened, topic, transform.reads)
     classes = {str(number): name for number, name in names.items()}
     filled = in_context(opened, prefix, job, frames, read_planes(opened, prefix) or (), classes)
-    filled = with_descriptors(replace(filled, **side_inputs(opened, prefix, job, {}).values), opened, prefix, frames)
+    filled = with_descriptors(
+        replace(filled, **side_inputs(RunState(opened, prefix, {}), job).values), opened, prefix, frames
+    )
     return frames, {f.name: getattr(filled, f.name) for f in fields(filled) if f.metadata.get("context")}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -26,9 +26,12 @@ from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, j
 from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import planes_in
-from mcaptrack.sources.cameras import VIDEO, camera_at, detections_of, provenance_of
+from mcaptrack.sources.cameras import VIDEO, camera_at, detections_of
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.fuse import CameraView
+
+if TYPE_CHECKING:
+    from mcaptrack.pipeline.write import RunState
 
 #: A track is at a detection of its time if it is at most so far away.
 _AT_M: Final = 1.0
@@ -175,15 +178,11 @@ def _standing(view: CameraView, xy_m: Floats, t_ns: Ints) -> Floats:
     return box
 
 
-def scene_on_pictures(
-    opened: log.Log, prefix: str, results: Mapping[str, tuple[Sequence[Frame], Provenance]]
-) -> SceneOnPictures:
-    """The scene below ``prefix`` and its cameras with pictures; no cameras if it is no scene.
-
-    ``results`` are the frames and the provenance of channels that are not written yet, by topic.
-    """
-    target = f"{prefix}/{STAGES['detect'].output_topic}"
-    how = results[target][1] if target in results else provenance_of(opened, target)
+def scene_on_pictures(state: RunState) -> SceneOnPictures:
+    """The scene of a run and its cameras with pictures; no cameras if it is no scene."""
+    opened = state.opened
+    target = f"{state.prefix}/{STAGES['detect'].output_topic}"
+    how = state.provenance(target)
     if how is None or how.transform != FUSE:
         return SceneOnPictures((), (), ())
     scene_cameras = []
@@ -200,9 +199,5 @@ def scene_on_pictures(
         scene_cameras.append(SceneCamera(number, clock, view, boxes, seconds_to_ns(late_s)))
     if not scene_cameras:
         return SceneOnPictures((), (), ())
-    parts = {target: DETECTIONS, f"{target}/sightings": SIGHTINGS}
-    frames = [
-        results[topic][0] if topic in results else opened.frame_columns(topic, schema)
-        for topic, schema in parts.items()
-    ]
-    return SceneOnPictures(frames[0], frames[1], scene_cameras)
+    sightings = state.frames(f"{target}/sightings", SIGHTINGS)
+    return SceneOnPictures(state.frames(target, DETECTIONS), sightings, scene_cameras)

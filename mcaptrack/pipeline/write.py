@@ -53,7 +53,7 @@ from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned, unique_values
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, digest, frame_id_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import Camera, camera_at
+from mcaptrack.sources.cameras import Camera, camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import transforms_of
 from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
 
@@ -142,6 +142,43 @@ def digest_of(opened: log.Log, topic: str) -> str:
     return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
 
 
+class RunState(NamedTuple):
+    """A log, the name of a camera in it, and the channels that this run has made so far, by topic.
+
+    What it says about a channel is of this run, or else of the log.
+    """
+
+    opened: log.Log
+    prefix: str
+    results: dict[str, Made]
+
+    def provenance(self, topic: str) -> Provenance | None:
+        """Return how a channel was made; None if it is missing or recorded."""
+        return self.results[topic].provenance if topic in self.results else provenance_of(self.opened, topic)
+
+    def holds(self, topic: str, schema: Schema) -> bool:
+        """Return whether a channel has rows of a schema."""
+        if topic in self.results:
+            return self.results[topic].schema is schema
+        channel = self.opened.channels.get(topic)
+        return channel is not None and channel.holds(schema)
+
+    def frames(self, topic: str, schema: Schema = TRACKS) -> Sequence[Frame]:
+        """Return the frames of a channel; none if it has no rows of the schema."""
+        if not self.holds(topic, schema):
+            return ()
+        return self.results[topic].frames if topic in self.results else self.opened.frame_columns(topic, schema)
+
+    def digest(self, topic: str) -> str:
+        """Return the digest of the messages of a channel."""
+        return self.results[topic].provenance.digest if topic in self.results else digest_of(self.opened, topic)
+
+    def classes(self, topic: str) -> dict[int, str]:
+        """Return the names of the classes of a channel by number."""
+        how = self.results[topic].provenance if topic in self.results else None
+        return class_names(how.to_metadata() if how else self.opened.channel(topic).metadata)
+
+
 # The largest values that the plots of a layout show, so that their axes have room for all of them.
 
 
@@ -178,9 +215,7 @@ def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Fram
 
 
 def write(
-    opened: log.Log,
-    prefix: str,
-    results: Mapping[str, Made],
+    state: RunState,
     planes: Planes,
     stamps: Mapping[str, Sequence[int]],
     output: Path | None,
@@ -188,15 +223,16 @@ def write(
     boxes: Mapping[str, foreign.NamedFrames] = {},
     gone: Collection[str] = (),
 ) -> dict[str, bytes]:
-    """Write channels and their views into the log, or into a copy at ``output``. Returns layout files by name.
+    """Write the channels of a run, their views and layouts into the log, or into a copy at ``output``.
 
-    Channels at the topics ``gone`` are dropped.
+    Returns the layouts by name. Channels at the topics ``gone`` are dropped.
 
     ``boxes`` are recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
 
     ``path`` is how the camera moves, if its tracks are compensated for it: so are views, and ``planes`` with it.
-    ``results`` and ``stamps``, the capture times in ns of pictures that stages have read, are by topic.
+    ``stamps`` are the capture times in ns of pictures that stages have read, by topic.
     """
+    opened, prefix, results = state
     camera = camera_at(opened, prefix)
     video, picture_ns, stamp_ns = picture_clock(opened, prefix, stamps)
     shown = _channels_to_draw(opened, camera, results) | _boxes_to_draw(opened, boxes)
@@ -209,9 +245,7 @@ def write(
     solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
     cameras = calibrated_cameras(opened, solid_in) if solid_in and tree else {}
     outdated |= {view for view in opened.channels for topic in shown if view.startswith(f"{topic}{views.SUFFIX}/")}
-    scene = scene_on_pictures(
-        opened, prefix, {topic: (channel.frames, channel.provenance) for topic, channel in results.items()}
-    )
+    scene = scene_on_pictures(state)
     seen_on = (*cameras, *(seen.pictures for seen in scene.cameras))
     outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in seen_on}
     drawn = ViewFactory(prefix, picture_ns, stamp_ns, planes, path, frames, cameras, scene)

@@ -36,14 +36,13 @@ from mcaptrack.foxglove.views.image import PictureTimes
 from mcaptrack.geometry.plane import Planes, moved_planes, scene_planes
 from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.checks import describe_origin, may_replace
+from mcaptrack.pipeline.checks import conflict_of
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
-from mcaptrack.pipeline.plan import is_stale
+from mcaptrack.pipeline.plan import is_outdated
 from mcaptrack.pipeline.planes import planes_to_json
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock
-from mcaptrack.pipeline.write import DrawnMessages, Made, digest_of
-from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Schema
-from mcaptrack.schema.classes import class_names
+from mcaptrack.pipeline.write import DrawnMessages, Made, RunState
+from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.zones import zones_from_json, zones_to_json
@@ -88,25 +87,21 @@ def outputs(topic: str) -> tuple[str, ...]:
 
 
 def make_zones(
-    opened: log.Log,
-    prefix: str,
-    results: Mapping[str, Made],
-    planes: Planes,
-    watch: ZoneWatch,
-    stamps: Mapping[str, Sequence[int]] = {},
+    state: RunState, planes: Planes, watch: ZoneWatch, stamps: Mapping[str, Sequence[int]]
 ) -> dict[str, Made]:
     """Count the zones of channels of tracks that are not counted yet, or that have changed since.
 
-    ``results`` and ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
+    ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
     McaptrackError for given topics that hold no tracks, and for zones that none of the tracks can be compared with.
     """
+    opened, prefix, _ = state
     before = _before(opened, prefix)
     zones = watch.zones or before.zones
     if not zones:
         return {}
     options = watch.options or (before.options if before.options else ZoneOptions())
     zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
-    topics = watch.topics or _default_topics(opened, prefix, results, before)
+    topics = watch.topics or _default_topics(state, before)
     if not topics:
         if not watch.zones:
             return {}
@@ -114,26 +109,21 @@ def make_zones(
     out: dict[str, Made] = {}
     faults: list[McaptrackError] = []
     for topic in topics:
-        if not _has_tracks(opened, topic, results):
+        if not state.holds(topic, TRACKS):
             schema_name = opened.channel(topic).schema_name  # raises if there is no such channel
             raise McaptrackError(f"{opened.path}: {topic} holds {schema_name or 'no schema'}, not tracks")
         wanted = _parameters(zones, options, planes)
-        if not watch.force and not _is_due(opened, topic, results, wanted):
+        if not watch.force and not _is_due(state, topic, wanted):
             continue
-        taken = [
-            output
-            for output in outputs(topic)
-            if not may_replace(opened, output, VIEW if "/view/" in output else STAGE)
-        ]
-        if taken:
-            text = f"no zones of {topic}: they would replace {taken[0]}, which {describe_origin(opened, taken[0])}"
+        if conflict := conflict_of(opened, outputs(topic), STAGE):
+            text = f"no zones of {topic}: they would replace {conflict}"
             if watch.topics:
                 raise McaptrackError(f"{opened.path}: {text}")
             warn(text, "left-out")
             continue
         try:
             pictures = picture_clock(opened, prefix, stamps)
-            out |= _counted(opened, prefix, topic, results, planes, zones, options, wanted, pictures)
+            out |= _counted(state, topic, planes, zones, options, wanted, pictures)
         except McaptrackError as error:
             faults.append(error)
     if faults and (not out or watch.topics) and watch.zones:
@@ -144,10 +134,8 @@ def make_zones(
 
 
 def _counted(
-    opened: log.Log,
-    prefix: str,
+    state: RunState,
     topic: str,
-    results: Mapping[str, Made],
     planes: Planes,
     zones: Sequence[Zone],
     options: ZoneOptions,
@@ -155,23 +143,22 @@ def _counted(
     pictures: PictureClock,
 ) -> dict[str, Made]:
     """Count the zones of one channel of tracks, and return the new channels by topic."""
-    source = results[topic].provenance.digest if topic in results else digest_of(opened, topic)
-    frames: Sequence[Frame]
-    if topic == camera_at(opened, prefix).truth:
-        frames = ground_truth_with(opened, prefix, results)
-    else:
-        frames = results[topic].frames if topic in results else opened.frame_columns(topic, TRACKS)
-    path, motion = path_with(opened, prefix, topic, results)
+    opened, prefix, _ = state
+    is_truth = topic == camera_at(opened, prefix).truth
+    frames = ground_truth_with(state) if is_truth else state.frames(topic)
+    path, motion = path_with(state, topic)
     still = scene_planes(planes, path)
     placed: list[PlacedZone] = [place_zone(zone, still) for zone in zones]
-    positions = positions_of(frames, still, path, _class_names(opened, topic, results))
+    positions = positions_of(frames, still, path, state.classes(topic))
     zone_events = find_zone_events(frames, positions, placed, options, topic)
     for note in zone_events.notes:
         warn(note, "not-compared")
     names = {str(zone.number): zone.name for zone in zones}
+    how = state.provenance(topic)
     provenance = Provenance(
-        STAGE, parameters, topic, source, references=motion, zones=names, frame_id=_frame_id(opened, topic, results)
-    )
+        STAGE, parameters, topic, state.digest(topic), references=motion, zones=names,
+        frame_id=how.frame_id if how else frame_id_of(opened.channel(topic).metadata),
+    )  # fmt: skip
     rows = (zone_events.visits, zone_events.crossings, zone_events.counts)
     out = {
         topic + _BELOW + name: Made.of(schema, some, provenance)
@@ -213,11 +200,11 @@ def _counted(
 
 def counted_zones(opened: log.Log, prefix: str) -> list[CountedZones]:
     """Return the totals of all channels of a camera's tracks that zones were counted of, in order of their topics."""
-    out = []
+    state, out = RunState(opened, prefix, {}), []
     for topic in _with_counts(opened, prefix):
         names = [topic + _BELOW + name for name in _SCHEMAS]
         schemas = _SCHEMAS.values()
-        if not all(_holds(opened, name, schema) for name, schema in zip(names, schemas, strict=True)):
+        if not all(state.holds(name, schema) for name, schema in zip(names, schemas, strict=True)):
             continue
         provenance = provenance_of(opened, names[0])
         zones = zones_from_json(provenance.parameters.get("zones")) if provenance else ()
@@ -273,11 +260,12 @@ def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: 
     return kept
 
 
-def _default_topics(opened: log.Log, prefix: str, results: Mapping[str, Made], before: _Before) -> tuple[str, ...]:
+def _default_topics(state: RunState, before: _Before) -> tuple[str, ...]:
+    prefix = state.prefix
     full = f"{prefix}/retracks{FULL}"
-    retracked = full if _has_tracks(opened, full, results) else f"{prefix}/retracks"
-    usual = (f"{prefix}/tracks", retracked, camera_at(opened, prefix).truth)
-    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if _has_tracks(opened, topic, results))
+    retracked = full if state.holds(full, TRACKS) else f"{prefix}/retracks"
+    usual = (f"{prefix}/tracks", retracked, camera_at(state.opened, prefix).truth)
+    return tuple(topic for topic in dict.fromkeys((*usual, *before.topics)) if state.holds(topic, TRACKS))
 
 
 def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> dict[str, Any]:
@@ -286,17 +274,11 @@ def _parameters(zones: Sequence[Zone], options: ZoneOptions, planes: Planes) -> 
     return values | ({"ground_planes": planes_to_json(planes)} if planes else {})
 
 
-def _is_due(opened: log.Log, topic: str, results: Mapping[str, Made], wanted: Mapping[str, Any]) -> bool:
+def _is_due(state: RunState, topic: str, wanted: Mapping[str, Any]) -> bool:
     """Whether zones were not counted yet, were counted with other parameters, or are out of date."""
     names = outputs(topic)[: len(_SCHEMAS) + 1]
-    if not all(name in opened.channels for name in names) or is_stale(opened, names[0]):
-        return True
-    provenance = provenance_of(opened, names[0])
-    if provenance is None or not _is_same(provenance.parameters, wanted):
-        return True
-    return any(
-        name in results and results[name].provenance.digest != then for name, then in provenance.made_from().items()
-    )
+    before = provenance_of(state.opened, names[0])
+    return before is None or is_outdated(state, names) or not _is_same(before.parameters, wanted)
 
 
 def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
@@ -304,26 +286,3 @@ def _is_same(before: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     zones = zones_from_json(before.get("zones"))
     rest = [{key: value for key, value in parameters.items() if key != "zones"} for parameters in (before, wanted)]
     return zones_to_json(zones) == wanted["zones"] and rest[0] == rest[1]
-
-
-def _class_names(opened: log.Log, topic: str, results: Mapping[str, Made]) -> dict[int, str]:
-    """The names of the classes of tracks."""
-    if topic in results:
-        return {int(number): name for number, name in results[topic].provenance.classes.items()}
-    return class_names(opened.channel(topic).metadata)
-
-
-def _frame_id(opened: log.Log, topic: str, results: Mapping[str, Made]) -> str:
-    """The frame of the metres of tracks."""
-    if topic in results:
-        return results[topic].provenance.frame_id
-    return frame_id_of(opened.channel(topic).metadata)
-
-
-def _has_tracks(opened: log.Log, topic: str, results: Mapping[str, Made]) -> bool:
-    return results[topic].schema is TRACKS if topic in results else _holds(opened, topic, TRACKS)
-
-
-def _holds(opened: log.Log, topic: str, schema: Schema) -> bool:
-    channel = opened.channels.get(topic)
-    return channel is not None and channel.holds(schema)

@@ -21,38 +21,6 @@ from mcaptrack.schema.proto import Column, Definition, parse
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = [
-    "APPEARANCE",
-    "BOX_PX",
-    "CAMERA_MOTION",
-    "COUNTS",
-    "COVARIANCE_M2",
-    "DECISIONS",
-    "DETECTIONS",
-    "EVENTS",
-    "EVENT_KINDS",
-    "FORECAST_ERRORS",
-    "FORECAST_SCORES",
-    "GROUND_PLANE",
-    "PLACE_M",
-    "PREDICTIONS",
-    "SCHEMAS",
-    "SIGHTINGS",
-    "SIZES",
-    "TRACKS",
-    "VIDEO",
-    "ZONE_COUNTS",
-    "ZONE_CROSSINGS",
-    "ZONE_VISITS",
-    "BodyPart",
-    "Column",
-    "DecisionKind",
-    "EventKind",
-    "Frame",
-    "Rows",
-    "Schema",
-]
-
 
 class Frame(NamedTuple):
     """The content of one message: ``rows`` at time ``t_ns``.

@@ -31,7 +31,8 @@ Rows = NDArray[np.void]
 Bytes = NDArray[np.uint8]
 
 
-def _varint(value: int) -> bytes:
+def varint(value: int) -> bytes:
+    """A whole number as a protobuf varint, 7 bits a byte."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -46,10 +47,10 @@ class _Layout:
         body, at = bytearray(), []
         for column in columns:
             _, width, wire_type, _ = KINDS[column.kind]
-            body += _varint(column.number << 3 | wire_type)
+            body += varint(column.number << 3 | wire_type)
             at.append(len(body))
             body += bytes(width)
-        head = b"\x0a" + _varint(len(body))  # field 1 of the message, length-delimited
+        head = b"\x0a" + varint(len(body))  # field 1 of the message, length-delimited
         offsets = [len(head) + offset for offset in at]
         self.head = len(head)
         self.template = np.frombuffer(head + body, np.uint8)

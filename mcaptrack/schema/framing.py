@@ -48,6 +48,15 @@ def frame_numbers(frames: Sequence[Frame]) -> Ints:
     return np.fromiter((frame.index for frame in frames), np.int64, len(frames))
 
 
+def nearest_times(t_ns: Ints, at_ns: Ints) -> Ints:
+    """The index of the time in rising ``t_ns`` that is nearest to each of ``at_ns``; the earlier one of two."""
+    after = np.clip(np.searchsorted(t_ns, at_ns), 1, max(len(t_ns) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(t_ns) - 1)
+    out: Ints = np.where(at_ns - t_ns[before] <= t_ns[after] - at_ns, before, after)
+    return out
+
+
 def row_ends(frames: Sequence[Frame]) -> Ints:
     """The ends of the rows of frames laid end to end, (F + 1,): those of frame f are ``[f]`` to ``[f + 1]``."""
     if isinstance(frames, FrameColumns):

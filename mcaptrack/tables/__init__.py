@@ -1,8 +1,7 @@
 """Tables of rows, and tables as files: one row for each object in each frame; metadata hold units and provenance.
 
 TABLES                               all tables with their columns
-rows_table(schema, channels)         rows -> Arrow; missing numbers are null in tables and NaN in rows
-rows_in_pieces(schema, channels)     the same in pieces, for as many rows as there are
+rows_in_pieces(schema, channels)     rows -> Arrow; missing numbers are null in tables and NaN in rows
 write(path, table, provenance)       Arrow -> Parquet, Arrow IPC, CSV or JSON lines
 verify(path)                         check that a file holds what was written
 join(parts)                          the same table of several logs as one
@@ -33,51 +32,13 @@ from mcaptrack.tables.build import (
     rows_of_topic,
     table_of,
     table_to_array,
-    table_to_frames,
     with_recording,
 )
 from mcaptrack.tables.catalogue import join
-from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES, Field, Table
+from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES
 from mcaptrack.tables.files import FORMATS, file_metadata, verify, write
 from mcaptrack.tables.messages import messages_table
-from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, rows_table, summary_table
-
-__all__ = [
-    "FORMATS",
-    "RECORDING",
-    "TABLES",
-    "TABLE_VERSION",
-    "Field",
-    "Pointers",
-    "Table",
-    "TablePieces",
-    "TrackNames",
-    "cells",
-    "columns_of",
-    "file_metadata",
-    "frames_table",
-    "holds_tracks",
-    "join",
-    "messages_table",
-    "names_by_track",
-    "pieces",
-    "read_columns",
-    "read_tracks",
-    "records_table",
-    "rows_in_pieces",
-    "rows_of_topic",
-    "rows_table",
-    "summary_table",
-    "table_of",
-    "table_to_array",
-    "table_to_frames",
-    "tidy",
-    "verify",
-    "with_recording",
-    "write",
-    "write_answer",
-]
-
+from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, summary_table
 
 # Parquet files of mcaptrack or of other tools, as arrays and frames.
 

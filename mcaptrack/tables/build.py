@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.schema import Frame, Schema
-from mcaptrack.schema.framing import split_rows
+from mcaptrack.schema import Schema
 from mcaptrack.tables.fields import RECORDING, TABLES, Table
 
 
@@ -133,22 +132,6 @@ def columns_of(rows: Any) -> dict[str, NDArray[Any]]:
         name: (column.cast(pa.float64()) if is_decimal[name] else column).to_numpy()
         for name, column in zip(table.column_names, table.columns, strict=True)
     }
-
-
-def table_to_frames(schema: Schema, rows: Any, frames: Any, topic: str) -> list[Frame]:
-    """The frames of one channel, also empty ones, from its table of rows and the table of frames."""
-    rows, frames = rows_of_topic(rows, topic), rows_of_topic(frames, topic)
-    order = np.argsort(rows.column("row").to_numpy(), kind="stable")
-    columns = {}
-    for column in schema.columns:
-        if column.since and column.name not in rows.column_names:  # an older table
-            continue
-        values = rows.column(column.name).combine_chunks()
-        values = values.fill_null(column.missing) if column.optional else values
-        columns[column.name] = values.to_numpy(zero_copy_only=False)[order]
-    members = schema.rows(**columns)
-    times, numbers, counts = (frames.column(name).to_pylist() for name in ("t_ns", "frame", "rows"))
-    return split_rows(times, numbers, members, np.cumsum(counts))
 
 
 def repeated(names: Sequence[str], counts: Sequence[int], among: Sequence[str] = ()) -> Any:

@@ -155,8 +155,8 @@ class _Facts:
         kind = None if self.has_lists and self.has_others else self._kind()
         if kind is None:
             return _Maker(pa.string(), _json)
-        make, type_ = _MAKERS[kind], _arrow(kind)
-        return _Maker(pa.list_(type_), lambda value: list(map(make, value))) if self.has_lists else _Maker(type_, make)
+        one = _maker(kind)
+        return _Maker(pa.list_(one.type), lambda value: list(map(one.make, value))) if self.has_lists else one
 
     def _kind(self) -> str | None:
         """The narrowest type that holds all values; None if only JSON does."""
@@ -191,25 +191,16 @@ def _json(value: Any) -> str:
     return _clean(json.dumps(value.hex() if isinstance(value, bytes) else value, ensure_ascii=False))
 
 
-_MAKERS: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "bool": bool,
-    "float": float,
-    "int": int,
-    "uint": int,
-    "bytes": bytes,
-    "str": _clean,
-}
-
-
-def _arrow(kind: str) -> Any:
+def _maker(kind: str) -> _Maker:
+    """The column of single values of a kind."""
     import pyarrow as pa
 
-    kinds = {
-        "bool": pa.bool_(),
-        "float": pa.float64(),
-        "int": pa.int64(),
-        "uint": pa.uint64(),
-        "bytes": pa.binary(),
-        "str": pa.string(),
+    makers = {
+        "bool": _Maker(pa.bool_(), bool),
+        "float": _Maker(pa.float64(), float),
+        "int": _Maker(pa.int64(), int),
+        "uint": _Maker(pa.uint64(), int),
+        "bytes": _Maker(pa.binary(), bytes),
+        "str": _Maker(pa.string(), _clean),
     }
-    return kinds[kind]
+    return makers[kind]

@@ -32,21 +32,6 @@ class TrackNames(NamedTuple):
     truth: Mapping[int, str] = {}
 
 
-def rows_table(
-    schema: Schema,
-    channels: Mapping[str, Sequence[Frame]],
-    names: Mapping[str, Mapping[int, str]] = {},
-    of_tracks: Mapping[str, TrackNames] = {},
-) -> Any:
-    """All rows of channels of one schema as an Arrow table, in the table's order; missing numbers are null.
-
-    ``names`` are the names of classes by their number, for each channel that names any; ``of_tracks`` those of tracks,
-    for each channel with rows about tracks of another one.
-    """
-    columns = {topic: collect(schema, frames) for topic, frames in channels.items()}
-    return rows_in_pieces(schema, columns, names, of_tracks).table()
-
-
 # The rows of a channel in the order of its table, some at a time: a channel may have more than fit into memory.
 #
 # Rows of tracks are stored track by track. They are divided into groups of whole tracks, each of which fits into
@@ -160,15 +145,20 @@ def stable_order(values: NDArray[np.integer]) -> Ints:
 
 def rows_in_pieces(
     schema: Schema,
-    channels: Mapping[str, FrameColumns],
+    channels: Mapping[str, Sequence[Frame]],
     names: Mapping[str, Mapping[int, str]] = {},
     of_tracks: Mapping[str, TrackNames] = {},
     zones: Mapping[str, Mapping[int, str]] = {},
 ) -> TablePieces:
-    """The table of ``rows_table``, piece by piece; ``zones`` are names of zones by number, for each channel."""
+    """All rows of channels of one schema, piece by piece, in the table's order; missing numbers are null.
+
+    ``names`` and ``zones`` are the names of classes and zones by their number, for each channel that names any;
+    ``of_tracks`` those of tracks, for each channel with rows about tracks of another one.
+    """
     import pyarrow as pa
 
-    table, members = table_of(schema), dict(sorted(channels.items()))
+    table = table_of(schema)
+    members = {topic: collect(schema, frames) for topic, frames in sorted(channels.items())}
     named = {topic: _Names.of(table, names.get(topic, {}), of_tracks.get(topic)) for topic in members}
     named_zones = {topic: _Names(ZONE.name, (("zone_id", zones.get(topic, {})),)) for topic in members}
     columns_of = {topic: [named[topic], *([named_zones[topic]] if table.is_of_zones() else [])] for topic in members}
@@ -289,7 +279,7 @@ def names_by_track(frames: FrameColumns, names: Mapping[int, str]) -> dict[int, 
 
 
 def summary_table(channels: Mapping[str, FrameColumns], names: Mapping[str, Mapping[int, str]] = {}) -> Any:
-    """The table ``track_summary`` of channels of tracks; ``names`` as in ``rows_table``."""
+    """The table ``track_summary`` of channels of tracks; ``names`` as in ``rows_in_pieces``."""
     import pyarrow as pa
 
     table, parts = TABLES["track_summary"], list[tuple[str, dict[str, NDArray[Any]]]]()

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Self
 
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call
@@ -50,23 +50,9 @@ _READERS: Final = {
 _MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
 
 
-class _TableSource(Protocol):
-    """A log, or the tables of a log in a folder."""
-
-    recording: str
-    where: Location
-
-    def part(self, name: str) -> Any:
-        """One of ``TABLES`` as Arrow or as a Parquet file; None if it does not exist."""
-
-    def channel(self, topic: str) -> Any:
-        """The table of a channel; None if it does not exist."""
-
-    def channels(self) -> list[str]:
-        """The channels that have tables of their own."""
-
-
 class _LogTables:
+    """The tables of a log, named as ``recording``, which is at ``where``."""
+
     def __init__(self, path: Location) -> None:
         self.opened = log.read(path)
         self.contents = LogTables(self.opened)
@@ -74,16 +60,21 @@ class _LogTables:
         self.where: Location = place_of(path)
 
     def part(self, name: str) -> Any:
+        """One of ``TABLES`` as Arrow or as a Parquet file; None if it does not exist."""
         return current_file(self.contents, default_folder(self.opened.path), name) or self.contents.table(name)
 
     def channel(self, topic: str) -> Any:
+        """The table of a channel; None if it does not exist."""
         return self.contents.messages(topic)[0] if topic in self.opened.channels else None
 
     def channels(self) -> list[str]:
+        """The channels that have tables of their own."""
         return sorted(self.opened.channels)
 
 
 class _FolderTables:
+    """The tables of a log in a folder, those that exist as Parquet files."""
+
     def __init__(self, folder: Path, recording: str) -> None:
         self.folder, self.recording = folder, recording
         self.where: Location = join(place_of(folder), recording)
@@ -100,6 +91,9 @@ class _FolderTables:
         paths = sorted((self.folder / TOPICS).glob(f"*/{self._member.parent.name}/{self._member.name}"))
         metadata = (tables.file_metadata(path, "parquet") or {} for path in paths)
         return [texts["topic"] for texts in metadata if "topic" in texts]
+
+
+_TableSource = _LogTables | _FolderTables
 
 
 class Database:

@@ -27,14 +27,12 @@ from mcaptrack.schema.framing import frame_times, joined_parts
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.sources.cameras import provenance_of
-from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.transforms import FULL, STAGES
 from mcaptrack.viewing.rendering import (
     RenderOptions,
     SceneDrawing,
-    at_times,
     draw,
     empty_ground,
     pictures_of_video,
@@ -43,6 +41,7 @@ from mcaptrack.viewing.rendering import (
     scene_times,
     scenes_of,
     sights,
+    views_at,
 )
 
 #: The largest width of a comparison in pixels, unless one is given.
@@ -163,16 +162,16 @@ def compare(
     happened = [_happened(opened, panel, start_ns) for panel in panels]
 
     def composed() -> Iterator[tuple[int, Image]]:
-        ground: _Ground | None = None
+        ground: SceneDrawing | None = None
         for done, (t_ns, parts) in enumerate(shown, 1):
             if ground is None and scene in opened.channels:
-                ground = _Ground(opened, scene, span, max(16, round(parts[0].shape[1] * len(parts) * _GROUND)))
+                ground = SceneDrawing(opened, [scene], span)
+                width = max(16, round(parts[0].shape[1] * len(parts) * _GROUND))
+                sight = sights(scenes_of(opened, scene, span), width, None, 1)[0]
             counters = [_counter(panel, events, t_ns) for panel, events in zip(panels, happened, strict=True)]
-            captions = _captions(panels, happened, t_ns)
-            clock = _clock((t_ns - start_ns) / NS_PER_S)
-            titles = [panel.title for panel in panels]
-            inset = ground.at(t_ns) if ground is not None else None
-            yield t_ns, _composed(parts, titles, counters, clock, captions, inset)
+            inset = ground.drawn(empty_ground(sight), t_ns, sight) if ground is not None else None
+            clock, captions = _clock((t_ns - start_ns) / NS_PER_S), _captions(panels, happened, t_ns)
+            yield t_ns, _composed(parts, panels, counters, clock, captions, inset)
             progress("render", done, len(times))
 
     return write_clip(output, composed(), rate_of(times))
@@ -183,16 +182,14 @@ def _on_pictures(
 ) -> Iterator[tuple[int, list[Image]]]:
     """The time of each picture, and the panels drawn on it."""
     span = int(pictures.t_ns[numbers[0]]), int(pictures.t_ns[numbers[-1]]) + 1
-    drawn = [(at_times(opened.messages(panel.view, *span)), message_decoder(opened, panel.view)) for panel in panels]
+    drawn = views_at(opened, [panel.view for panel in panels], span)
     width = 0
     for frame in pictures.readable(numbers.tolist()):
         whole = np.asarray(frame.rows, np.uint8)
         width = width or _panel_width(options, whole.shape[1], len(panels))
-        plain, parts = scaled(whole, width), []
-        for view, read in drawn:
-            payload, image = view(frame.t_ns), plain.copy()
-            parts.append(image if payload is None else draw(image, read(payload), width / whole.shape[1]))
-        yield frame.t_ns, parts
+        plain, scale = scaled(whole, width), width / whole.shape[1]
+        messages = [view(frame.t_ns) for view in drawn]
+        yield frame.t_ns, [plain.copy() if one is None else draw(plain.copy(), one, scale) for one in messages]
 
 
 def _from_above(
@@ -211,18 +208,6 @@ def _from_above(
 def _panel_width(options: RenderOptions, usual_px: int, count: int) -> int:
     total = options.width_px or min(_WIDTH_PX, usual_px * count)
     return max(2, total // count // 2 * 2)
-
-
-class _Ground:
-    """The re-tracked people on the ground, below the panels."""
-
-    def __init__(self, opened: log.Log, scene: str, span: tuple[int, int], width_px: int) -> None:
-        self._drawing = SceneDrawing(opened, [scene], span)
-        self._sight = sights(scenes_of(opened, scene, span), width_px, None, 1)[0]
-
-    def at(self, t_ns: int) -> Image:
-        """The picture at a time, for rising times."""
-        return self._drawing.drawn(empty_ground(self._sight), t_ns, self._sight)
 
 
 def _happened(opened: log.Log, panel: Panel, start_ns: int) -> _Happened:
@@ -277,7 +262,7 @@ def _clock(seconds: float) -> str:
 
 def _composed(
     parts: Sequence[Image],
-    titles: Sequence[str],
+    panels: Sequence[Panel],
     counters: Sequence[str],
     clock: str,
     captions: Sequence[str],
@@ -293,7 +278,7 @@ def _composed(
     for number, part in enumerate(parts):
         left = number * width
         out[header : header + height, left : left + width] = part
-        end = _write(out, titles[number], (left + line // 3, line), line, _INK, width - line)
+        end = _write(out, panels[number].title, (left + line // 3, line), line, _INK, width - line)
         _write(out, counters[number], (end + line // 2, line), line, _FAINT, left + width - end - line)
         if number:
             out[: header + height, left - 1 : left + 1] = 0

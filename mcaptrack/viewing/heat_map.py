@@ -28,8 +28,7 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
-from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.rendering import RenderOptions, draw, scaled
+from mcaptrack.viewing.rendering import ABOVE_PX, RenderOptions, draw, scaled, sight_of
 
 #: The formats of a heat map by the suffix of its file.
 SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
@@ -37,9 +36,6 @@ SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 _BEST: Final = ("retracks" + FULL, "retracks", "tracks", "truth")
 #: The scene without people is the median of this many pictures.
 _PICTURES: Final = 15
-#: Seen from above: the width in pixels, and the height as a share of it.
-_WIDTH_PX: Final = 960
-_HEIGHT: Final = 0.75
 #: The heat is drawn over the picture with this opacity at most, and is faded below this share of the highest.
 _OPACITY: Final = 0.8
 _FADED: Final = 0.04
@@ -95,7 +91,7 @@ def draw_heat_map(
         if pictures is not None:
             why = "the ground plane changes" if planes else "there is no ground plane"
             warn(f"{opened.path}: the heat map is drawn from above, because {why}", "other")
-        image = _from_above(heat, options.width_px or _WIDTH_PX)
+        image = _from_above(heat, options.width_px or ABOVE_PX)
     most = float(heat.person_s.max()) / heat.cell_m**2
     if options.width_px is None and image.shape[1] < _LEAST_PX:
         image = scaled(image, _LEAST_PX)
@@ -347,14 +343,10 @@ def _over_picture(scene: Image, heat: Occupancy, plane: GroundPlane) -> Image:
 def _from_above(heat: Occupancy, width_px: int) -> Image:
     import cv2
 
-    size = width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
     low, high = np.array(heat.low_m), np.array(heat.high_m)
-    extent = np.maximum(high - low, 1.0) * 1.15
-    middle = (low + high) / 2
-    scale = float(min(size[0] / extent[0], size[1] / extent[1]))
-    sight = Sight(float(middle[0]), float(middle[1]), scale, *size)
-    x = (np.arange(size[0]) + 0.5 - size[0] / 2) / scale + middle[0]
-    y = -(np.arange(size[1]) + 0.5 - size[1] / 2) / scale + middle[1]
+    sight = sight_of(low, high, np.maximum(high - low, 1.0) * 1.15, width_px)
+    x = (np.arange(sight.width_px) + 0.5 - sight.width_px / 2) / sight.px_per_m + sight.x_m
+    y = -(np.arange(sight.height_px) + 0.5 - sight.height_px / 2) / sight.px_per_m + sight.y_m
     across, up = (x - low[0]) / heat.cell_m + 1.5, (y - low[1]) / heat.cell_m + 1.5
     column, row = np.meshgrid(across.astype(np.float32), up.astype(np.float32))
     density = cv2.remap(_smooth(heat).astype(np.float32), column, row, cv2.INTER_LINEAR, borderValue=0)

@@ -18,15 +18,14 @@ from numpy.typing import NDArray
 
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Image, Ints
+from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.pipeline import RobotPath
 from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
-from mcaptrack.viewing.blur.mosaic import hide
-from mcaptrack.viewing.blur.people import HiddenPeople
+from mcaptrack.viewing.blur.people import HiddenPeople, hide
 from mcaptrack.viewing.from_above import Sight
 
 _LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
@@ -35,7 +34,7 @@ _SHIFT: Final = 4
 _GIF_FPS: Final = 10.0
 #: Seen from above: the width of a video in pixels and its height as a share of it, the width in metres around a robot,
 #: the least one around places, and the margin around these as a factor.
-_WIDTH_PX: Final = 960
+ABOVE_PX: Final = 960
 _HEIGHT: Final = 0.75
 _AROUND_M: Final = 80.0
 _LEAST_M: Final = 10.0
@@ -94,17 +93,16 @@ def render(
 
     def drawn() -> Iterator[tuple[int, Image]]:
         span = int(chosen[0]), int(chosen[-1]) + 1
-        views = [(at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in view_topics]
+        views = views_at(opened, view_topics, span)
         for done, frame in enumerate(pictures.readable(numbers.tolist()), 1):
             whole = np.asarray(frame.rows, np.uint8)
             if hidden is not None:
                 whole, _ = hide(whole, hidden.at(frame.index))
             image = scaled(whole, options.width_px)
             scale = image.shape[1] / frame.rows.shape[1]
-            for view, read in views:
-                payload = view(frame.t_ns)
-                if payload is not None:
-                    image = draw(image, read(payload), scale)
+            for view in views:
+                if (annotations := view(frame.t_ns)) is not None:
+                    image = draw(image, annotations, scale)
             yield frame.t_ns, image
             progress("render", done, len(chosen))
 
@@ -158,7 +156,7 @@ def render_from_above(
     span = int(chosen[0]), int(chosen[-1]) + 1
     path = path_of_robot(chosen)
     scenes = scenes_of(opened, view_topics[0], span)
-    seen = sights(scenes, options.width_px or _WIDTH_PX, path, len(chosen))
+    seen = sights(scenes, options.width_px or ABOVE_PX, path, len(chosen))
 
     def drawn() -> Iterator[tuple[int, Image]]:
         drawing = SceneDrawing(opened, view_topics, span)
@@ -196,27 +194,26 @@ class SceneDrawing:
     """Draws scenes of channels, seen from above, at rising times; their labels keep apart."""
 
     def __init__(self, opened: log.Log, topics: Sequence[str], span: tuple[int, int]) -> None:
-        self._views = [(at_times(opened.messages(topic, *span)), message_decoder(opened, topic)) for topic in topics]
+        self._views = views_at(opened, topics, span)
         self._places = from_above.LabelPlaces()
 
     def drawn(self, image: Image, t_ns: int, sight: Sight) -> Image:
         """The picture with the scenes at a time."""
         self._places.next_picture()
-        for view, read in self._views:
-            payload = view(t_ns)
-            if payload is not None:
-                image = draw(image, self._places.spread(from_above.drawing(read(payload), sight)))
+        for view in self._views:
+            if (scene := view(t_ns)) is not None:
+                image = draw(image, self._places.spread(from_above.drawing(scene, sight)))
         return image
 
 
 def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: int) -> list[Sight]:
     """The part of the ground in each picture: the surroundings of the robot, or all boxes and people of the scenes."""
-    size = width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
     if path is not None:
         placed = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
         if len(placed):
             nearest = placed[np.abs(placed[None] - np.arange(count)[:, None]).argmin(axis=1)]
-            return [Sight(x, y, size[0] / _AROUND_M, *size) for x, y in path.at_m[nearest].tolist()]
+            width, height = size_from_above(width_px)
+            return [Sight(x, y, width / _AROUND_M, width, height) for x, y in path.at_m[nearest].tolist()]
     places = [
         (shape.pose.position.x, shape.pose.position.y)
         for scene in scenes
@@ -224,10 +221,19 @@ def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: 
         for shape in (*entity.cubes, *entity.cylinders)
     ]
     low, high = np.quantile(np.array(places), [0.01, 0.99], axis=0) if places else np.array([[-5.0, -5.0], [5.0, 5.0]])
-    extent = np.maximum((high - low) * _MARGIN, _LEAST_M)
-    scale = min(size[0] / extent[0], size[1] / extent[1])
+    return [sight_of(low, high, np.maximum((high - low) * _MARGIN, _LEAST_M), width_px)] * count
+
+
+def size_from_above(width_px: int) -> tuple[int, int]:
+    """The size of a picture that is seen from above, even numbers."""
+    return width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
+
+
+def sight_of(low: Floats, high: Floats, extent: Floats, width_px: int) -> Sight:
+    """The part of the ground in a picture that has the middle of two corners (2,), and shows an extent (2,) in m."""
+    width, height = size_from_above(width_px)
     x, y = ((low + high) / 2).tolist()
-    return [Sight(x, y, float(scale), *size)] * count
+    return Sight(x, y, float(min(width / extent[0], height / extent[1])), width, height)
 
 
 def check_suffix(output: Path) -> None:
@@ -241,10 +247,7 @@ def chosen_pictures(opened: log.Log, times: Ints, what: str, output: Path, optio
     first = int(times[0]) + seconds_to_ns(options.start_s)
     last = int(times[-1]) if options.end_s is None else int(times[0]) + seconds_to_ns(options.end_s)
     numbers = np.flatnonzero((times >= first) & (times <= last))
-    _, first_of = np.unique(times[numbers], return_index=True)
-    if len(first_of) < len(numbers):
-        notices.warn(f"{len(numbers) - len(first_of)} {what} have the time of another and are left out", "left-out")
-        numbers = numbers[first_of]
+    numbers = without_repeated(times, numbers, what)
     max_fps = options.max_fps or (_GIF_FPS if output.suffix.lower() == ".gif" else None)
     if max_fps is not None and len(numbers):
         ticks = np.floor((times[numbers] - times[numbers[0]]) / NS_PER_S * max_fps + 1e-6)
@@ -256,21 +259,38 @@ def chosen_pictures(opened: log.Log, times: Ints, what: str, output: Path, optio
     return numbers
 
 
+def without_repeated(times: Ints, numbers: Ints, what: str) -> Ints:
+    """Leave out pictures, or scenes, that have the time of another, with a warning."""
+    _, first_of = np.unique(times[numbers], return_index=True)
+    if len(first_of) < len(numbers):
+        notices.warn(f"{len(numbers) - len(first_of)} {what} have the time of another and are left out", "left-out")
+    return np.asarray(numbers[first_of], np.int64)
+
+
 def rate_of(t_ns: Ints) -> Fraction:
     """The frame rate of a video with pictures at these times."""
     rest = np.diff(t_ns)
+    rest = rest[rest > 0]
     return Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
 
 
-def at_times(messages: Iterator[log.Message]) -> Callable[[int], bytes | None]:
-    """A function that returns the message at a time, for rising times; None if there is none at exactly that time."""
-    waiting: log.Message | None = next(messages, None)
+def views_at(opened: log.Log, topics: Sequence[str], span: tuple[int, int]) -> list[Callable[[int], Any]]:
+    """For each topic, a function that returns the message at exactly a time in a span, for rising times, or None."""
+    return [
+        message_at(((m.t_ns, m.payload) for m in opened.messages(topic, *span)), message_decoder(opened, topic))
+        for topic in topics
+    ]
 
-    def at(t_ns: int) -> bytes | None:
+
+def message_at(coming: Iterator[tuple[int, bytes]], read: Callable[[bytes], Any]) -> Callable[[int], Any]:
+    """A function that reads the message at exactly a time, for rising times; None if there is none."""
+    waiting = next(coming, None)
+
+    def at(t_ns: int) -> Any:
         nonlocal waiting
-        while waiting is not None and waiting.t_ns < t_ns:
-            waiting = next(messages, None)
-        return waiting.payload if waiting is not None and waiting.t_ns == t_ns else None
+        while waiting is not None and waiting[0] < t_ns:
+            waiting = next(coming, None)
+        return read(waiting[1]) if waiting is not None and waiting[0] == t_ns else None
 
     return at
 

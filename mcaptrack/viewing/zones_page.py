@@ -16,6 +16,7 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.zones import Units, Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.motion import moves
+from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.sources.pictures import Pictures
@@ -39,7 +40,7 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
     """
     topic = pipeline.camera_at(opened, prefix).pictures
     # Where the camera moves, zones in pixels are those of its first picture.
-    is_still = not moves(opened, prefix, {})
+    is_still = not moves(RunState(opened, prefix, {}))
     background = background_picture(Pictures(opened, topic), is_still) if topic else None
     if background is not None:
         units: Units = "pixels"

@@ -99,7 +99,7 @@ def write_all(folder: Path, parts: Iterable[Part]) -> None:
     size: dict[str, int] = {}
     rows = 0
     for number, part in enumerate(parts):
-        by_track = tables.rows_table(TRACKS, {"/camera/tracks": part}).combine_chunks()
+        by_track = tables.rows_in_pieces(TRACKS, {"/camera/tracks": part}).table().combine_chunks()
         by_time = by_track.take(np.argsort(by_track.column("row").to_numpy())).combine_chunks()
         rows += by_track.num_rows
         paths = {
@@ -121,7 +121,7 @@ def write_all(folder: Path, parts: Iterable[Part]) -> None:
             "ours": ours,
             "snappy": lambda path=paths["snappy"], table=by_time: pq.write_table(table, path),
             "zstd": lambda path=paths["zstd"], table=by_time: pq.write_table(table, path, compression="zstd"),
-            "put in order": lambda part=part: tables.rows_table(TRACKS, {"/camera/tracks": part}),
+            "put in order": lambda part=part: tables.rows_in_pieces(TRACKS, {"/camera/tracks": part}).table(),
         }
         for key, seconds in timed(calls).items():
             took[key] = took.get(key, 0.0) + seconds

@@ -63,19 +63,21 @@ def lifetime_ns(t_ns: Ints) -> int:
     return round(_LIFETIME * float(np.quantile(steps, 0.95))) if len(steps) else NS_PER_S
 
 
-class _Instants:
+class Instants:
     """The instants of the scenes of a channel, in batches."""
 
     def __init__(self, t_ns: Ints, frame_id: str) -> None:
         self.t_ns, self._frame_id, self._lifetime_ns = t_ns, frame_id, lifetime_ns(t_ns)
 
     def batches(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, SceneMessages]]:
+        """Yield the span and the empty scenes of each batch, from instant ``first`` to before ``last``."""
         last = len(self.t_ns) if last is None else last
         for start in range(first, last, BATCH):
             span = slice(start, min(start + BATCH, last))
             yield span, SceneMessages(self.t_ns[span], self._frame_id, self._lifetime_ns)
 
     def numbered(self, span: slice, scene: SceneMessages) -> View:
+        """Yield time, number and payload of the scenes of a batch."""
         yield from zip(self.t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
@@ -84,7 +86,7 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
 
     ``shown`` are those at these times. 3D boxes are drawn in the colours of their ``classes``, names by number.
     """
-    instants = _Instants(t_ns, frame_id)
+    instants = Instants(t_ns, frame_id)
     for first, last, people in shown.parts(BATCH):
         has_body = people.has_body()
         placed = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
@@ -125,7 +127,7 @@ def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapp
 
     Labels are the ids of the detector, or the numbers of rows where not all boxes of a frame have one of their own.
     """
-    instants = _Instants(t_ns, frame_id)
+    instants = Instants(t_ns, frame_id)
     joined = join_frames(DETECTIONS, frames)
     body = bodies_of(joined.rows)
     complete = np.flatnonzero(np.isfinite(np.column_stack([body.centre_m, body.size_m])).all(axis=1))
@@ -168,7 +170,7 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequ
 
     ``bodies`` are tracks with 3D boxes; forecasts of these are drawn at the height of their bottoms.
     """
-    instants = _Instants(t_ns, frame_id)
+    instants = Instants(t_ns, frame_id)
     wanted = latest(frames, t_ns)
     for first, last, forecasts in forecasts_in_parts(frames, wanted, BATCH, is_whole=bool(bodies)):
         futures = [

@@ -292,7 +292,7 @@ def _tracking(camera: CameraChannels) -> bytes:
     scene = _ground(camera, panels, "ground", "Tracks" if camera.recorded else "Ground", on)
     left = [*(picture or scene), *_plots(camera, panels)]
     right = [*(scene if picture else ()), *_recorded(camera, panels), *_event_text_or_log(camera, panels)]
-    return _file(panels, _columns(left, right, 55.0))
+    return layout(panels, _columns(left, right, 55.0))
 
 
 def _comparing(camera: CameraChannels) -> bytes:
@@ -310,7 +310,7 @@ def _comparing(camera: CameraChannels) -> bytes:
     lower = [*_ground(camera, panels, "ground", "All", shown), *_plots(camera, panels)]
     events = [part for title, names in _KINDS for part in _events(camera, panels, title, names)]
     lower += [split(events, "column")] if events else []
-    return _file(panels, ("column", split(upper), split(lower), 50.0) if lower else split(upper))
+    return layout(panels, ("column", split(upper), split(lower), 50.0) if lower else split(upper))
 
 
 def _predictions(camera: CameraChannels) -> bytes:
@@ -324,7 +324,7 @@ def _predictions(camera: CameraChannels) -> bytes:
     right = [*_ground(camera, panels, "ground", "Forecasts on the ground", on)]
     beside = _events(camera, panels, "Tracking", (events,))
     right.append(("row", "Plot!spread", beside[0], 60.0) if beside else "Plot!spread")
-    return _file(panels, _columns(left, right, 50.0))
+    return layout(panels, _columns(left, right, 50.0))
 
 
 def _spread(camera: CameraChannels, future: str) -> dict[str, Any]:
@@ -450,7 +450,3 @@ def _columns(left: Sequence[Tree], right: Sequence[Tree], share: float) -> Tree:
 
 def _column(parts: Sequence[Tree]) -> Tree:
     return ("column", parts[0], split(parts[1:], "column"), 65.0) if len(parts) > 1 else parts[0]
-
-
-def _file(panels: Mapping[str, Any], tree: Tree) -> bytes:
-    return layout(panels, tree)

@@ -11,10 +11,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.foxglove import SceneMessages
 from mcaptrack.foxglove.annotations import Annotations
-from mcaptrack.foxglove.views.ground import lifetime_ns
-from mcaptrack.foxglove.views.image import BATCH, PictureTimes, View
+from mcaptrack.foxglove.views.ground import Instants
+from mcaptrack.foxglove.views.image import PictureTimes, View
+from mcaptrack.foxglove.views.people import by_plane
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
@@ -93,12 +93,9 @@ class ZoneShape(NamedTuple):
 
 def on_ground(zones: Sequence[ZoneShape], captions: ZoneCaptions, frame_id: str) -> View:
     """Scene messages (time, number, payload) in metres, one for each frame."""
-    t_ns = captions.t_ns
-    life_ns = lifetime_ns(t_ns)
-    for start in range(0, len(t_ns), BATCH):
-        span = slice(start, min(start + BATCH, len(t_ns)))
-        scene = SceneMessages(t_ns[span], frame_id, life_ns)
-        frame = np.arange(len(t_ns[span]))
+    instants = Instants(captions.t_ns, frame_id)
+    for span, scene in instants.batches():
+        frame = np.arange(span.stop - span.start)
         for place, zone in enumerate(zones):
             rings = zone.rings_m()
             if not rings:
@@ -107,7 +104,7 @@ def on_ground(zones: Sequence[ZoneShape], captions: ZoneCaptions, frame_id: str)
             label = rings[0].mean(axis=0)
             texts = captions.texts[place][span]
             scene.zone(frame, zone.zone.name, rings, not zone.zone.is_line, label, texts, (*rgb, _ALPHA), zone.height_m)
-        yield from zip(t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
+        yield from instants.numbered(span, scene)
 
 
 def on_pictures(
@@ -123,15 +120,13 @@ def on_pictures(
     ``planes`` are those of the pictures, ``path`` is how the camera moves; zones in pixels are those of its reference
     picture. ``height_px`` is the height of a picture.
     """
-    since = np.array([start for start, _ in planes[1:]], np.int64)
     for span, drawn in pictures.batches():
         t_ns = pictures.t_ns[span]
-        which = np.searchsorted(since, t_ns, "right")
         taken: list[Floats] = []
         for place, zone in enumerate(zones):
             texts = np.array(captions.at(place, t_ns), object)
             down_px: float | None = None  # the same in all pictures of a batch, so that labels don't jump
-            for frame, rings in _seen(zone, t_ns, which, planes, path, height_px):
+            for frame, rings in _seen(zone, t_ns, planes, path, height_px):
                 if _is_drawn(rings):
                     size, corner = _label_of(rings[0], height_px)
                     down_px = _free_place(taken, corner, size, texts[frame]) if down_px is None else down_px
@@ -140,15 +135,12 @@ def on_pictures(
 
 
 def _seen(
-    shape: ZoneShape, t_ns: Ints, which: Ints, planes: Planes, path: CameraPath | None, height_px: float
+    shape: ZoneShape, t_ns: Ints, planes: Planes, path: CameraPath | None, height_px: float
 ) -> Iterator[tuple[Ints, list[Floats]]]:
     """The rings of a zone in pictures: groups of pictures in which they are at the same place."""
     if shape.zone.units == "metres":
-        for number in np.unique(which).tolist() if planes else ():
-            yield (
-                np.flatnonzero(which == number),
-                [planes[number][1].metres_to_pixels(ring) for ring in shape.rings_m()],
-            )
+        for plane, held in by_plane(planes, t_ns):
+            yield np.flatnonzero(held), [plane.metres_to_pixels(ring) for ring in shape.rings_m()]
         return
     rings = shape.rings_px(height_px)
     if path is None:

@@ -16,8 +16,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location, Url
 from mcaptrack.notices import warn
-from mcaptrack.schema.cdr import is_ros_topic
-from mcaptrack.schema.encodings import CDR, PROTOBUF, Encoding
+from mcaptrack.schema.encodings import CDR, PROTOBUF, Encoding, is_ros_topic
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, is_packed, names_file
 

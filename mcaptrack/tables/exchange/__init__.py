@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, get_args
+from typing import Final, NamedTuple, get_args
 
 from mcaptrack import log
 from mcaptrack.choices import ExchangeFormat
@@ -26,28 +26,22 @@ __all__ = ["FORMATS", "ExchangeFormat", "WrittenBoxes", "default_file", "ends_wi
 FORMATS: Final[tuple[ExchangeFormat, ...]] = get_args(ExchangeFormat)
 Progress = Callable[[str, int, int], None]
 
-#: How each format is written, what it can hold beside frames, boxes and ids, and the end of its file's name.
-_WRITERS: Final[Mapping[ExchangeFormat, Callable[[BoxTable], Iterator[bytes]]]] = {
-    "mot": text.mot,
-    "kitti": text.kitti,
-    "coco": coco.coco,
-    "cvat": cvat.cvat,
-    "boxes-csv": text.boxes_csv,
-}
-_HOLDS: Final[Mapping[ExchangeFormat, frozenset[str]]] = {
-    "mot": frozenset({"scores"}),
-    "kitti": frozenset({"scores", "names"}),
-    "coco": frozenset({"scores", "names", "observed"}),
-    "cvat": frozenset({"names", "observed"}),
-    "boxes-csv": frozenset({"scores", "names", "observed", "metres"}),
-}
-_ENDS: Final[Mapping[ExchangeFormat, str]] = {
-    "mot": ".mot.txt",
-    "kitti": ".kitti.txt",
-    "coco": ".coco.json",
-    "cvat": ".cvat.xml",
-    "boxes-csv": ".boxes.csv",
-    "rerun": ".rrd",
+
+class _Format(NamedTuple):
+    """The end of the name of a file, how it is written, and what it holds beside frames, boxes and ids."""
+
+    end: str
+    write: Callable[[BoxTable], Iterator[bytes]] | None = None
+    holds: frozenset[str] = frozenset()
+
+
+_FORMATS: Final[Mapping[str, _Format]] = {
+    "mot": _Format(".mot.txt", text.mot, frozenset({"scores"})),
+    "kitti": _Format(".kitti.txt", text.kitti, frozenset({"scores", "names"})),
+    "coco": _Format(".coco.json", coco.coco, frozenset({"scores", "names", "observed"})),
+    "cvat": _Format(".cvat.xml", cvat.cvat, frozenset({"names", "observed"})),
+    "boxes-csv": _Format(".boxes.csv", text.boxes_csv, frozenset({"scores", "names", "observed", "metres"})),
+    "rerun": _Format(".rrd"),
 }
 
 
@@ -62,12 +56,12 @@ class WrittenBoxes:
 
 def default_file(path: Location, form: ExchangeFormat) -> Path:
     """The default file for the boxes of a log: log.mcap -> log.cvat.xml beside it."""
-    return local_name(path, _ENDS[form])
+    return local_name(path, _FORMATS[form].end)
 
 
 def ends_with(form: str) -> str:
     """The end of the name of a file of this format; "" for others."""
-    return next((end for name, end in _ENDS.items() if name == form), "")
+    return _FORMATS[form].end if form in _FORMATS else ""
 
 
 # Which channel of boxes is given to other programs.
@@ -145,19 +139,20 @@ def write_boxes(
     """
     refuse_overwrite(output, force)
     chosen = boxes_topic(opened, topic)
-    if form == "rerun":
+    written = _FORMATS[form]
+    if written.write is None:
         rows, notes = write_recording(opened, output, chosen, progress)
         return WrittenBoxes(chosen, rows, tuple(notes))
     boxes = read_boxes(opened, chosen)
     done = 0
     with publish_stream(output) as stream:
         progress("export", 0, len(boxes.frame))
-        for part in _WRITERS[form](boxes):
+        for part in written.write(boxes):
             stream.write(part)
             done = min(done + 1, len(boxes.frame))
             progress("export", done, len(boxes.frame))
         progress("export", len(boxes.frame), len(boxes.frame))
-    lost = [boxes.left_out(form, _HOLDS[form])]
+    lost = [boxes.left_out(form, written.holds)]
     lost += [text.describe_mot_numbers(boxes.classes)] if form == "mot" else []
     lost += [text.describe_merged(form, boxes.classes)] if form in ("mot", "kitti") else []
     lost += [cvat.describe_classes(boxes)] if form == "cvat" else []

@@ -94,23 +94,7 @@ def boxes_csv(boxes: BoxTable) -> Iterator[bytes]:
     """A table with a header; frames without boxes have a row of their own, without a box."""
     held = io.StringIO()
     writer = csv.writer(held, lineterminator="\n")
-    writer.writerow(
-        [
-            "frame",
-            "t_ns",
-            "track_id",
-            "x",
-            "y",
-            "w",
-            "h",
-            "score",
-            "class_id",
-            "class_name",
-            "observed",
-            "ground_x_m",
-            "ground_y_m",
-        ]
-    )
+    held.write("frame,t_ns,track_id,x,y,w,h,score,class_id,class_name,observed,ground_x_m,ground_y_m\n")
     names = boxes.classes
     ends = np.searchsorted(boxes.frame, boxes.frames, "right").tolist()
     starts = np.searchsorted(boxes.frame, boxes.frames, "left").tolist()

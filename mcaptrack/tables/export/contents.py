@@ -86,8 +86,8 @@ def _escaped(character: str) -> str:
 #: The tracks that stand for a camera, below its name: the first that there are.
 _BEST: Final = ("retracks", "retracks/online", "tracks")
 #: The rules by which they are scored, the first that gave a score.
-_RULES: Final = (("metres", GATE_M), ("iou", 0.5))
-_RULES_3D: Final = (("metres", GATE_3D_M), *_RULES)
+RULES: Final = (("metres", GATE_M), ("iou", 0.5))
+RULES_3D: Final = (("metres", GATE_3D_M), *RULES)
 #: The scores that are taken over.
 _SCORES: Final = ("MOTA", "IDF1", "HOTA", "IDSW")
 
@@ -128,7 +128,7 @@ def worst_score(topics: Sequence[str], scores: Sequence[Mapping[str, Any]]) -> d
 def _headline(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     """The row of one channel of tracks by which it is compared; None if it has no score."""
     together = [row for row in rows if row.get("class") is None]
-    rules = _RULES_3D if any(row.get("AMOTA") is not None for row in together) else _RULES
+    rules = RULES_3D if any(row.get("AMOTA") is not None for row in together) else RULES
     by_rule = {(row["similarity"], row["gate"]): row for row in together}
     return next((by_rule[rule] for rule in rules if rule in by_rule), None)
 

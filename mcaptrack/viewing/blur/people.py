@@ -8,7 +8,7 @@ Letters: N boxes, M pictures.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -19,12 +19,12 @@ from mcaptrack.errors import DamagedError, McaptrackError
 from mcaptrack.foxglove import Cuboids
 from mcaptrack.foxglove.views import MovingCamera
 from mcaptrack.foxglove.views.projected import corners
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.pinhole import project
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import PEOPLE, UNKNOWN, class_name, class_names
 from mcaptrack.schema.framing import frame_times, joined_parts
 from mcaptrack.schema.provenance import frame_id_of
@@ -39,6 +39,70 @@ _NEAR_S: Final = 0.25
 #: Margins at each side: shares of width and height, at least some pixels; and the growth, in widths, for each second
 #: without a row.
 _MARGIN: Final = (0.2, 0.1)
+
+
+# The pixels that hide a person: a mosaic that is too coarse to be undone.
+#
+# A cell is at least a quarter as large as the person, so that a face is smaller than a cell, and its colour is
+# rounded to one of eight levels, so that pictures that follow each other don't give more detail together. Cells
+# stay where they are in the picture.
+#
+# Letters: N boxes, H rows, W columns.
+
+
+#: The least size of a cell in px, and its least share of the longer side of a box.
+_MOSAIC_LEAST_PX: Final = 8
+_SHARE: Final = 0.25
+#: Colours are multiples of this, in the middle of their step.
+_STEP: Final = 32
+
+
+def hide(image: Image, boxes: Floats) -> tuple[Image, Bools]:
+    """Hide the inside of boxes.
+
+    Parameters
+    ----------
+    image : (H, W, 3) of uint8
+        Blue, green, red. It is not changed.
+    boxes : (N, 4)
+        Left, top, width and height in px. Parts outside of the picture have no effect.
+
+    Returns
+    -------
+    image : (H, W, 3) of uint8
+    mask : (H, W) of bool
+        Which pixels are hidden. All others are those of the given picture.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    mask = np.zeros((height, width), np.bool_)
+    out = image.copy()
+    left, top = np.floor(boxes[:, :2]).T.clip(0, [[width], [height]]).astype(np.int64)
+    right, bottom = np.ceil(boxes[:, :2] + boxes[:, 2:]).T.clip(0, [[width], [height]]).astype(np.int64)
+    longer = np.maximum(boxes[:, 2:].max(axis=1, initial=0) * _SHARE, _MOSAIC_LEAST_PX)
+    power = np.ceil(np.log2(longer) - 1e-9).astype(np.int64)
+    for level in np.unique(power).tolist():  # where boxes overlap, larger cells hide smaller ones
+        own = np.flatnonzero((power == level) & (right > left) & (bottom > top))
+        if not len(own):
+            continue
+        cell = 1 << level
+        inside = np.zeros((height, width), np.bool_)
+        for number in own.tolist():
+            inside[top[number] : bottom[number], left[number] : right[number]] = True
+        x, y = int(left[own].min()) // cell * cell, int(top[own].min()) // cell * cell
+        part = image[y : int(bottom[own].max()), x : int(right[own].max())]
+        rows, columns = -(-part.shape[0] // cell), -(-part.shape[1] // cell)
+        more = (rows * cell - part.shape[0], columns * cell - part.shape[1])
+        whole = cv2.copyMakeBorder(part, 0, more[0], 0, more[1], cv2.BORDER_REPLICATE)
+        small = cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA)
+        rough = (np.asarray(small, np.uint8) // _STEP * _STEP + _STEP // 2).repeat(cell, axis=0).repeat(cell, axis=1)
+        end = np.s_[y : y + part.shape[0], x : x + part.shape[1]]
+        out[end][inside[end]] = rough[: part.shape[0], : part.shape[1]][inside[end]]
+        mask |= inside
+    return out, mask
+
+
 _LEAST_PX: Final = 4.0
 _GROWTH_PER_S: Final = 0.5
 #: Pictures without a frame of boxes within this time were not looked at.
@@ -268,21 +332,37 @@ def _read(opened: log.Log, topic: str) -> tuple[Pieces, Ints, str] | None:
         schema, frames, frame_id, names = DETECTIONS, named.frames, named.frame_id, named.classes
     else:
         return None
-    parts: list[tuple[Ints, Ints, Floats]] = []
+    t_ns, number, state = _of_people(schema, frames, names, _states, len(_STATE))
+    if not len(t_ns):
+        return None
+    pieces = linked(t_ns, number, state, state[:, :3]) if schema is TRACKS else around(t_ns, state, _NEAR_NS)
+    return pieces, frame_times(frames), frame_id
+
+
+def _states(rows: Rows) -> Floats:
+    """The states (N, 7) of 3D boxes. Those without a heading may stand in any direction."""
+    state = np.stack([rows[name].astype(np.float64) for name in _STATE], axis=-1)
+    turned = np.isfinite(state[:, 6])
+    state[~turned, 3:5] = state[~turned, 3:5].max(axis=1, keepdims=True, initial=0)
+    state[~turned, 6] = 0
+    return state
+
+
+def _of_people(
+    schema: Schema, frames: Sequence[Frame], names: Mapping[int, str], state_of: Callable[[Rows], Floats], width: int
+) -> tuple[Ints, Ints, Floats]:
+    """The times (N,), track ids (0 for detections) and states (N, ``width``) of people; rows without one are left out.
+
+    ``state_of`` returns the states of rows, not finite where there is none.
+    """
+    parts: list[tuple[Ints, Ints, Floats]] = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, width)))]
     for _, _, part in joined_parts(schema, frames):
-        state = np.stack([part.rows[name].astype(np.float64) for name in _STATE], axis=-1)
-        # Boxes without a heading may stand in any direction.
-        turned = np.isfinite(state[:, 6])
-        state[~turned, 3:5] = state[~turned, 3:5].max(axis=1, keepdims=True, initial=0)
-        state[~turned, 6] = 0
+        state = state_of(part.rows)
         usable = np.isfinite(state).all(axis=1) & people_among(part.rows["class_id"], names)
         number = part.rows["track_id"] if schema is TRACKS else np.zeros(len(state), np.int64)
         parts.append((part.row_ns[usable], number[usable].astype(np.int64), state[usable]))
-    if not sum(len(part[0]) for part in parts):
-        return None
-    t_ns, number, state = (np.concatenate([part[n] for part in parts]) for n in range(3))
-    pieces = linked(t_ns, number, state, state[:, :3]) if schema is TRACKS else around(t_ns, state, _NEAR_NS)
-    return pieces, frame_times(frames), frame_id
+    t_ns, number, states = (np.concatenate([part[n] for part in parts]) for n in range(3))
+    return t_ns, number, states
 
 
 def outlines(states: Floats, picture: Ints, camera: MovingCamera) -> Floats:
@@ -399,20 +479,17 @@ def _people(opened: log.Log, topic: str) -> tuple[Schema, Ints, Ints, Ints, Floa
         frames, names = named.frames, names | named.classes
     else:
         return None
-    parts: list[tuple[Ints, Ints, Floats]] = []
-    for _, _, part in joined_parts(schema, frames):
-        boxes, rows = columns_to_boxes(part.rows), part.rows
-        usable = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1)
-        usable &= people_among(rows["class_id"], names)
-        number = rows["track_id"] if schema is TRACKS else np.zeros(len(rows), np.int64)
-        parts.append((part.row_ns[usable], number[usable].astype(np.int64), boxes[usable]))
-    if not sum(len(part[0]) for part in parts) and not _has_pixels(schema, frames):
+    t_ns, number, boxes = _of_people(schema, frames, names, _boxes, 4)
+    if not len(t_ns) and not _has_pixels(schema, frames):
         return None
-    t_ns, number, boxes = (np.concatenate([part[n] for part in parts]) for n in range(3)) if parts else _NOTHING
     return schema, frame_times(frames), t_ns, number, boxes
 
 
-_NOTHING: Final = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 4)))
+def _boxes(rows: Rows) -> Floats:
+    """The boxes (N, 4) of rows in pixels, NaN where they have no extent."""
+    boxes = columns_to_boxes(rows)
+    boxes[~(boxes[:, 2:] > 0).all(axis=1)] = np.nan
+    return boxes
 
 
 def _has_pixels(schema: Schema, frames: Sequence[Frame]) -> bool:

@@ -10,7 +10,6 @@ import base64
 import dataclasses
 import json
 from collections.abc import Callable, Iterator, Sequence
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -18,8 +17,7 @@ import numpy as np
 
 from mcaptrack import __version__, foxglove, log
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.geometry.arrays import Bools, Image, Ints
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.arrays import Bools, Image
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of
 from mcaptrack.sources import foreign
@@ -28,8 +26,8 @@ from mcaptrack.sources.foreign.decoding import MessageType, ros_types
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.video import EncodedPicture, H264Encoder, decode_bgr, encode_image
 from mcaptrack.sources.video.decode import raw_with
-from mcaptrack.viewing.blur.mosaic import hide
-from mcaptrack.viewing.blur.people import HiddenPeople
+from mcaptrack.viewing.blur.people import HiddenPeople, hide
+from mcaptrack.viewing.rendering import rate_of
 
 #: The key of the metadata of a channel with replaced pictures.
 BLURRED: Final = "mcaptrack.blurred"
@@ -66,7 +64,8 @@ def blurrable(opened: log.Log, only: str | None = None) -> dict[str, HiddenPeopl
             out[topic] = people
             _warn_of_pictures(opened, topic, people)
     if not with_pictures:
-        raise McaptrackError(f"{opened.path} has no pictures{_of(only)} in which people could be hidden")
+        of = f" of {only}" if only else ""
+        raise McaptrackError(f"{opened.path} has no pictures{of} in which people could be hidden")
     if not out:
         picture_topics = ", ".join(dict.fromkeys(str(camera.pictures) for camera in with_pictures))
         why = f" ({'; '.join(dict.fromkeys(problems))})" if problems else ""
@@ -77,10 +76,6 @@ def blurrable(opened: log.Log, only: str | None = None) -> dict[str, HiddenPeopl
     for problem in dict.fromkeys(problems):
         warn(f"{opened.path}: people in boxes in space may be recognisable: {problem}", "not-blurred")
     return out
-
-
-def _of(prefix: str | None) -> str:
-    return f" of {prefix}" if prefix else ""
 
 
 def _warn_of_pictures(opened: log.Log, topic: str, people: HiddenPeople) -> None:
@@ -215,11 +210,7 @@ def write_blurred_log(
             for topic, people in blurrable.items():
                 channel = opened.channel(topic)
                 kind = message_type_of(opened, topic)
-                note = {
-                    "hidden": "people",
-                    "boxes": list(people.topics),
-                    "version": __version__,
-                }
+                note = {"hidden": "people", "boxes": list(people.topics), "version": __version__}
                 metadata = channel.metadata | {BLURRED: json.dumps(note, sort_keys=True, separators=(",", ":"))}
                 schema = (kind.name, kind.schema_encoding, kind.schema)
                 number = writer.add_channel(topic, schema, kind.encoding, metadata, "media", topic)
@@ -287,10 +278,3 @@ class _Encoder:
         if not self._has_warned:
             warn(f"{self._name}: pictures in {before} become {after}", "other")
         self._has_warned = True
-
-
-def rate_of(t_ns: Ints) -> Fraction:
-    """The frame rate of pictures at these times."""
-    rest = np.diff(t_ns)
-    rest = rest[rest > 0]
-    return Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)

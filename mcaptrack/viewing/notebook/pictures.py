@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack import log, notices, pipeline
+from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.foxglove import ANNOTATIONS, SCENE, views
 from mcaptrack.foxglove.messages import message_class
@@ -33,7 +33,7 @@ from mcaptrack.sources.video import encode_image
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.rendering import draw, scaled, sights
+from mcaptrack.viewing.rendering import draw, message_at, scaled, sights, without_repeated
 
 #: The largest width of a player and of a still in pixels, unless it is given.
 PLAYER_PX: Final = 640
@@ -176,23 +176,6 @@ class ShownView(NamedTuple):
     topic: str
     messages: Callable[[Ints, tuple[int, int]], Iterator[tuple[int, bytes]]]
     read: Callable[[bytes], Any]
-
-    def payloads(self, t_ns: Ints, span: tuple[int, int]) -> Iterator[bytes]:
-        """Yield the payloads of all messages in a span of times."""
-        return (payload for _, payload in self.messages(t_ns, span))
-
-    def payload_at(self, t_ns: Ints, span: tuple[int, int]) -> Callable[[int], bytes | None]:
-        """Return a function that gives the payload at exactly a time, for rising times; None if there is none."""
-        coming = self.messages(t_ns, span)
-        waiting = next(coming, None)
-
-        def at(time_ns: int) -> bytes | None:
-            nonlocal waiting
-            while waiting is not None and waiting[0] < time_ns:
-                waiting = next(coming, None)
-            return waiting[1] if waiting is not None and waiting[0] == time_ns else None
-
-        return at
 
 
 class ToShow(NamedTuple):
@@ -346,11 +329,7 @@ class PictureSource:
             raise McaptrackError(
                 f"{self._opened.path} has no {self.noun} between {start_s:g} s and {end}; {self._there()}"
             )
-        _, first_of = np.unique(self.t_ns[numbers], return_index=True)
-        if len(first_of) < len(numbers):
-            left = len(numbers) - len(first_of)
-            notices.warn(f"{left} {self.noun} have the time of another and are left out", "left-out")
-        return np.asarray(numbers[first_of], np.int64)
+        return without_repeated(self.t_ns, numbers, self.noun)
 
     def step(self, numbers: Ints, most_bytes: float, width_px: int | None) -> int:
         """Return the step between pictures with which about as many as fit into ``most_bytes`` are taken."""
@@ -395,20 +374,14 @@ class PictureSource:
         """Yield number, size, picture, and the annotations of each layer, None where a view has none."""
         chosen = self.t_ns[numbers]
         span = int(chosen[0]), int(chosen[-1]) + 1
-        views = [(view.payload_at(self.t_ns, span), view.read) for view in self._views]
-
-        def at(t_ns: int) -> Iterator[Any]:
-            for payload_at, read in views:
-                payload = payload_at(t_ns)
-                yield None if payload is None else read(payload)
-
+        views = [message_at(view.messages(self.t_ns, span), view.read) for view in self._views]
         if self._pictures is not None:
             for frame in self._pictures.readable(numbers.tolist()):
                 image = np.asarray(frame.rows, np.uint8)
-                yield frame.index, (image.shape[1], image.shape[0]), image, list(at(frame.t_ns))
+                yield frame.index, (image.shape[1], image.shape[0]), image, [view(frame.t_ns) for view in views]
             return
         for number, sight, ground in self._ground(numbers, span, above_px):
-            scenes = at(int(self.t_ns[number]))
+            scenes = [view(int(self.t_ns[number])) for view in views]
             drawings = [None if scene is None else from_above.drawing(scene, sight) for scene in scenes]
             yield number, (sight.width_px, sight.height_px), from_above.ground(sight), [ground, *drawings]
 
@@ -417,7 +390,7 @@ class PictureSource:
         first = self.views[0]
         is_view = first.endswith(SCENE_SUFFIX)  # rows that are drawn now are seen without the robot
         path = pipeline.robot_path(self._opened, self._prefix, first, self.t_ns[numbers]) if is_view else None
-        scenes = (self._views[0].read(payload) for payload in self._views[0].payloads(self.t_ns, span))
+        scenes = (self._views[0].read(payload) for _, payload in self._views[0].messages(self.t_ns, span))
         seen = sights(scenes, width_px, path, len(numbers))
         for place, (number, sight) in enumerate(zip(numbers.tolist(), seen, strict=True)):
             ground = from_above.grid(sight)

@@ -226,6 +226,11 @@ def thinned(*columns: Floats) -> tuple[Floats, ...]:
 _TICKS_S: Final = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 43200, 86400)
 
 
+def figure(chart: Chart, title: str, caption: str) -> dict[str, Any]:
+    """A chart with the text below it."""
+    return {"chart": chart, "title": title, "caption": caption}
+
+
 def time_ticks(span_s: float) -> Floats:
     """About six round times from 0 to ``span_s``."""
     step = next((tick for tick in _TICKS_S if span_s / tick <= 6.5), round_step(span_s / 6))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -32,14 +32,17 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing.comparing import tracker_name
 from mcaptrack.viewing.report import statistics
-from mcaptrack.viewing.report.charts import POINTS, Axis, Floats, Line, line_chart, round_most
-from mcaptrack.viewing.report.doubts import Doubt, DoubtfulTrack, find_doubtful_tracks, find_doubts
+from mcaptrack.viewing.report.charts import POINTS, Axis, Floats, Line, figure, line_chart, round_most
 from mcaptrack.viewing.report.formatting import NONE, number, plain, short
 from mcaptrack.viewing.report.headline import AFTER, BEFORE, BeforeAfter, compared
 from mcaptrack.viewing.report.identity_events import (
     ChannelEvents,
+    Doubt,
+    DoubtfulTrack,
     IdentityEvent,
     add_thumbnails,
+    find_doubtful_tracks,
+    find_doubts,
     most_important,
     summarize_events,
 )
@@ -110,7 +113,11 @@ class LogReport:
     @property
     def headline(self) -> BeforeAfter | None:
         """The scores before and after re-tracking that the whole page counts by; None without scores."""
-        return compared({role: track_set.topic for role, track_set in self.track_sets.items()}, self.results)
+        return self.compared_in(self.results)
+
+    def compared_in(self, results: Sequence[EvaluationRow]) -> BeforeAfter | None:
+        """The scores before and after re-tracking among these; None without any."""
+        return compared({role: track_set.topic for role, track_set in self.track_sets.items()}, results)
 
     @property
     def compared_roles(self) -> tuple[str, str]:
@@ -221,11 +228,8 @@ def _inside(opened: log.Log, topic: str, zones: tuple[Zone, ...]) -> dict[str, t
 def _chart(name: str, lines: list[Line]) -> dict[str, Any]:
     last = max((float(line.x[-1]) for line in lines), default=1.0)
     axes = Axis("time, s", max(last, 1e-3)), Axis("tracks inside", round_most([line.y for line in lines], 4.0))
-    return {
-        "chart": line_chart(f"Tracks inside {name} over time", lines, *axes),
-        "title": f"Inside {name}.",
-        "caption": "The most at a time in each period.",
-    }
+    chart = line_chart(f"Tracks inside {name} over time", lines, *axes)
+    return figure(chart, f"Inside {name}.", "The most at a time in each period.")
 
 
 def gather(

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
+
+import numpy as np
 
 from mcaptrack.errors import command
+from mcaptrack.evaluation.people import PersonScores
 from mcaptrack.foxglove.palette import COUNT as COLOURS
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.viewing.report.charts import time_ticks
+from mcaptrack.geometry.ragged import run_starts
+from mcaptrack.schema import Frame
+from mcaptrack.schema.framing import frame_times, row_ends
+from mcaptrack.viewing.report.charts import POINTS, Axis, Line, figure, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport, TrackSet, plane_of
-from mcaptrack.viewing.report.formatting import clock, counted, number, short
+from mcaptrack.viewing.report.formatting import clock, counted, number, short, tick_marks
 from mcaptrack.viewing.report.headline import rule_text
 from mcaptrack.viewing.report.identity_events import BARS, SIDE_PX, ChannelEvents, IdentityEvent, Thumbnail
 from mcaptrack.viewing.report.scene_map import (
@@ -24,6 +31,7 @@ from mcaptrack.viewing.report.scene_map import (
     picture_map,
     pixel_paths,
 )
+from mcaptrack.viewing.report.statistics import rows_by_track
 
 #: The time in the text of an event.
 _WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
@@ -147,10 +155,7 @@ def _timeline(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: Lo
         "bin": number(span / BARS, 2, "s"),
         "marks": list(dict.fromkeys(places)),
         "highlights": [(x, e.text) for e, x in zip(channel.events, places, strict=True) if id(e) in chosen],
-        "ticks": [
-            (f"{100 * tick / span:.2f}%", clock(tick, span), "end" if tick > 0.97 * span else "mid" if tick else "")
-            for tick in time_ticks(span).tolist()
-        ],
+        "ticks": tick_marks(span),
     }
 
 
@@ -175,3 +180,193 @@ def _thumbnail(thumbnail: Thumbnail, when: str) -> dict[str, Any]:
     box = {"x": x, "y": y, "w": w, "h": h, "label": thumbnail.box.label, "colour": thumbnail.box.identity % COLOURS}
     box |= {"label_x": f"{max(thumbnail.box.xywh[0], 2):.1f}", "label_y": f"{max(thumbnail.box.xywh[1] - 4, 14):.1f}"}
     return values | {"title": f"{when}, at {at}: track {thumbnail.box.label}", "box": box}
+
+
+# The identities of people over time, a bar for each of them coloured by ids of tracks; and how many there were.
+#
+# Letters: P rows of one person.
+
+
+#: The largest number of people that get a bar; those who stay longest.
+_MOST: Final = 40
+#: Pauses up to this many intervals between rows are part of a bar.
+_PAUSE: Final = 1.6
+#: Pieces are at least this part of the width, in percent, and those with ids printed in them this part.
+_LEAST, _WIDE = 0.15, 4.5
+#: Logs longer than this are shown in minutes.
+_MINUTES: Final = 600.0
+
+
+class IdentitySpan(NamedTuple):
+    """A time in which a person has one id: seconds since the start of the log."""
+
+    identity: int
+    first_s: float
+    last_s: float
+
+
+def pieces(identity: Ints, t_ns: Ints, start_ns: int, interval_ns: float) -> list[IdentitySpan]:
+    """The times with one id (P,), of rows at rising times (P,) that are usually ``interval_ns`` apart.
+
+    A piece lasts until the next row is due, so that a single row is as long as an interval.
+    """
+    if not len(identity):
+        return []
+    first = np.flatnonzero(run_starts(identity, times=t_ns, max_gap=round(_PAUSE * interval_ns)))
+    last = np.append(first[1:], len(identity)) - 1
+    begin = (t_ns[first] - start_ns) / NS_PER_S
+    due = np.append(t_ns[1:], np.iinfo(np.int64).max)[last]
+    end = (np.minimum(t_ns[last] + round(interval_ns), due) - start_ns) / NS_PER_S
+    return [IdentitySpan(*span) for span in zip(identity[first].tolist(), begin.tolist(), end.tolist(), strict=True)]
+
+
+def identity_timeline(report: LogReport) -> dict[str, Any]:
+    """The values of the section."""
+    span_s = max((report.end_ns - report.start_ns) / NS_PER_S, 1e-9)
+    scored = [(report.track_sets[role], report.people[role]) for role in report.compared_roles if role in report.people]
+    rows = _of_people(report, [people for _, people in scored]) if scored else _of_tracks(report)
+    kept = sorted(sorted(rows, key=lambda row: -row["seconds"])[:_MOST], key=lambda row: row["begins"])
+    headline = report.headline
+    return {
+        "rows": [{**row, "lanes": [_lane(lane, span_s) for lane in row["lanes"]]} for row in kept],
+        "left_out": len(rows) - len(kept),
+        "has_truth": bool(scored),
+        "lanes": [
+            {"name": short(side.name), "role": side.role, "switches": _switches(people)} for side, people in scored
+        ],
+        "rule": rule_text(*headline.rule) if headline else "",
+        "span": clock(span_s),
+        "ticks": tick_marks(span_s),
+    }
+
+
+def _switches(people: PersonScores) -> str:
+    return counted(int(people.switches.sum()), "identity switch", "identity switches")
+
+
+def _of_people(report: LogReport, sides: Sequence[PersonScores]) -> list[dict[str, Any]]:
+    """A row for each true person, with a lane for each kind of tracks."""
+    truth, t_ns = rows_by_track(report.track_sets["truth"].frames)
+    interval_ns = _interval_ns(np.unique(t_ns))
+    out = []
+    for person, low, high in _groups(truth["track_id"]):
+        lanes = [("truth", pieces(np.zeros(high - low, np.int64), t_ns[low:high], report.start_ns, interval_ns))]
+        for side in sides:
+            low_match, high_match = np.searchsorted(side.person, [person, person + 1])
+            own = slice(int(low_match), int(high_match))
+            step_ns = _interval_ns(side.frame_ns)
+            lanes.append(("ids", pieces(side.track[own], side.t_ns[own], report.start_ns, step_ns)))
+        out.append(_row(person, lanes))
+    return out
+
+
+def _of_tracks(report: LogReport) -> list[dict[str, Any]]:
+    """A row for each re-tracked track, with the tracker's ids along it; without re-tracking, for each track."""
+    role = next((role for role in reversed(report.compared_roles) if role in report.track_sets), "")
+    if not role:
+        return []
+    rows, t_ns = rows_by_track(report.track_sets[role].frames)
+    interval_ns = _interval_ns(frame_times(report.track_sets[role].frames))
+    sources = rows["source_id"].astype(np.int64)
+    return [
+        _row(track, [("ids", pieces(_known(sources[low:high], track), t_ns[low:high], report.start_ns, interval_ns))])
+        for track, low, high in _groups(rows["track_id"])
+    ]
+
+
+def _known(source: Ints, track: int) -> Ints:
+    """The ids of the tracker (P,): rows without one, which are interpolated, have that of the row before, or the first.
+
+    A track without any has its own id.
+    """
+    with_id = np.flatnonzero(source >= 0)
+    if not len(with_id):
+        return np.full(len(source), track)
+    return source[with_id[np.maximum(np.searchsorted(with_id, np.arange(len(source)), "right") - 1, 0)]]
+
+
+def _row(identity: int, lanes: list[tuple[str, list[IdentitySpan]]]) -> dict[str, Any]:
+    whole = lanes[0][1]
+    seconds = sum(piece.last_s - piece.first_s for piece in whole)
+    return {"name": str(identity), "seconds": seconds, "begins": whole[0].first_s if whole else 0.0, "lanes": lanes}
+
+
+def _groups(ids: Any) -> Iterator[tuple[int, int, int]]:
+    """Each id of sorted rows, and its first row and the row after its last."""
+    unique, first = np.unique(ids, return_index=True)
+    yield from zip(unique.tolist(), first.tolist(), np.append(first, len(ids))[1:].tolist(), strict=True)
+
+
+def _interval_ns(t_ns: Ints) -> float:
+    """The usual time between frames."""
+    return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else NS_PER_S / 10
+
+
+def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float) -> dict[str, Any]:
+    """A lane as coordinates in percent; pieces that are too short to be seen are drawn a little longer."""
+    kind, spans = lane
+    out = []
+    for piece in spans:
+        left = 100 * piece.first_s / span_s
+        width = max(100 * (piece.last_s - piece.first_s) / span_s, _LEAST)
+        seconds = f"{number(piece.first_s, 1)} to {number(piece.last_s, 1, 's')}"
+        out.append(
+            {
+                "x": f"{left:.2f}%",
+                "width": f"{width:.2f}%",
+                "colour": piece.identity % COLOURS,
+                "title": f"{piece.identity}: {seconds}",
+                "label": str(piece.identity) if width >= _WIDE else "",
+                "label_x": f"{left + 0.4:.2f}%",
+            }
+        )
+    return {"kind": kind, "pieces": out}
+
+
+def people_over_time(report: LogReport) -> dict[str, Any] | None:
+    """The chart of how many people there are; None without any tracks."""
+    roles = [*filter(None, report.compared_roles), "truth"]
+    sets = [report.track_sets[role] for role in roles if role in report.track_sets]
+    span_s = max((report.end_ns - report.start_ns) / NS_PER_S, 1e-9)
+    scale, unit = (60.0, "minutes") if span_s > _MINUTES else (1.0, "seconds")
+    lines = []
+    for tracks in sets:
+        at_s, count = counts_over_time(tracks.frames, report.start_ns, span_s)
+        if len(at_s):
+            lines.append(Line(short(tracks.name), tracks.role, at_s / scale, count, dashed=tracks.role == "truth"))
+    if not lines:
+        return None
+    noun = "people" if report.has_only_people else "objects"
+    axes = (
+        Axis(f"{unit} since the start", span_s / scale),
+        Axis(f"{noun} at a time", round_most(line.y for line in lines)),
+    )
+    title = f"{noun} over time".capitalize()
+    return figure(line_chart(title, lines, *axes), f"{title}.", mean_numbers(lines, unit))
+
+
+def mean_numbers(lines: Sequence[Line], unit: str) -> str:
+    """Mean numbers over the time that all lines cover: ground truth may begin later or end earlier than tracks."""
+    low, high = max(float(line.x[0]) for line in lines), min(float(line.x[-1]) for line in lines)
+    inside = [line.y[(low <= line.x) & (line.x <= high)] for line in lines]
+    if not all(map(len, inside)):
+        inside, when = [line.y for line in lines], ", each while it is there"
+    else:
+        least = 0.02 * (high - low)
+        is_whole = all(low - line.x[0] <= least and line.x[-1] - high <= least for line in lines)
+        when = "" if is_whole else f", from {number(low, 1)} to {number(high, 1)} {unit}"
+    means = ", ".join(f"{line.name} {number(float(y.mean()), 1)}" for line, y in zip(lines, inside, strict=True))
+    return f"On average{when}: {means}."
+
+
+def counts_over_time(frames: Sequence[Frame], start_ns: int, span_s: float) -> tuple[Floats, Floats]:
+    """Times in s and mean numbers of rows: of each frame, or of as many equal times as a line has points."""
+    t_s = (frame_times(frames) - start_ns) / NS_PER_S
+    count = np.diff(row_ends(frames)).astype(np.float64)
+    if len(t_s) <= POINTS:
+        return t_s, count
+    edges = np.linspace(0, span_s, POINTS + 1)
+    place = np.clip(np.searchsorted(edges, t_s, "right") - 1, 0, POINTS - 1)
+    number_of = np.bincount(place, minlength=POINTS)
+    mean = np.bincount(place, count, minlength=POINTS) / np.maximum(number_of, 1)
+    return ((edges[:-1] + edges[1:]) / 2)[number_of > 0], mean[number_of > 0]

@@ -14,7 +14,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
-from mcaptrack.viewing.report.charts import WIDTH, Axis, Line, line_chart, round_most, thinned
+from mcaptrack.viewing.report.charts import WIDTH, Axis, Line, line_chart, round_most, thinned, time_ticks
 
 #: Printed in place of a number that is missing.
 NONE: Final = "\N{EN DASH}"
@@ -59,6 +59,14 @@ def clock(seconds: float, span_s: float = 0.0) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def tick_marks(span_s: float) -> list[tuple[str, str, str]]:
+    """The ticks of an axis of time: where each is, its text, and how the text is aligned."""
+    return [
+        (f"{100 * tick / span_s:.2f}%", clock(tick, span_s), "end" if tick > 0.97 * span_s else "mid" if tick else "")
+        for tick in time_ticks(span_s).tolist()
+    ]
 
 
 def plain(value: Any) -> Any:

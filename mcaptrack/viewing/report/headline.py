@@ -6,12 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from mcaptrack.evaluation import EvaluationRow
-from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.evaluation.metrics import summary
+from mcaptrack.tables.export.contents import RULES, RULES_3D
 
-#: The rules of the summary; the first by which tracks can be scored.
-_RULES: Final = (("metres", GATE_M), ("iou", 0.5))
-_RULES_3D: Final = (("metres", GATE_3D_M), *_RULES)
 #: The roles of tracks before and after re-tracking, the first that there is: at the prediction rate if possible.
 BEFORE: Final = ("samples", "tracks")
 AFTER: Final = ("offline", "online")
@@ -68,7 +65,7 @@ def result_of(results: Sequence[EvaluationRow], topic: str, similarity: str, gat
 def compared(topics: Mapping[str, str], results: Sequence[EvaluationRow]) -> BeforeAfter | None:
     """The scores that a page compares, of the topics of tracks by role; None if nothing was scored."""
     is_3d = bool(results) and all(row.is_3d for row in results)
-    for similarity, gate in _RULES_3D if is_3d else _RULES:
+    for similarity, gate in RULES_3D if is_3d else RULES:
         rows = {role: result_of(results, topic, similarity, gate) for role, topic in topics.items()}
         before = next((role for role in BEFORE if rows.get(role)), "")
         after = next((role for role in AFTER if rows.get(role)), "")

@@ -12,11 +12,10 @@ from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.evaluation.metrics.displacement import LEVELS
-from mcaptrack.viewing.report.charts import Axis, Bars, Line, histogram_chart, line_chart, round_most
+from mcaptrack.viewing.report.charts import Axis, Bars, Line, figure, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import counted, number, percent, short
 from mcaptrack.viewing.report.headline import rule_text, rules_text
-from mcaptrack.viewing.report.summary import before_after
 
 #: The columns of the table of scores: whether a column is a share, and whether its lowest value is the best.
 _SCORES: Final = {"IDF1": True, "MOTA": True, "HOTA": True, "IDSW": False, "Frag": False, "FP": False, "FN": False}
@@ -30,17 +29,16 @@ Figure = dict[str, Any]
 
 def scores(report: LogReport) -> dict[str, Any]:
     """All scores by rule, and statistics of tracks that need no ground truth."""
-    headline = before_after(report, report.results) if report.results else None
+    headline = report.headline
     of_all = [row for row in report.results if row.of_class is None]
     # The tracker's tracks at the prediction rate are compared with the re-tracked ones: one number for one thing.
     beside = report.track_sets["tracks"].topic if {"tracks", "samples"} <= set(report.track_sets) else ""
-    first = [
-        row
-        for row in of_all
-        if (headline is None or (row.similarity, row.gate) == headline.rule) and row.tracks != beside
-    ]
-    of_classes = [row for row in report.results if row.of_class is not None]
-    of_classes = [row for row in of_classes if headline is None or (row.similarity, row.gate) == headline.rule]
+
+    def by_rule(row: EvaluationRow) -> bool:
+        return headline is None or (row.similarity, row.gate) == headline.rule
+
+    first = [row for row in of_all if by_rule(row) and row.tracks != beside]
+    of_classes = [row for row in report.results if row.of_class is not None and by_rule(row)]
     rest = [row for row in of_all if row not in first]
     rules = sorted({(row.similarity, row.gate) for row in rest})
     return {
@@ -145,11 +143,8 @@ def _by_recall(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
     ]
     y = Axis("mean displacement error, m", round_most(line.y for line in lines))
     x = Axis("recall: share of people with a forecast", 1.0)
-    return {
-        "chart": line_chart("Displacement error of forecasts over recall", lines, x, y),
-        "title": "Error over recall.",
-        "caption": "People with the best tracked past come first, from left to right. Lower and longer is better.",
-    }
+    caption = "People with the best tracked past come first, from left to right. Lower and longer is better."
+    return figure(line_chart("Displacement error of forecasts over recall", lines, x, y), "Error over recall.", caption)
 
 
 def _by_horizon(errors: dict[str, Any], name: str, role: str, most: float) -> Figure:
@@ -164,11 +159,8 @@ def _by_horizon(errors: dict[str, Any], name: str, role: str, most: float) -> Fi
         text += f"; constant velocity has {number(baseline['mean_m'][-1], 2, 'm')}"
     title = f"Error of the forecasts of {name} by how far ahead they look"
     axes = Axis("seconds ahead", float(ahead[-1])), Axis("distance from the ground truth, m", most)
-    return {
-        "chart": line_chart(title, lines, *axes),
-        "title": f"Error by horizon, {name}.",
-        "caption": f"{text}. Line: mean of {counted(part['n'], 'forecast')}; band: the middle half.",
-    }
+    caption = f"{text}. Line: mean of {counted(part['n'], 'forecast')}; band: the middle half."
+    return figure(line_chart(title, lines, *axes), f"Error by horizon, {name}.", caption)
 
 
 def _reliability(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
@@ -188,12 +180,11 @@ def _reliability(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
         + f", NLL {number(errors['NLL'], 2)}"
         for errors, name, _ in members
     )
-    return {
-        "chart": line_chart(title, lines, *axes, diagonal="calibrated"),
-        "title": "Reliability.",
-        "caption": f"{text}. Below the dashed line forecasts are overconfident, above it too cautious. NLL: negative "
-        "log-likelihood of the true positions; lower is better.",
-    }
+    text += (
+        ". Below the dashed line forecasts are overconfident, above it too cautious. NLL: negative log-likelihood of "
+    )
+    text += "the true positions; lower is better."
+    return figure(line_chart(title, lines, *axes, diagonal="calibrated"), "Reliability.", text)
 
 
 def motion(report: LogReport) -> dict[str, Any]:
@@ -231,8 +222,5 @@ def _histogram(
         beyond = f" ({number(part['above'])} of them beyond)" if part["above"] else ""
         texts.append(f"{short(tracks.name)} {counted(part['n'], of)}{beyond}")
     high = f"the highest bar is {percent(max(float(bar.shares.max(initial=0)) for bar in bars), 0)}"
-    return {
-        "chart": histogram_chart(f"Histograms: {x}", bars, edges, x),
-        "title": title,
-        "caption": f"Shares of {', '.join(texts)}; {high}; lines are medians. {note}",
-    }
+    caption = f"Shares of {', '.join(texts)}; {high}; lines are medians. {note}"
+    return figure(histogram_chart(f"Histograms: {x}", bars, edges, x), title, caption)
