@@ -22,7 +22,7 @@ from mcaptrack.schema import TRACKS
 from mcaptrack.sources.ingest.labels.content import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.tables.exchange import _FORMATS
-from mcaptrack.tables.exchange.boxes import BoxTable
+from mcaptrack.tables.exchange.boxes import ExportedBoxes
 from mcaptrack.tables.exchange.cvat import KEYFRAME_PX, describe_classes
 from mcaptrack.tables.exchange.text import describe_merged
 
@@ -93,7 +93,7 @@ def read(tmp_path: Path, text: str | bytes, name: str = "a.xml", role: str = "tr
 
 
 @st.composite
-def tables(draw, has_ids: bool = True) -> BoxTable:
+def tables(draw, has_ids: bool = True) -> ExportedBoxes:
     """Rows of tracks: each id once a frame, and one class a track."""
     last = draw(st.integers(0, 12))
     frames = np.arange(last + 1)
@@ -106,7 +106,7 @@ def tables(draw, has_ids: bool = True) -> BoxTable:
     boxes = np.array([[draw(places), draw(places), draw(sizes), draw(sizes)] for _ in kept]) + 3.25
     boxes[:, 2:] = np.abs(boxes[:, 2:])
     scores = [draw(st.floats(0, 1, width=32)) for _ in kept]
-    return BoxTable(
+    return ExportedBoxes(
         "/camera/tracks",
         frames,
         frames * 40_000_000,
@@ -178,7 +178,7 @@ def test_a_straight_walk_needs_few_keyframes(tmp_path):
     boxes = np.stack([frames * 3.0, frames * 0.5, np.full(count, 20.0), np.full(count, 50.0)], axis=-1)
     boxes[20, 0] += 2
     observed = (frames < 30) | (frames >= 35)
-    table = BoxTable(
+    table = ExportedBoxes(
         "/t", frames, frames, frames, np.full(count, 4), boxes, boxes[:, :2], np.full(count, np.nan, np.float32),
         np.ones(count, int), observed, {}, True, False, None, (),
     )  # fmt: skip
@@ -297,7 +297,7 @@ def test_classes_that_a_file_cannot_tell_apart_are_said():
     assert "person and pedestrian are both 1" in describe_merged("mot", {1: "person", 2: "pedestrian", 3: "car"})
     assert describe_merged("kitti", NAMES) == describe_merged("mot", NAMES) == ""
     ids = np.array([1, 1, 1, 2])
-    table = BoxTable(
+    table = ExportedBoxes(
         "/t", ids, ids, ids, ids, np.ones((4, 4)), np.ones((4, 2)), np.ones(4, np.float32), np.array([3, 2, 3, 2]),
         np.ones(4, bool), {}, True, False, None, (),
     )  # fmt: skip

@@ -211,11 +211,8 @@ def test_what_is_kept_of_comparing_changes_nothing(tmp_path: Path, monkeypatch: 
     mcaptrack.fuse(path)
     kept = fused(path)
     monkeypatch.setattr("mcaptrack.pipeline.fusing._KEPT_BYTES", 1500)  # some frames only
-    monkeypatch.setattr("mcaptrack.transforms.fuse.view._BLOCK", 40)
-    monkeypatch.setattr("mcaptrack.pipeline.fusing._TOGETHER", 3)
-    monkeypatch.setattr("mcaptrack.pipeline.gathering._KEPT_BYTES", 1500)  # some frames only
     monkeypatch.setattr("mcaptrack.transforms.fuse._BLOCK", 40)
-    monkeypatch.setattr("mcaptrack.pipeline.gathering._TOGETHER", 3)
+    monkeypatch.setattr("mcaptrack.pipeline.fusing._TOGETHER", 3)
     mcaptrack.fuse(path)
     for t_ns, rows in fused(path).items():
         for name in ("x_m", "y_m", "cov_xx_m2", "score", "seen_by", "expected_by"):

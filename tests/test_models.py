@@ -13,7 +13,6 @@ import pytest
 import mcaptrack
 from mcaptrack import notices
 from mcaptrack.api import catalogue as fetching
-from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.detect.onnx import session
@@ -53,7 +52,7 @@ def test_the_catalogue_says_where_each_model_comes_from_and_each_has_a_detector(
             assert re.match(r"https://\S+/([0-9a-f]{7,40}|releases/download/[\w.]+)/\S+\.onnx$", url), url
         cls = STAGES["detect"].find(name).cls
         assert (cls.model, cls().weights_sha256()) == (name, model.sha256)
-    known = {name for name, where in BUILT_IN["detector"].items() if "catalogued" in where}
+    known = {name for name, cls in STAGES["detect"].built_in().items() if getattr(cls, "model", "")}
     assert known == set(session.CATALOGUE)
 
 

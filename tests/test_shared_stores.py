@@ -13,6 +13,7 @@ import mcaptrack
 from mcaptrack import objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import parse
+from mcaptrack.objects import trial
 from tests.commands import call, done
 from tests.tiers import one_in
 
@@ -63,7 +64,7 @@ class TestDoctor:
 
     def test_a_store_that_ignores_conditions_is_found_out(self, store, monkeypatch):
         real = objects.put_if_unchanged
-        monkeypatch.setattr(objects, "put_if_unchanged", lambda url, data, _: real(url, data, objects.find(url)))
+        monkeypatch.setattr(trial, "put_if_unchanged", lambda url, data, _: real(url, data, objects.find(url)))
         code, access, err = self.access(str(NIGHT))
         assert code == 1
         assert [name for name, why in access.items() if why] == ["put-if-absent", "replace"]

@@ -129,11 +129,11 @@ class Once(Called[T]):
             arguments = self.arguments(names)
             with stdout_to_stderr():
                 done = common.with_progress(self.function, talk.progress)(**arguments)
-            self.print(done, talk)
+            self.print_result(done, talk)
         if code := self.code(done):
             raise typer.Exit(code)
 
-    def print(self, done: T, talk: common.Talk) -> None:
+    def print_result(self, done: T, talk: common.Talk) -> None:
         """Print the result: for people, or as JSON."""
         if self.given["json"]:
             common.print_json(self.data(done))

@@ -75,10 +75,10 @@ class Docs(Once[Pages]):
         """Return the function that declares the command."""
         return documentation
 
-    def print(self, done: Pages, talk: common.Talk) -> None:
+    def print_result(self, done: Pages, talk: common.Talk) -> None:
         """Print the list, or the page."""
         with common.printed_to(self.given["output"], self.given["force"]):
-            super().print(done, talk)
+            super().print_result(done, talk)
 
     def data(self, done: Pages) -> dict[str, Any]:
         """Return the list, or the page, as values of JSON."""

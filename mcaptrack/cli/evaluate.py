@@ -80,12 +80,12 @@ class Evaluate(Once["Scores"]):
         """Return the scores as values of JSON."""
         return {"results": done.rows()}
 
-    def print(self, done: Scores, talk: common.Talk) -> None:
+    def print_result(self, done: Scores, talk: common.Talk) -> None:
         """Print the scores, or write them to a file, and draw curves."""
         if self.given["curves"] is not None:
             done.draw_curves(self.given["curves"], self.given["force"])
         with common.printed_to(self.given["output"], self.given["force"]):
-            super().print(done, talk)
+            super().print_result(done, talk)
 
     def show(self, done: Scores, talk: common.Talk) -> None:
         """Print a table, or rows of CSV."""

@@ -40,7 +40,7 @@ class Check(EachLog["LogCheck"]):
         """Return the findings in a log and its results as values of JSON."""
         return {"files": [_as_json(file) for file in done.files]}
 
-    def print(self, results: Sequence[LogCheck], totals: Mapping[str, Any]) -> None:
+    def print_result(self, results: Sequence[LogCheck], totals: Mapping[str, Any]) -> None:
         """Print the findings in each file."""
         files = [file for checked in results for file in checked.files]
         with common.printed_to(self.given["output"], self.given["force"]):

@@ -162,7 +162,7 @@ class EachLog(Called[T]):
         """Print the result of one log alone."""
         talk.say(f"{log}: {self.line(done)}")
 
-    def print(self, results: Sequence[T], totals: Mapping[str, Any]) -> None:
+    def print_result(self, results: Sequence[T], totals: Mapping[str, Any]) -> None:
         """Print the results of all logs, with totals if there are several: as JSON."""
         if self.given["json"]:
             common.print_json({"results": [self.data(done) for done in results], **totals})
@@ -177,7 +177,7 @@ class EachLog(Called[T]):
             self.inputs = self.logs()
             arguments = self.arguments(names)
             results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
-        self.print(results, totals)
+        self.print_result(results, totals)
         if code := self.code(results):
             raise typer.Exit(code)
 

@@ -78,7 +78,7 @@ class Query(Once[Any]):
                 raise McaptrackError(f"{output} is both input and output; give another name with -o")
         return {"log": logs, "files": _named(given["files"] or [])} | ({} if given["tables"] else {"sql": sql})
 
-    def print(self, done: Any, talk: common.Talk) -> None:
+    def print_result(self, done: Any, talk: common.Talk) -> None:
         """Print the answer, or write it to a file."""
         output, json = self.given["output"], self.given["json"]
         if self.given["tables"]:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mcaptrack import ReportResult
 
 
-class Report(Once["ReportResult"]):
+class ReportCommand(Once["ReportResult"]):
     """Write one HTML page about logs."""
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
@@ -24,7 +24,7 @@ class Report(Once["ReportResult"]):
         """Return the numbers of the page."""
         return dict(done.data)
 
-    def print(self, done: ReportResult, talk: common.Talk) -> None:
+    def print_result(self, done: ReportResult, talk: common.Talk) -> None:
         """Print where the page is, and with ``--json`` its numbers."""
         count = done.data["summary"]["logs"] if "summary" in done.data else len(done.data["logs"])
         talk.say(f"{done.page}: {count} log{'s' if count > 1 else ''}, {done.size / 1e6:.2f} MB")

@@ -88,13 +88,13 @@ class Export(EachLog["ExportResult"]):
         written = {"log": str(done.log), "folder": str(done.folder), "rows": done.rows}
         return written | {"written": list(done.written)}
 
-    def print(self, results: Sequence[ExportResult], totals: Mapping[str, Any]) -> None:
+    def print_result(self, results: Sequence[ExportResult], totals: Mapping[str, Any]) -> None:
         """Print the results; bring the catalogue of several logs in one folder up to date."""
         from mcaptrack.tables.catalogue import refresh
 
         if self._folder is not None and self.given["form"] == "parquet" and len(self.given["logs"]) > 1:
             refresh(self._folder)
-        super().print(results, totals)
+        super().print_result(results, totals)
 
 
 def _print(data: dict[str, Any], verbose: bool) -> None:

@@ -59,7 +59,7 @@ class Tune(Once["TuneResult"]):
         names = ("stage", "metric", "settings", "trials", "best", "scores", "default_scores")
         return {"results": [{name: getattr(done, name) for name in names}]}
 
-    def print(self, done: TuneResult, talk: common.Talk) -> None:
+    def print_result(self, done: TuneResult, talk: common.Talk) -> None:
         """Write the settings to the file, and print them with their scores."""
         given, output, metric = self.given, self.given["output"], done.metric
         if given["truth"]:
@@ -78,7 +78,7 @@ class Tune(Once["TuneResult"]):
         else:
             write_settings(output, done.stage, _as_options(done))
             talk.say(f"{output}: {metric} {before:.4f} with the defaults, {score:.4f} now")
-        super().print(done, talk)
+        super().print_result(done, talk)
 
     def show(self, done: TuneResult, talk: common.Talk) -> None:
         """Print the scores as a table, and the settings."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mcaptrack import LogServer
 
 
-class View(Once["LogServer"]):
+class ViewCommand(Once["LogServer"]):
     """Serve a log to viewers in a browser."""
 
     class More:
@@ -24,10 +24,10 @@ class View(Once["LogServer"]):
             int, Option("What is opened", 0, 1_000_000, help="Print the links of at most so many events.")
         ] = 8
 
-    def print(self, done: LogServer, talk: common.Talk) -> None:
+    def print_result(self, done: LogServer, talk: common.Talk) -> None:
         """Print the links, and serve the log until Ctrl-C."""
         try:
-            super().print(done, talk)
+            super().print_result(done, talk)
             talk.say("serving until Ctrl-C ...")
             done.serve_forever()
         except KeyboardInterrupt:

@@ -1,6 +1,6 @@
 """One channel of boxes as a file of another program: MOTChallenge, KITTI, COCO, CVAT, Rerun, or a plain table.
 
-Each format is a module that takes ``BoxTable`` and yields the bytes of the file. What a format can't hold is said once.
+Each format is a module that takes ``ExportedBoxes`` and yields the bytes of the file. What a format can't hold is said once.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mcaptrack.location import Location, local_name
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.tables.exchange import coco, cvat, text
-from mcaptrack.tables.exchange.boxes import BoxTable, read_boxes
+from mcaptrack.tables.exchange.boxes import ExportedBoxes, read_boxes
 from mcaptrack.tables.exchange.rerun_file import write_recording
 
 __all__ = ["FORMATS", "ExchangeFormat", "WrittenBoxes", "default_file", "ends_with", "write_boxes"]
@@ -31,7 +31,7 @@ class _Format(NamedTuple):
     """The end of the name of a file, how it is written, and what it holds beside frames, boxes and ids."""
 
     end: str
-    write: Callable[[BoxTable], Iterator[bytes]] | None = None
+    write: Callable[[ExportedBoxes], Iterator[bytes]] | None = None
     holds: frozenset[str] = frozenset()
 
 

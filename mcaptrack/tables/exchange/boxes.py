@@ -31,7 +31,7 @@ _NAMES: Final = {
 
 
 @dataclass(frozen=True)
-class BoxTable:
+class ExportedBoxes:
     """Rows with a box in pixels, in order of frames.
 
     ``frame`` (N,) are numbers of pictures from 0; ``frames`` (F,) those of all frames, with or without rows, and
@@ -82,7 +82,7 @@ class BoxTable:
         return "; ".join(out)
 
 
-def read_boxes(opened: log.Log, topic: str) -> BoxTable:
+def read_boxes(opened: log.Log, topic: str) -> ExportedBoxes:
     """The boxes of a channel. Raises McaptrackError if no row has a box in pixels."""
     channel = opened.channel(topic)
     schema = SCHEMAS[channel.schema_name]
@@ -117,7 +117,7 @@ def read_boxes(opened: log.Log, topic: str) -> BoxTable:
     frame, track_id, boxes, xy_m, score, class_id, observed = (
         np.concatenate([part[k] for part in parts]) for k in range(7)
     )
-    return BoxTable(
+    return ExportedBoxes(
         topic, numbers, columns.t_ns, frame, track_id, boxes, xy_m, score, class_id, observed,
         class_names(channel.metadata), schema is not DETECTIONS, has_3d, _size(opened, topic), tuple(notes),
     )  # fmt: skip

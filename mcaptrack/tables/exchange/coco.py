@@ -14,13 +14,13 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.schema.classes import UNKNOWN
-from mcaptrack.tables.exchange.boxes import BoxTable
+from mcaptrack.tables.exchange.boxes import ExportedBoxes
 
 _ENTRIES: Final = 1024
 _VIDEO: Final = 1
 
 
-def coco(boxes: BoxTable) -> Iterator[bytes]:
+def coco(boxes: ExportedBoxes) -> Iterator[bytes]:
     """A JSON object with videos, images, annotations and categories."""
     size = {} if boxes.size is None else {"width": boxes.size[0], "height": boxes.size[1]}
     name = boxes.topic.strip("/")
@@ -38,7 +38,7 @@ def _category(number: int, name: str) -> dict[str, Any]:
     return {"id": number, "name": "unknown" if number == UNKNOWN else name, "supercategory": ""}
 
 
-def _images(boxes: BoxTable, size: dict[str, int]) -> Iterator[dict[str, Any]]:
+def _images(boxes: ExportedBoxes, size: dict[str, int]) -> Iterator[dict[str, Any]]:
     """All frames, and frame 0 in any case: readers take the first image for the first picture."""
     frames, times = boxes.frames.tolist(), boxes.t_ns.tolist()
     begin = [] if frames[0] == 0 else [(0, None)]
@@ -47,7 +47,7 @@ def _images(boxes: BoxTable, size: dict[str, int]) -> Iterator[dict[str, Any]]:
         yield image if t_ns is None else image | {"timestamp_ns": t_ns}
 
 
-def _annotations(boxes: BoxTable) -> Iterator[dict[str, Any]]:
+def _annotations(boxes: ExportedBoxes) -> Iterator[dict[str, Any]]:
     columns = (boxes.frame.tolist(), boxes.id.tolist(), boxes.boxes.tolist(), boxes.class_id.tolist())
     scores, observed = boxes.score, boxes.observed.tolist()
     for row, (frame, track, box, kind) in enumerate(zip(*columns, strict=True)):

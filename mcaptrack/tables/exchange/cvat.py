@@ -14,7 +14,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.tables.exchange.boxes import BoxTable
+from mcaptrack.tables.exchange.boxes import ExportedBoxes
 
 #: The attribute that keeps the id of a track: CVAT gives tracks new numbers.
 TRACK_ID: Final = "track_id"
@@ -25,7 +25,7 @@ _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010f
 _COLOURS: Final = ("#fa3253", "#3d3df5", "#33ddff", "#ffcc33", "#b83df5", "#24b353", "#ff6a4d", "#8c78f0")
 
 
-def cvat(boxes: BoxTable) -> Iterator[bytes]:
+def cvat(boxes: ExportedBoxes) -> Iterator[bytes]:
     """The file, track by track; a box without an id is a track of one frame."""
     yield _head(boxes).encode("utf-8")
     names = {number: _plain(name) for number, name in boxes.classes.items()}
@@ -37,7 +37,7 @@ def cvat(boxes: BoxTable) -> Iterator[bytes]:
     yield b"</annotations>\n"
 
 
-def describe_classes(boxes: BoxTable) -> str:
+def describe_classes(boxes: ExportedBoxes) -> str:
     """Say how many boxes get the label of their track in place of their own class; "" if none do."""
     if not boxes.has_ids:
         return ""
@@ -51,7 +51,7 @@ def describe_classes(boxes: BoxTable) -> str:
     return f"a track has one label in CVAT: {others:,} boxes get that of their track" if others else ""
 
 
-def _head(boxes: BoxTable) -> str:
+def _head(boxes: ExportedBoxes) -> str:
     """The beginning, as in CVAT's own files: the labels, and the number and size of pictures."""
     width, height = boxes.size or np.ceil((boxes.boxes[:, :2] + boxes.boxes[:, 2:]).max(axis=0)).astype(int).tolist()
     labels = "".join(
@@ -98,7 +98,7 @@ _ATTRIBUTE: Final = f"""
           """
 
 
-def _track(boxes: BoxTable, number: int, rows: Ints, names: dict[int, str]) -> str:
+def _track(boxes: ExportedBoxes, number: int, rows: Ints, names: dict[int, str]) -> str:
     frame, box, occluded = boxes.frame[rows], boxes.boxes[rows], ~boxes.observed[rows]
     corners = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], axis=1)
     kinds, counts = np.unique(boxes.class_id[rows], return_counts=True)

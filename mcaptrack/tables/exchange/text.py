@@ -16,14 +16,14 @@ import numpy as np
 
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.formats import MOT_CLASSES
-from mcaptrack.tables.exchange.boxes import BoxTable
+from mcaptrack.tables.exchange.boxes import ExportedBoxes
 
 _LINES: Final = 4096
 #: What KITTI's tools write for numbers that are not known: angle, size and position of a 3D box, rotation.
 _KITTI_UNKNOWN: Final = "-10 {box} -1 -1 -1 -1000 -1000 -1000 -10"
 
 
-def mot(boxes: BoxTable) -> Iterator[bytes]:
+def mot(boxes: ExportedBoxes) -> Iterator[bytes]:
     """MOTChallenge with 9 columns: frame from 1, id, left, top, width, height, confidence, class, visibility (-1)."""
     number = mot_numbers(boxes.classes)
     kinds = [number[kind] for kind in boxes.class_id.tolist()]
@@ -58,7 +58,7 @@ def describe_mot_numbers(classes: dict[int, str]) -> str:
     return f"MOTChallenge has no number for some classes, and no names: {', '.join(renumbered)}" if renumbered else ""
 
 
-def kitti(boxes: BoxTable) -> Iterator[bytes]:
+def kitti(boxes: ExportedBoxes) -> Iterator[bytes]:
     """KITTI tracking: frame, id, type, truncated, occluded, and the box by its corners; the score as column 18."""
     names = {kind: kitti_name(name) for kind, name in boxes.classes.items()}
     has_scores = bool(np.isfinite(boxes.score).any())
@@ -90,7 +90,7 @@ def describe_merged(form: str, classes: dict[int, str]) -> str:
     return f"classes that the file can't tell apart: {', '.join(merged)}" if merged else ""
 
 
-def boxes_csv(boxes: BoxTable) -> Iterator[bytes]:
+def boxes_csv(boxes: ExportedBoxes) -> Iterator[bytes]:
     """A table with a header; frames without boxes have a row of their own, without a box."""
     held = io.StringIO()
     writer = csv.writer(held, lineterminator="\n")
