@@ -1,6 +1,6 @@
 """One channel of boxes as a file of another program: MOTChallenge, KITTI, COCO, CVAT, Rerun, or a plain table.
 
-Each format is a module that takes ``ExportedBoxes`` and yields the bytes of the file. What a format can't hold is said once.
+Each format is a module that takes ``ExportedBoxes`` and yields the bytes of the file. What it can't hold is said once.
 """
 
 from __future__ import annotations
