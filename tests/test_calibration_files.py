@@ -17,7 +17,7 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.planes import read_planes
+from mcaptrack.pipeline.staleness import read_planes
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.calibration import GivenCalibration, is_calibration

@@ -18,7 +18,7 @@ from mcaptrack.geometry.camera_path import CameraPath, poses_of
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at, scene_planes
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.planes import planes_to_json, read_planes
+from mcaptrack.pipeline.staleness import planes_to_json, read_planes
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.calibrations import find_calibration, is_rectified_topic, read_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at

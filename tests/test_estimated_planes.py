@@ -18,16 +18,8 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.plane_from_boxes import PlaneFit, plane_from_boxes, whole_people
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.motion import side_inputs
-from mcaptrack.pipeline.planes import (
-    AS_BEFORE,
-    PlaneChoice,
-    fit_in_words,
-    fit_of,
-    is_poor,
-    make_plane,
-    plane_in_words,
-    planes_to_json,
-)
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, fit_in_words, fit_of, is_poor, make_plane, plane_in_words
+from mcaptrack.pipeline.staleness import planes_to_json
 from mcaptrack.pipeline.write import Made, RunState
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Plugin, Provenance

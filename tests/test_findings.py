@@ -23,7 +23,7 @@ from tests.commands import done
 from tests.logs import write_channels
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
-run = importlib.import_module("mcaptrack.pipeline.run")  # the package has a function of that name
+run = importlib.import_module("mcaptrack.pipeline.runner")  # the package has a function of that name
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from mcaptrack import log, notices, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.pictures import Ahead, KeptPictures
 from mcaptrack.pipeline.plan import spaces_of_boxes
-from mcaptrack.pipeline.run import Stopwatch
+from mcaptrack.pipeline.runner import Stopwatch
 from mcaptrack.schema import TRACKS, Frame, frame_columns, framing
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.sources.ingest.labels.timeline import boxes_extent
@@ -28,7 +28,7 @@ from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from tests.awaiting import until
 from tests.memory import held
 
-runner = import_module("mcaptrack.pipeline.run")  # the package has a function of its name
+runner = import_module("mcaptrack.pipeline.runner")  # the package has a function of its name
 
 PEOPLE = 12
 

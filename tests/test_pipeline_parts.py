@@ -23,7 +23,7 @@ from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort,
 from tests.logs import write_channels
 from tests.worlds import ns, tracks_at, walk
 
-run = sys.modules["mcaptrack.pipeline.run"]  # the package has a function of this name
+run = sys.modules["mcaptrack.pipeline.runner"]  # the package has a function of this name
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
 Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
 

@@ -223,7 +223,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG", "--no-tables", "--zones", str(zones_file(Path()))
     ),
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
-    "pipeline/run.py:warn_findings:retrack": Scene.side_view,
+    "pipeline/runner.py:warn_findings:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,

@@ -1,121 +1,51 @@
 """Run stages on a log: plan them, check their inputs and outputs, run their transforms, and write the results.
 
 A stage reads a channel of an existing log and adds its own channels to the log, with their provenance: the input, the
-transform and its parameters.
+transform and its parameters. Names are imported when they are first used, so that asking whether a channel is out of
+date loads neither transforms nor views.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple
+from __future__ import annotations
 
-from mcaptrack import log
-from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.pipeline.checks import Job, cameras_named
-from mcaptrack.pipeline.drawing import RobotPath, find_views, robot_path
-from mcaptrack.pipeline.events import Watch
-from mcaptrack.pipeline.following import Before, Continued, begins_here
-from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
-from mcaptrack.pipeline.plan import is_stale, plan_all, plan_stage
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, read_planes
-from mcaptrack.pipeline.run import Report, input_of, outdated_by, run, warn_clock_jumps
-from mcaptrack.pipeline.summary import Summary, summarise
-from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
-from mcaptrack.pipeline.zones import ZoneWatch, counted_zones
-from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import (
-    Camera,
-    camera_at,
-    camera_to_name,
-    cameras,
-    find_camera,
-    has_own_channels,
-    provenance_of,
-    scenes_of,
-)
-from mcaptrack.sources.pictures import size_of_pictures
-from mcaptrack.transforms import STAGES
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
 
-# The cameras that a run of a whole log works on, and the scenes that they are fused to.
+if TYPE_CHECKING:
+    from mcaptrack.pipeline.checks import Job
+    from mcaptrack.pipeline.choice_of_cameras import SCENE, ChosenCameras, begins_with, choose_cameras
+    from mcaptrack.pipeline.drawing import RobotPath, find_views, robot_path
+    from mcaptrack.pipeline.events import Watch
+    from mcaptrack.pipeline.following import Before, Continued, begins_here
+    from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
+    from mcaptrack.pipeline.plan import plan_all, plan_stage
+    from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice
+    from mcaptrack.pipeline.runner import Report, input_of, outdated_by, run
+    from mcaptrack.pipeline.staleness import is_stale, read_planes, warn_clock_jumps
+    from mcaptrack.pipeline.summary import Summary, summarise
+    from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
+    from mcaptrack.pipeline.zones import ZoneWatch, counted_zones
+    from mcaptrack.sources.cameras import Camera, camera_at, camera_to_name, find_camera, scenes_of
 
-
-#: The scene that a run fuses cameras to.
-SCENE: Final = "/world"
-#: The channels that a run can begin with, if a camera has no pictures and no boxes of others.
-_BEGINNINGS: Final = tuple(STAGES[name].input_topic for name in ("track", "sample", "predict"))
-
-
-class ChosenCameras(NamedTuple):
-    """The cameras of a run, by prefix; the reasons why others are left out, by name; and the scenes that are named."""
-
-    prefixes: tuple[str, ...]
-    left_out: Mapping[str, str]
-    scenes: tuple[str, ...] = ()
+_NAMES: Final = {
+    "mcaptrack.pipeline.checks": "Job",
+    "mcaptrack.pipeline.choice_of_cameras": "SCENE ChosenCameras begins_with choose_cameras",
+    "mcaptrack.pipeline.drawing": "RobotPath find_views robot_path",
+    "mcaptrack.pipeline.events": "Watch",
+    "mcaptrack.pipeline.following": "Before Continued begins_here",
+    "mcaptrack.pipeline.fusing": "fusable fuse_again fuse_cameras",
+    "mcaptrack.pipeline.plan": "plan_all plan_stage",
+    "mcaptrack.pipeline.planes": "AS_BEFORE PlaneChoice",
+    "mcaptrack.pipeline.runner": "Report input_of outdated_by run",
+    "mcaptrack.pipeline.staleness": "is_stale read_planes warn_clock_jumps",
+    "mcaptrack.pipeline.summary": "Summary summarise",
+    "mcaptrack.pipeline.write": "LAYOUTS attachment_of layout_path",
+    "mcaptrack.pipeline.zones": "ZoneWatch counted_zones",
+    "mcaptrack.sources.cameras": "Camera camera_at camera_to_name find_camera scenes_of",
+}
+_MODULES: Final = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 
-def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras | None:
-    """Choose the cameras of a run: those with these names, or all that have pictures or boxes.
-
-    None if the log has one camera only, or sensors of boxes in space alone: then there is no choice. Raises
-    McaptrackError if no camera has anything to begin with, and for names that the log doesn't have, or that can't be
-    run.
-    """
-    every, scenes = cameras(opened), scenes_of(opened)
-    if names:
-        wanted = cameras_named(opened, names, every)
-        wanted_scenes = tuple(camera.prefix for camera in wanted if camera.prefix in scenes)
-        wanted = [camera for camera in wanted if camera.prefix not in scenes]
-    else:
-        wanted_scenes = ()
-        wanted = [camera for camera in every if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
-        wanted = [camera for camera in wanted if not camera.in_space or has_own_channels(opened, camera)] or wanted
-        if len(wanted) + len(scenes) < 2 or all(camera.in_space for camera in wanted):
-            return None
-    lacks = {camera.prefix[1:]: why for camera in wanted if (why := _lack(opened, camera))}
-    chosen = tuple(camera.prefix for camera in wanted if camera.prefix[1:] not in lacks)
-    if not chosen and not wanted_scenes:
-        why = "; ".join(f"{name} {reason}" for name, reason in lacks.items())
-        raise McaptrackError(f"{opened.path} has no camera to begin with: {why}")
-    for name, reason in lacks.items() if names else ():
-        raise McaptrackError(f"{opened.path}: {name} {reason}; leave it out of `camera=`")
-    return ChosenCameras(chosen, lacks, wanted_scenes)
-
-
-def _is_truth_of_scene(opened: log.Log, camera: Camera) -> bool:
-    """Whether these are the labels of a scene that isn't made yet."""
-    return camera.prefix == SCENE and camera.pictures is None and camera.boxes is None and _is_bare(opened, camera)
-
-
-def _is_bare(opened: log.Log, camera: Camera) -> bool:
-    return not any(f"{camera.prefix}/{name}" in opened.channels for name in _BEGINNINGS)
-
-
-def _lack(opened: log.Log, camera: Camera) -> str:
-    """The reason why nothing can be made of a camera; "" if there is none."""
-    if camera.boxes or not _is_bare(opened, camera):
-        return ""
-    if camera.pictures is None:
-        with_pictures = sorted(topic for topic in camera.topics if foreign.holds_pictures(opened.channels[topic]))
-        if with_pictures:
-            return f"has pictures in {list_names(with_pictures)}; `topic=` runs it on one of them"
-        has = sorted(topic for topic in camera.topics if "/view/" not in topic)
-        return f"has neither pictures nor boxes, but {list_names(has, 5)}"
-    if not opened.channels[camera.pictures].messages:
-        return f"has no pictures: {camera.pictures} has no messages"
-    try:
-        if size_of_pictures(opened, camera.pictures) is None:
-            return f"has no picture in {camera.pictures} that can be decoded"
-    except McaptrackError as error:
-        return f"has pictures that can't be read: {error}"
-    return ""
-
-
-def begins_with(opened: log.Log, prefix: str) -> str:
-    """Describe the input of the run of one of several cameras; "" for the usual one, pictures alone."""
-    camera, detections = camera_at(opened, prefix), f"{prefix}/{STAGES['detect'].output_topic}"
-    provenance = provenance_of(opened, detections)
-    if detections in opened.channels and (provenance is None or provenance.transform not in STAGES):
-        return f"{prefix[1:]} has detections in {detections} already: it is tracked from these, nothing is detected"
-    if camera.pictures is None and camera.boxes:
-        return f"{prefix[1:]} has no pictures: it is tracked from the boxes in {camera.boxes}"
-    if camera.pictures is None:
-        return f"{prefix[1:]} has neither pictures nor boxes, but tracks or samples: it is run from these"
-    return ""
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

@@ -35,7 +35,8 @@ from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace
 from mcaptrack.pipeline.fusing import Gathered, Source, compared_cameras, fusable, read_sources
-from mcaptrack.pipeline.write import Made, digest_of
+from mcaptrack.pipeline.staleness import digest_of
+from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import GROUND_PLANE, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of

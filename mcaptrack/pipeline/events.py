@@ -26,7 +26,8 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import conflict_of, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with
 from mcaptrack.pipeline.plan import is_outdated
-from mcaptrack.pipeline.write import Made, RunState, digest_of
+from mcaptrack.pipeline.staleness import digest_of
+from mcaptrack.pipeline.write import Made, RunState
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import join_frames

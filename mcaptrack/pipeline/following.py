@@ -25,9 +25,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, read_named_frames
-from mcaptrack.pipeline.plan import is_stale
-from mcaptrack.pipeline.planes import read_planes
-from mcaptrack.pipeline.write import digest_of
+from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
 from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values

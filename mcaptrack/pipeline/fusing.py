@@ -22,11 +22,10 @@ from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.location import Location
 from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace, read_named_frames
-from mcaptrack.pipeline.plan import is_stale
-from mcaptrack.pipeline.planes import read_planes
 from mcaptrack.pipeline.rebuild import fuser_of, plugins_of
-from mcaptrack.pipeline.run import Report, outdated_by
-from mcaptrack.pipeline.write import Made, RunState, digest_of, write
+from mcaptrack.pipeline.runner import Report, outdated_by
+from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_times, nearest_times, split_rows

@@ -37,16 +37,6 @@ def uses_motion(transform: Transform | None) -> bool:
     return getattr(transform, "camera_motion", _OFF) != _OFF
 
 
-def is_motion_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
-    """Whether a channel that takes camera motion into account was made before the motion was known."""
-    usual = _OFF
-    if provenance.transform in STAGES and "transform" not in provenance.plugins:
-        usual = getattr(STAGES[provenance.transform].default, "camera_motion", _OFF)
-    is_used = provenance.parameters.get("camera_motion", usual) != _OFF
-    topic = motion_topic(camera_at(opened, prefix).prefix)
-    return is_used and topic in opened.channels and topic not in provenance.references
-
-
 def is_motion_wanted(opened: log.Log, transform: Transform, boxes: str, jobs: Sequence[Job]) -> bool:
     """Whether the motion of a camera is needed before its boxes are tracked.
 

@@ -18,16 +18,17 @@ from mcaptrack.geometry.plane import is_assumed
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
-from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, planes_to_json, read_planes, warn_unused
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
-from mcaptrack.pipeline.write import RunState, digest_of
+from mcaptrack.pipeline.staleness import CORRECTED_IN, is_of_corrections, is_stale, read_planes
+from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
 from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.camera_motion import motion_topic
-from mcaptrack.sources.cameras import USUAL, camera_at, chain_of, is_made_by_stage, is_plane, name_above, provenance_of
-from mcaptrack.sources.corrections import CORRECTED, corrections_of, fixed_ids, with_corrections, without_filled
+from mcaptrack.sources.cameras import USUAL, camera_at, is_made_by_stage, provenance_of
+from mcaptrack.sources.corrections import corrections_of, fixed_ids, with_corrections, without_filled
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import FUSION, STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import Space, traits_of
@@ -163,10 +164,6 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
 # Corrections by people in the pipeline: samples are of corrected tracks, and re-tracking keeps these as they are.
 
 
-#: The stage that takes corrections.
-CORRECTED_IN: Final = "sample"
-
-
 def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence[Frame]) -> Sequence[Frame]:
     """The tracks at ``source`` with corrections, if they have any."""
     topic = corrections_of(opened, prefix, source)
@@ -179,16 +176,6 @@ def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequenc
     return frames if topic is None else without_filled(frames, opened.frame_columns(topic, TRACKS))
 
 
-def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
-    """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
-    if provenance.transform != CORRECTED_IN:
-        return False
-    ending = f"/{CORRECTED}"
-    then = {topic: digest for topic, digest in provenance.references.items() if topic.endswith(ending)}
-    corrections = corrections_of(opened, camera_at(opened, prefix).prefix, provenance.input)
-    return then != ({} if corrections is None else {corrections: digest_of(opened, corrections)})
-
-
 def fixed_in(state: RunState, source: str) -> tuple[int, ...]:
     """The ids of corrected tracks in the samples at ``source``; () if they were made without corrections."""
     how = state.provenance(source)
@@ -196,27 +183,6 @@ def fixed_in(state: RunState, source: str) -> tuple[int, ...]:
     if how is None or topic is None or topic not in how.references:
         return ()
     return fixed_ids(state.frames(how.input), state.opened.frame_columns(topic, TRACKS))
-
-
-def is_stale(opened: log.Log, topic: str) -> bool:
-    """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
-    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
-    if provenance is None:
-        return False
-    prefix = name_above(chain_of(opened, topic)[-1])
-    if "ground_planes" in provenance.parameters:
-        planes = read_planes(opened, prefix)
-        if planes_to_json(planes or ()) != provenance.parameters["ground_planes"]:
-            return True
-    if motion.is_motion_new(opened, prefix, provenance) or is_of_corrections(opened, prefix, provenance):
-        return True
-    planes_used = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
-    if any(camera_at(opened, name_above(name)).ground_plane != name for name in planes_used):
-        return True  # a plane was corrected, or its correction is gone
-    if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
-        return True
-    now = {name: how for name in provenance.made_from() if (how := provenance_of(opened, name)) and how.digest}
-    return any(how.digest != provenance.made_from()[name] for name, how in now.items())
 
 
 def is_outdated(state: RunState, topics: Sequence[str]) -> bool:

@@ -5,12 +5,9 @@ Boxes give an estimated plane, or a guessed scale.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields
 from typing import Any, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -31,7 +28,8 @@ from mcaptrack.geometry.plane_from_boxes import plane_from_boxes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job
-from mcaptrack.pipeline.write import Made, RunState, digest_of
+from mcaptrack.pipeline.staleness import digest_of, planes_to_json
+from mcaptrack.pipeline.write import Made, RunState
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.schema.framing import JoinedFrames, filtered_rows, has_any, join_frames, joined_parts, thinned
@@ -39,7 +37,6 @@ from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, see_ground
-from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
 from mcaptrack.sources.pictures import picture_size
 from mcaptrack.transforms import STAGES, Transform
@@ -51,8 +48,6 @@ _MOST_FRAMES: Final = 5000
 #: Scales are guessed from about so many boxes at most.
 _MOST_BOXES: Final = 500_000
 _BOX_COLUMNS: Final = ["x_px", "y_px", "w_px", "h_px", "score", "class_id"]
-#: More planes are recorded by their digest in the parameters of channels.
-_MOST_RECORDED: Final = 100
 
 
 class PlaneChoice(NamedTuple):
@@ -94,28 +89,6 @@ class PlaneChoice(NamedTuple):
 
 #: The choice of a user who makes none.
 AS_BEFORE: Final[PlaneChoice] = PlaneChoice()
-
-
-_READ: Final[WeakKeyDictionary[log.Log, dict[str, Planes | None]]] = WeakKeyDictionary()
-
-
-def read_planes(opened: log.Log, prefix: str) -> Planes | None:
-    """Return the ground planes of a camera, each with its start time in ns; None if the log has none."""
-    topic = camera_at(opened, prefix).ground_plane
-    planes_by_topic = _READ.setdefault(opened, {})
-    if topic not in planes_by_topic:
-        planes_by_topic[topic] = (planes_in(opened, topic) if topic in opened.channels else []) or None
-    return planes_by_topic[topic]
-
-
-def planes_to_json(planes: Planes) -> list[Any]:
-    """Convert ground planes to the JSON values that the parameters of a channel contain: their digest, if many."""
-    values = [
-        (t_ns, {name: value for name, value in asdict(plane).items() if value is not None}) for t_ns, plane in planes
-    ]
-    text = json.dumps(values)
-    kept: list[Any] = json.loads(text)
-    return kept if len(kept) <= _MOST_RECORDED else [len(kept), hashlib.sha256(text.encode()).hexdigest()]
 
 
 def is_plane_due(opened: log.Log, prefix: str, source: str, choice: PlaneChoice) -> bool:

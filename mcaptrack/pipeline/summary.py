@@ -16,7 +16,8 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.plan import corrected_tracks
-from mcaptrack.pipeline.planes import fit_of, read_planes
+from mcaptrack.pipeline.planes import fit_of
+from mcaptrack.pipeline.staleness import read_planes
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names

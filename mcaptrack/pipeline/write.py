@@ -35,6 +35,7 @@ from mcaptrack.pipeline.drawing import (
     robot_frame,
 )
 from mcaptrack.pipeline.scene_views import picture_clock, scene_on_pictures
+from mcaptrack.pipeline.staleness import digest_of
 from mcaptrack.schema import (
     COUNTS,
     DETECTIONS,
@@ -132,14 +133,6 @@ class DrawnMessages(Collection[tuple[int, int, bytes]]):
 
     def __contains__(self, message: object) -> bool:
         return any(message == own for own in self)
-
-
-def digest_of(opened: log.Log, topic: str) -> str:
-    """Return the digest of a channel's messages: from its provenance if possible, else computed."""
-    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
-    if provenance and provenance.digest:
-        return provenance.digest
-    return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
 
 
 class RunState(NamedTuple):

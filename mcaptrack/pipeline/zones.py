@@ -39,8 +39,8 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import conflict_of
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
 from mcaptrack.pipeline.plan import is_outdated
-from mcaptrack.pipeline.planes import planes_to_json
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock
+from mcaptrack.pipeline.staleness import planes_to_json
 from mcaptrack.pipeline.write import DrawnMessages, Made, RunState
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of

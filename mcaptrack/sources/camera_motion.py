@@ -22,7 +22,6 @@ from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
 from mcaptrack.sources.fixed_frame import poses_at
 from mcaptrack.transforms import STAGES
-from mcaptrack.transforms.sort.tracker import used_path
 
 #: Positions that differ by no more than this, in metres, are those of a plane.
 _SAME_M: Final = 1e-6
@@ -53,6 +52,8 @@ def path_of(
     motion = motion_topic(prefix)
     for _, provenance in lineage(opened, topic, provenances):
         if provenance and motion in provenance.references and "camera_motion" in provenance.parameters:
+            from mcaptrack.transforms.sort.tracker import used_path
+
             path = used_path(_read_path(opened, motion, frames), provenance.parameters["camera_motion"])
             return path, {} if path is None else {motion: provenance.references[motion]}
     return None, {}

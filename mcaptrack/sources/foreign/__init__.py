@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,9 @@ from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
 from mcaptrack.sources.foreign.decoding import MessageType as MessageType
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, plain_name, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.video import EncodedPicture, PixelLayout
+
+if TYPE_CHECKING:
+    from mcaptrack.sources.video import EncodedPicture, PixelLayout
 
 _COMPRESSED: Final = (foxglove.VIDEO, foxglove.IMAGE, "sensor_msgs/CompressedImage")
 _RAW: Final = ("foxglove.RawImage", "sensor_msgs/Image")
@@ -49,6 +51,8 @@ class Picture(NamedTuple):
 
     def encoded(self, t_ns: int, number: int, where: str) -> EncodedPicture:
         """The picture for decoders: with its time, its number and its place for errors."""
+        from mcaptrack.sources.video import EncodedPicture
+
         return EncodedPicture(t_ns, number, self.format, self.data, self.layout, where)
 
 
@@ -199,6 +203,8 @@ def _format(text: str) -> str:
 
 
 def _raw(message: Any) -> Picture:
+    from mcaptrack.sources.video import PixelLayout
+
     is_bigendian = bool(getattr(message, "is_bigendian", False))  # foxglove.RawImage is always little-endian
     layout = PixelLayout(integer(message.width), integer(message.height), integer(message.step), is_bigendian)
     return Picture(stamp_of(message), text(message.encoding).lower(), to_bytes(message.data), layout)

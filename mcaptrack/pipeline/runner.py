@@ -26,7 +26,7 @@ from mcaptrack.pipeline.events import Watch, make_events, tally
 from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
 from mcaptrack.pipeline.motion import path_with, side_inputs
 from mcaptrack.pipeline.pictures import pictures_of, with_descriptors
-from mcaptrack.pipeline.plan import CORRECTED_IN, corrected_tracks, fixed_in, without_filled_in
+from mcaptrack.pipeline.plan import corrected_tracks, fixed_in, without_filled_in
 from mcaptrack.pipeline.planes import (
     AS_BEFORE,
     Channels,
@@ -34,12 +34,12 @@ from mcaptrack.pipeline.planes import (
     is_poor,
     plane_in_words,
     planes_for,
-    read_planes,
     recorded_planes,
     without_unseen,
 )
 from mcaptrack.pipeline.rebuild import plugins_of
-from mcaptrack.pipeline.write import Made, RunState, digest_of, write
+from mcaptrack.pipeline.staleness import CORRECTED_IN, digest_of, read_planes, warn_clock_jumps
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.pipeline.zones import STAGE as ZONES_STAGE
 from mcaptrack.pipeline.zones import ZoneWatch, make_zones
 from mcaptrack.predictors import weights_sha256
@@ -174,15 +174,6 @@ def warn_no_rows(
         return
     reason = transform.why_empty(read, made_rows) if hasattr(transform, "why_empty") else "the transform gave none"
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
-
-
-def warn_clock_jumps(opened: log.Log) -> None:
-    """Warn if the clock of a log jumps, or if nothing was recorded for long."""
-    if jumps := log.jumps_text(log.clock_jumps(opened), opened.start_ns):
-        warn(
-            f"{opened.path}: {jumps}: the clock jumps, or the recording paused; tracks and forecasts end there",
-            "clock-jump",
-        )
 
 
 def warn_memory(frames: Sequence[Frame]) -> None:

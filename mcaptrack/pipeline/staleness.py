@@ -1,0 +1,103 @@
+"""Whether a channel is out of date: whether what it was made from is still what it was then."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from typing import Any, Final
+from weakref import WeakKeyDictionary
+
+from mcaptrack import log
+from mcaptrack.geometry.plane import Planes
+from mcaptrack.notices import warn
+from mcaptrack.schema.provenance import FUSE, Provenance, digest
+from mcaptrack.sources.camera_motion import motion_topic, planes_in
+from mcaptrack.sources.cameras import camera_at, chain_of, is_plane, name_above, provenance_of
+from mcaptrack.sources.corrections import CORRECTED, corrections_of
+from mcaptrack.transforms import STAGES
+
+_OFF: Final = "off"
+#: Of more ground planes than this, a channel holds the digest.
+_MOST_RECORDED: Final = 100
+#: The stage that takes corrections over.
+CORRECTED_IN: Final = "sample"
+_READ: Final[WeakKeyDictionary[log.Log, dict[str, Planes | None]]] = WeakKeyDictionary()
+
+
+def is_stale(opened: log.Log, topic: str) -> bool:
+    """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    if provenance is None:
+        return False
+    prefix = name_above(chain_of(opened, topic)[-1])
+    if "ground_planes" in provenance.parameters:
+        planes = read_planes(opened, prefix)
+        if planes_to_json(planes or ()) != provenance.parameters["ground_planes"]:
+            return True
+    if is_motion_new(opened, prefix, provenance) or is_of_corrections(opened, prefix, provenance):
+        return True
+    planes_used = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
+    if any(camera_at(opened, name_above(name)).ground_plane != name for name in planes_used):
+        return True  # a plane was corrected, or its correction is gone
+    if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
+        return True
+    now = {name: how for name in provenance.made_from() if (how := provenance_of(opened, name)) and how.digest}
+    return any(how.digest != provenance.made_from()[name] for name, how in now.items())
+
+
+def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
+    """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
+    if provenance.transform != CORRECTED_IN:
+        return False
+    ending = f"/{CORRECTED}"
+    then = {topic: digest for topic, digest in provenance.references.items() if topic.endswith(ending)}
+    corrections = corrections_of(opened, camera_at(opened, prefix).prefix, provenance.input)
+    return then != ({} if corrections is None else {corrections: digest_of(opened, corrections)})
+
+
+def is_motion_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
+    """Whether a channel that takes camera motion into account was made before the motion was known."""
+    topic = motion_topic(camera_at(opened, prefix).prefix)
+    if topic not in opened.channels or topic in provenance.references:
+        return False
+    usual = _OFF
+    if provenance.transform in STAGES and "transform" not in provenance.plugins:
+        usual = getattr(STAGES[provenance.transform].default, "camera_motion", _OFF)
+    return bool(provenance.parameters.get("camera_motion", usual) != _OFF)
+
+
+def read_planes(opened: log.Log, prefix: str) -> Planes | None:
+    """Return the ground planes of a camera, each with its start time in ns; None if the log has none."""
+    topic = camera_at(opened, prefix).ground_plane
+    planes_by_topic = _READ.setdefault(opened, {})
+    if topic not in planes_by_topic:
+        planes_by_topic[topic] = (planes_in(opened, topic) if topic in opened.channels else []) or None
+    return planes_by_topic[topic]
+
+
+def planes_to_json(planes: Planes) -> list[Any]:
+    """Convert ground planes to the JSON values that the parameters of a channel contain: their digest, if many."""
+    values = [
+        (t_ns, {name: value for name, value in asdict(plane).items() if value is not None}) for t_ns, plane in planes
+    ]
+    text = json.dumps(values)
+    kept: list[Any] = json.loads(text)
+    return kept if len(kept) <= _MOST_RECORDED else [len(kept), hashlib.sha256(text.encode()).hexdigest()]
+
+
+def digest_of(opened: log.Log, topic: str) -> str:
+    """Return the digest of a channel's messages: from its provenance if possible, else computed."""
+    provenance = Provenance.from_metadata(opened.channel(topic).metadata)
+    if provenance and provenance.digest:
+        return provenance.digest
+    return digest((message.t_ns, message.sequence, message.payload) for message in opened.messages(topic))
+
+
+def warn_clock_jumps(opened: log.Log) -> None:
+    """Warn if the clock of a log jumps, or if nothing was recorded for long."""
+    if jumps := log.jumps_text(log.clock_jumps(opened), opened.start_ns):
+        warn(
+            f"{opened.path}: {jumps}: the clock jumps, or the recording paused; tracks and forecasts end there",
+            "clock-jump",
+        )
