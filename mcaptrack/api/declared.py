@@ -19,7 +19,6 @@ import textwrap
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from difflib import get_close_matches
 from functools import cache, wraps
 from numbers import Integral, Real
 from pathlib import Path
@@ -37,7 +36,7 @@ from typing import (
     get_type_hints,
 )
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -413,9 +412,9 @@ def _name_of(path: Any) -> Any:
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:
     if not isinstance(value, str) or value not in choices:
-        close = get_close_matches(str(value), map(str, choices), 1)
-        meant = f"did you mean {close[0]}? " if close else ""
-        raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {meant}there are {', '.join(map(str, choices))}")
+        names = list(map(str, choices))
+        meant = did_you_mean(str(value), names)
+        raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {meant}there are {', '.join(names)}")
 
 
 def _check_range(name: str, value: Any, ends: tuple[float, float], *, is_whole: bool) -> None:

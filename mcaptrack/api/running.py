@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from time import monotonic
@@ -19,7 +18,7 @@ from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
 from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.api.products import refuse_foreign_products, write_products
 from mcaptrack.choices import Mode
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, did_you_mean
 from mcaptrack.evaluation.zones import ZoneTotals
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.location import Location
@@ -341,10 +340,9 @@ def _with_options(base: Transform, options: Mapping[str, Value]) -> Transform:
     own_names = [f.name for f in fields(base) if not f.metadata.get("context")]
     for name in options:
         if name not in own_names:
-            close = get_close_matches(name, own_names, 1)
-            meant = f"did you mean {close[0]}? " if close else ""
             raise McaptrackError(
-                f"{type(base).__name__} has no parameter {name}; {meant}there are {', '.join(own_names) or 'none'}"
+                f"{type(base).__name__} has no parameter {name}; {did_you_mean(name, own_names)}"
+                f"there are {', '.join(own_names) or 'none'}"
             )
     return replace(base, **options)
 

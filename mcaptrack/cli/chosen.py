@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, Final, get_type_hints
 
 from mcaptrack.cli.command import is_on_command_line, settings_of
-from mcaptrack.cli.settings import found_of
+from mcaptrack.cli.settings import found_of, nearest
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS
@@ -60,8 +59,7 @@ def values_set(command: str, texts: Sequence[str] | None, kinds: Mapping[str, ty
         if not equals:
             refuse_usage(f"{where} needs name=value, as in --set {name}=0.5, not {text!r}")
         if name not in owners:
-            alike = difflib.get_close_matches(name, owners, 1)
-            hint = f"; did you mean {alike[0]}?" if alike else f"; there are {listed(sorted(owners))}"
+            hint = nearest(name, owners) or f"; there are {listed(sorted(owners))}"
             refuse_usage(f"{where} {text}: there is no parameter {name}{hint}")
         if name in values:
             refuse_usage(f"{where} gives {name} twice")

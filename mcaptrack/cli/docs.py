@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +12,7 @@ from mcaptrack.cli import common
 from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.generated import PARTS, with_parts
 from mcaptrack.cli.text import console, show
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean
 
 Pages = dict[str, Path]
 
@@ -59,9 +58,7 @@ def documentation(
         return pages
     name = Path(page).name.lower().removesuffix(".md")
     if name not in pages:
-        near = get_close_matches(name, pages, 1)
-        meant = f"did you mean {near[0]}? " if near else ""
-        raise McaptrackError(f"there is no page {page}; {meant}There are {', '.join(pages)}")
+        raise McaptrackError(f"there is no page {page}; {did_you_mean(name, pages)}There are {', '.join(pages)}")
     return {name: pages[name]}
 
 

@@ -6,7 +6,6 @@ the working folder and then that of the user.
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import reprlib
@@ -22,7 +21,7 @@ from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.config import NAME, ConfigFile, read_files, user_file
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.environment import PREFIX, VARIABLES
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.ranges import limits
 
 #: Options that only the command line can set.
@@ -157,7 +156,7 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
         setting = next((candidate for candidate in own if candidate.variable == name), None)
         if setting is None:
             variables = [each.variable for command in commands for each in commands[command].settings.values()]
-            refuse_usage(f"the environment variable {name} names no option{_nearest(name, [*variables, *VARIABLES])}")
+            refuse_usage(f"the environment variable {name} names no option{nearest(name, [*variables, *VARIABLES])}")
         if not text or setting.name in CALL_ONLY:
             continue
         try:
@@ -170,7 +169,7 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
 def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Setting, Given]]:
     for command, values in file.tables.items():
         if command not in commands:
-            refuse_usage(f"{file.path}: there is no command {command}{_nearest(command, commands)}")
+            refuse_usage(f"{file.path}: there is no command {command}{nearest(command, commands)}")
         if not isinstance(values, dict):
             refuse_usage(f"{file.path}: {command} is a command; write its options below [{command}]")
         own = {name: setting for name, setting in commands[command].settings.items() if name not in CALL_ONLY}
@@ -178,7 +177,7 @@ def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Sett
             name = key.replace("_", "-")
             if name not in own:
                 settable = key.replace("-", "_") in getattr(commands[command], "settable", ())
-                hint = f'; write set = ["{key}={value}"]' if settable else _nearest(name, own)
+                hint = f'; write set = ["{key}={value}"]' if settable else nearest(name, own)
                 refuse_usage(f"{file.path}: {command} has no option {key}{hint}")
             where = f"{file.path}: [{command}] {key}"
             try:
@@ -202,6 +201,7 @@ def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
     return {settings[name].parameter: (settings[name], set_value) for name, set_value in values_set[command].items()}
 
 
-def _nearest(name: str, names: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(names), 1)
-    return f"; did you mean {close[0]}?" if close else ""
+def nearest(name: str, names: Iterable[str]) -> str:
+    """The end of a message: a question about the name that is meant; "" if none is close."""
+    question = did_you_mean(name, names)
+    return f"; {question.rstrip()}" if question else ""

@@ -13,12 +13,11 @@ import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final, Self
 
 from mcaptrack import log, tables
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, did_you_mean
 from mcaptrack.files import place_of
 from mcaptrack.location import Location, distinct_names, join
 from mcaptrack.log.recording_files import results_path
@@ -275,8 +274,8 @@ class Database:
             name = missing.group(1)
             names = [*TABLES, *sorted(self._loaded - set(TABLES))]
             channels = self.channels if "/" in name else ()
-            close = get_close_matches(name, [*names, *channels], 1) or get_close_matches(name.lower(), names, 1)
-            nearest = f" (did you mean {close[0]}?)" if close else ""
+            question = did_you_mean(name, [*names, *channels]) or did_you_mean(name.lower(), names)
+            nearest = f" ({question.rstrip()})" if question else ""
             more = f"the channels {', '.join(channels)}" if channels else "channels in double quotes"
             return f"there is no table {name}{nearest}; there are {', '.join(names)}, and {more}"
         kind, _, text = error.partition(": ")
