@@ -25,7 +25,7 @@ _PARTS = {
     "scoring": ["Scores", "evaluate"],
     "reading": ["FetchedMessage"],
     "stages": ["detect", "motion", "predict", "retrack", "sample", "track"],
-    "training": ["TrainResult", "train"],
+    "training": ["train"],
     "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
     "viewing": ["LogServer", "view"],
@@ -36,6 +36,7 @@ _MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() 
     "McaptrackError": "mcaptrack.errors",
     "McaptrackWarning": "mcaptrack.notices",
     "Notice": "mcaptrack.notices",
+    "TrainResult": "mcaptrack.training.result",
 }
 __all__ = sorted(_MODULES)  # noqa: PLE0605  # __init__.pyi lists them for tools
 

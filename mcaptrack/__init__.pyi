@@ -42,7 +42,6 @@ from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack
 from mcaptrack.api.stages import sample as sample
 from mcaptrack.api.stages import track as track
-from mcaptrack.api.training import TrainResult as TrainResult
 from mcaptrack.api.training import train as train
 from mcaptrack.api.tuning import TuneResult as TuneResult
 from mcaptrack.api.tuning import tune as tune
@@ -59,6 +58,7 @@ from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
+from mcaptrack.training.result import TrainResult as TrainResult
 
 _MODULES: dict[str, str]
 __all__ = [

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -14,8 +14,9 @@ from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import FILES, Force, GroundPlane, LabelFps, PathLike, PointOfBox, Reports, Topic, no_progress
 from mcaptrack.errors import McaptrackError
-from mcaptrack.notices import Notice, collected
+from mcaptrack.notices import collected
 from mcaptrack.training.recipe import RECIPES, Recipe
+from mcaptrack.training.result import TrainResult
 from mcaptrack.training.sources import SYNTHETIC, SourceOptions, read_scenes, split, synthetic, windows_of
 from mcaptrack.training.windows import Windows
 
@@ -27,43 +28,6 @@ _WINDOWS: Final = "Training data"
 #: The licence of weights that were trained on files.
 _LICENCE: Final = "that of the data it was trained on"
 _VALIDATION_SHARE: Final = 0.1
-
-
-@dataclass(frozen=True)
-class TrainResult:
-    """A trained predictor.
-
-    Attributes
-    ----------
-    weights : pathlib.Path
-        The file of weights, with a model card in its header.
-    predictor : str
-        The name that ``predict`` and ``run`` take: "red:" or "lstm:" and the file.
-    epochs, kept_epoch : int
-        Number of epochs, and the one that the weights are of.
-    windows, validation_windows : int
-        Number of windows to train and to validate on.
-    scores : dict of str to dict of str to dict of str to float
-        Scores on the validation windows: as they are ("clean") and with 0.2 m of noise ("noisy"), by predictor.
-    seconds : float
-        How long the epochs took.
-    notes : tuple of str
-        What was done, such as why the training stopped early.
-    warnings : tuple of mcaptrack.Notice
-        What was assumed, left out or looks odd.
-
-    """
-
-    weights: Path
-    predictor: str
-    epochs: int
-    kept_epoch: int
-    windows: int
-    validation_windows: int
-    scores: Mapping[str, Mapping[str, Mapping[str, float]]]
-    seconds: float
-    notes: tuple[str, ...]
-    warnings: tuple[Notice, ...]
 
 
 @declared(most_used=("recipe", "epochs", "device", "validate", "topic", "output", "force"))
@@ -194,18 +158,7 @@ def train(
         notes.say(f"training on {len(training)} windows, validating on {len(validation)}")
         folder.mkdir(parents=True, exist_ok=True)
         trained = fit(chosen, training, validation, folder, card, where, threads, resume, progress, notes.say)
-    return TrainResult(
-        weights=trained.weights,
-        predictor=f"{chosen.network}:{trained.weights}",
-        epochs=trained.epochs,
-        kept_epoch=trained.kept_epoch,
-        windows=trained.windows,
-        validation_windows=trained.validation_windows,
-        scores=trained.scores,
-        seconds=trained.seconds,
-        notes=tuple(notes),
-        warnings=tuple(dict.fromkeys(warnings)),
-    )
+    return replace(trained, notes=tuple(notes), warnings=tuple(dict.fromkeys(warnings)))
 
 
 def _refuse_folder(folder: Path, recipe: Recipe, *, resume: bool, force: bool) -> None:

@@ -22,6 +22,7 @@ from mcaptrack.predictors.forecast import Predictor
 from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.weights import Weights, load, save
 from mcaptrack.training.recipe import Recipe
+from mcaptrack.training.result import TrainResult
 from mcaptrack.training.windows import Windows, ar1
 
 _LOG: Final = "epochs.csv"
@@ -31,22 +32,6 @@ _COLUMNS: Final = ("epoch", "loss", "validation_ade_m", "rate", "seconds")
 _NOISE_M: Final = 0.2
 
 Progress = Callable[[str, int, int], None]
-
-
-@dataclass(frozen=True)
-class Trained:
-    """The result of a training: the file of weights, their scores on the validation windows, and its epochs.
-
-    ``scores`` maps "clean" and "noisy" windows to predictors, and these to their scores.
-    """
-
-    weights: Path
-    scores: dict[str, dict[str, dict[str, float]]]
-    epochs: int
-    kept_epoch: int
-    windows: int
-    validation_windows: int
-    seconds: float
 
 
 @dataclass
@@ -70,7 +55,7 @@ def train(
     resume: bool = False,
     progress: Progress = lambda *_: None,
     say: Callable[[str], None] = lambda _: None,
-) -> Trained:
+) -> TrainResult:
     """Train a network; write weights, a log of the epochs and a state to resume from into ``folder``.
 
     Parameters
@@ -96,8 +81,9 @@ def train(
 
     Returns
     -------
-    Trained
-        The same recipe, windows and device give the same weights, also if the training was interrupted and resumed.
+    TrainResult
+        Without notes and warnings. The same recipe, windows and device give the same weights, also if the training was
+        interrupted and resumed.
 
     Raises
     ------
@@ -130,10 +116,18 @@ def train(
     kept = run.state.best_epoch if recipe.kept == "best" else run.state.epoch
     card = {"trained_epochs": str(run.state.epoch), "kept_epoch": str(kept)}
     run.publish(validation, card)
-    scores = compare(make(f"{recipe.network}:{run.weights}", recipe.steps, recipe.step_s), validation, recipe)
+    predictor = f"{recipe.network}:{run.weights}"
+    scores = compare(make(predictor, recipe.steps, recipe.step_s), validation, recipe)
     run.publish(validation, card | {f"scores_{k}": _to_text(part[recipe.network]) for k, part in scores.items()})
-    return Trained(
-        run.weights, scores, run.state.epoch, kept, len(training), len(validation), round(run.state.seconds, 1)
+    return TrainResult(
+        weights=run.weights,
+        predictor=predictor,
+        epochs=run.state.epoch,
+        kept_epoch=kept,
+        windows=len(training),
+        validation_windows=len(validation),
+        scores=scores,
+        seconds=round(run.state.seconds, 1),
     )
 
 
