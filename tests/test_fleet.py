@@ -401,12 +401,12 @@ while True:
 
 def test_a_worker_that_was_ended_while_it_waited_is_replaced(monkeypatch):
     """The system may end it for its memory. That was a broken pipe, which ended the whole command."""
-    answer = pickle.dumps(Reply("done", seconds=7.0)).hex()
+    answer = pickle.dumps(Reply(Path("a.mcap"), "done", seconds=7.0)).hex()
     monkeypatch.setattr(child, "_CODE", LIGHT.format(answer))
     worker, request = Child(WorkerLimits()), Request(Path("a.mcap"), b"", {})
     try:
         for number in range(3):
-            assert worker.do(request, lambda: False) == Reply("done", seconds=7.0), number
+            assert worker.do(request, lambda: False) == Reply(Path("a.mcap"), "done", seconds=7.0), number
             process = worker._process
             assert process is not None
             os.kill(process.pid, signal.SIGKILL)

@@ -181,7 +181,7 @@ class Fleet(Generic[T]):
         except (CancelledError, StoppedError):
             if self._crew.lost():
                 return
-            reply = Reply("killed", error=f"{work.log}: the cluster gave it up")
+            reply = Reply(work.log, "killed", error=f"{work.log}: the cluster gave it up")
         del self._busy[work.number]
         used: dict[str, Any] = {name: getattr(reply, name) for name in ("seconds", "cpu_seconds", "peak_bytes")}
         if self._ledger is not None:
@@ -401,7 +401,7 @@ class Processes:
                 self._own.child = Child(self._limits)
             except OSError as error:  # no folder for temporary files, or no room there
                 text = f"{request.log}: no worker process can be started ({error.strerror or error})"
-                return Reply("failed", error=text)
+                return Reply(request.log, "failed", error=text)
             with self._lock:
                 self._children.append(self._own.child)
         child: Child = self._own.child

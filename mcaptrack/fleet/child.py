@@ -112,7 +112,7 @@ class Child:
                 self._start()
             except OSError as error:
                 reason = f"{request.log}: no worker process can be started in {self._limits.folder or '.'}"
-                return Reply("failed", error=f"{reason} ({error.strerror or error})")
+                return Reply(request.log, "failed", error=f"{reason} ({error.strerror or error})")
             deadline = began + _START_S
         else:
             deadline = self._deadline()
@@ -141,7 +141,7 @@ class Child:
                 self.end(grace_s=_GRACE_S if state == "timed-out" else 0.0)
                 seconds = round(monotonic() - began, 3)
                 reason = f"{request.log}: {reason}, and was ended"
-                return Reply(state, error=reason, seconds=seconds, peak_bytes=peak, detail=self._printed())
+                return Reply(request.log, state, error=reason, seconds=seconds, peak_bytes=peak, detail=self._printed())
             if self._process.poll() is not None and not self._connection.poll(0):
                 return replace(self._died(request), seconds=monotonic() - began, peak_bytes=peak)
 
@@ -199,7 +199,7 @@ class Child:
         if code is not None and code < 0:
             with suppress(ValueError):
                 how = f"was killed by {signal.Signals(-code).name}"
-        return Reply("killed", error=f"{request.log}: the worker process {how}", detail=self._printed())
+        return Reply(request.log, "killed", error=f"{request.log}: the worker process {how}", detail=self._printed())
 
     def _printed(self) -> str:
         """Return the last of what the worker has printed since the request."""

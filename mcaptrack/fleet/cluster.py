@@ -110,12 +110,12 @@ class Cluster:
             out.set_result(task.result(timeout=_ANSWER_S))
         except KilledWorker as error:
             text = f"{request.log}: workers of the cluster died while they processed it"
-            out.set_result(Reply("killed", error=text, detail=str(error)))
+            out.set_result(Reply(request.log, "killed", error=text, detail=str(error)))
         except CancelledError:
             out.cancel()
         except Exception as error:
             text = " ".join(str(error).split()) or type(error).__name__
-            out.set_result(Reply("failed", error=f"{request.log}: {text:.500}"))
+            out.set_result(Reply(request.log, "failed", error=f"{request.log}: {text:.500}"))
         self._futures.pop(request.log, None)
         return out
 

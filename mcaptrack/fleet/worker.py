@@ -25,7 +25,7 @@ from typing import Any, Final, NoReturn
 from mcaptrack.environment import hush_libraries, share_allocator
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet.ledger import digest_of_log
-from mcaptrack.fleet.results import State
+from mcaptrack.fleet.results import LogOutcome, State
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, about, listening
 from mcaptrack.processes import die_with
@@ -44,22 +44,13 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Reply:
-    """The outcome of one try, as in ``LogOutcome``; ``result`` is pickled; ``digest`` is that of the log afterwards.
+class Reply(LogOutcome[bytes]):
+    """The outcome of one try; ``result`` is pickled; ``digest`` is that of the log afterwards.
 
     ``files`` are those beside the log that the function owes, by what its result says.
     """
 
-    state: State
-    result: bytes = b""
-    error: str = ""
-    detail: str = ""
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    peak_bytes: int = 0
-    warnings: tuple[Notice, ...] = ()
     digest: str = ""
-    printed: str = ""
     files: tuple[str, ...] = ()
 
 
@@ -72,15 +63,16 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
         with listening(warnings.append), about(request.own.get("output") or request.log):
             result = function(request.log, **options, **request.own, **_taking(function, progress))
         state: State = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
-        reply = Reply(state, result=pickle.dumps(result), digest=digest_of_log(request.log), files=_files_of(result))
+        answer, digest = pickle.dumps(result), digest_of_log(request.log)
+        reply = Reply(request.log, state, answer, digest=digest, files=_files_of(result))
     except McaptrackError as error:
-        reply = Reply("failed", error=" ".join(str(error).split()))
+        reply = Reply(request.log, "failed", error=" ".join(str(error).split()))
     except MemoryError:
-        reply = Reply("out-of-memory", error=f"{request.log}: the memory of this machine is not enough")
+        reply = Reply(request.log, "out-of-memory", error=f"{request.log}: the memory of this machine is not enough")
     except Exception as error:
         last = " ".join(traceback.format_exception_only(error)[-1].split())
         text = f"{request.log}: {last}; this is a fault of the program, the ledger and -v have its traceback"
-        reply = Reply("failed", error=text, detail=traceback.format_exc())
+        reply = Reply(request.log, "failed", error=text, detail=traceback.format_exc())
     seconds, cpu = round(monotonic() - began, 3), round(_cpu_seconds() - used, 3)
     unique_warnings = tuple(dict.fromkeys(warnings))
     return replace(reply, seconds=seconds, cpu_seconds=cpu, peak_bytes=_peak_bytes(), warnings=unique_warnings)
@@ -125,7 +117,8 @@ def serve(handle: int, life: int) -> None:
             except SystemExit as ended:
                 if _ENDING:
                     raise
-                reply = Reply("failed", error=f"{request.log}: it ended its process with code {ended.code}")
+                text = f"{request.log}: it ended its process with code {ended.code}"
+                reply = Reply(request.log, "failed", error=text)
             sys.stdout.flush()
             sys.stderr.flush()
             connection.send(reply)
