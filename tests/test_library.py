@@ -14,7 +14,7 @@ import re
 import shutil
 import warnings
 from pathlib import Path
-from typing import Literal, get_args, get_origin
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -387,6 +387,11 @@ class TestDocumentation:
             assert named == parameters, name
             assert sections == [one for one in SECTIONS if one in sections], name
             assert not (parameters or needed["Returns"]) or sections[-1] == "Examples", name
+
+    @pytest.mark.parametrize("name", FUNCTIONS)
+    def test_types_of_parameters_and_results_are_there_for_those_who_ask(self, name):
+        hints = get_type_hints(getattr(mcaptrack, name))
+        assert hints.keys() == {*inspect.signature(getattr(mcaptrack, name)).parameters, "return"}
 
     @pytest.mark.parametrize("name", CLASSES)
     def test_classes_document_their_attributes(self, name):

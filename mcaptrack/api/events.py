@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import mcaptrack
 from mcaptrack.api.common import names_of, warn_unused
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import (
@@ -22,9 +23,6 @@ from mcaptrack.api.options import (
 )
 from mcaptrack.choices import Similarity
 
-if TYPE_CHECKING:
-    from mcaptrack.api.running import RunResult
-
 
 @declared(most_used=("topic", "similarity", "gate_m", "output", "force"))
 def events(
@@ -39,7 +37,7 @@ def events(
     sidecar: Sidecar = None,
     force: Force = False,
     progress: Reports = no_progress,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Write events of tracks (begin, end, identity switches) and errors of predictions into the log.
 
     Events are the begin and end of tracks, and which tracks re-tracking joined or split; if the log has /camera/truth

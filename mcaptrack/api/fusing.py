@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import TYPE_CHECKING, Annotated, Final
 
+import mcaptrack
 from mcaptrack.api.common import clock_offsets, split_names
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import (
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
     from mcaptrack import log as logs
     from mcaptrack import pipeline
-    from mcaptrack.api.running import RunResult
     from mcaptrack.pipeline.several import Say
     from mcaptrack.sources.fixed_frame import BoxesRead
 
@@ -60,7 +60,7 @@ def fuse(
     sidecar: Sidecar = None,
     force: Force = False,
     progress: Reports = no_progress,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Fuse the detections of several cameras with one ground to detections of the whole scene.
 
     From /CAMERA/detections and /CAMERA/ground_plane to /world/detections: boxes that stand at the same place are

@@ -13,6 +13,17 @@ from mcaptrack.tables import RECORDING, TABLES
 
 if TYPE_CHECKING:
     import pyarrow as pa
+else:
+
+    class _Arrow:
+        """pyarrow: imported when the types of annotations are asked for, and not for help."""
+
+        def __getattr__(self, name: str) -> object:
+            import pyarrow
+
+            return getattr(pyarrow, name)
+
+    pa = _Arrow()
 
 #: Heading of options in the help.
 QUERY: Final = "Query and answer"

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
+import mcaptrack
 from mcaptrack.api.common import as_location, split_names
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
 from mcaptrack.api.options import (
@@ -31,7 +32,6 @@ from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
 
 if TYPE_CHECKING:
     from mcaptrack import log as logs
-    from mcaptrack.api.running import RunResult
     from mcaptrack.location import Location
     from mcaptrack.pipeline import Job
 
@@ -76,7 +76,7 @@ def run(
     stages: Stages = None,
     follows: Annotated[PathLike | Sequence[PathLike] | None, PYTHON_ONLY] = None,
     progress: Reports = no_progress,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Detect, track, re-track and predict: run all stages that are missing or out of date, then events and tables.
 
     From /camera/video (or the detections, tracks or samples that the log has) to /camera/predictions and

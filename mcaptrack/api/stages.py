@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
+import mcaptrack
 from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, declared
 from mcaptrack.api.options import (
     Camera,
@@ -24,10 +25,6 @@ from mcaptrack.api.options import (
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import Transform
-
-if TYPE_CHECKING:
-    from mcaptrack.api.running import RunResult
-
 
 # Run a stage that reads pictures: detect, motion.
 
@@ -53,7 +50,7 @@ def detect(
     stages: Stages = None,
     progress: Reports = no_progress,
     **options: Value,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Detect people in the video of a log: whoever moves, or what a network finds.
 
     Reads /camera/video, writes /camera/detections: one box for each person or object.
@@ -104,7 +101,7 @@ def motion(
     stages: Stages = None,
     progress: Reports = no_progress,
     **options: Value,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Estimate how the camera moves, from picture to picture.
 
     Reads /camera/video, writes /camera/motion: one row per picture, with the transform from the picture before, the one
@@ -160,7 +157,7 @@ def track(
     stages: Stages = None,
     progress: Reports = no_progress,
     **options: Value,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Track detections: give each person an id that stays the same from frame to frame.
 
     Reads /camera/detections, writes /camera/tracks: one row per frame for each person who is tracked and detected in
@@ -217,7 +214,7 @@ def sample(
     stages: Stages = None,
     progress: Reports = no_progress,
     **options: Value,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Resample tracks to a fixed rate, in metres on the ground.
 
     Reads /camera/tracks, writes /camera/samples: one row per person and sample time; ``observed`` is false where a gap
@@ -271,7 +268,7 @@ def predict(
     stages: Stages = None,
     progress: Reports = no_progress,
     **options: Value,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Predict where tracked people will be, with covariance.
 
     Reads /camera/samples, writes /camera/predictions: one row per track and future step, for tracks with enough past
@@ -328,7 +325,7 @@ def retrack(
     stages: Stages = None,
     progress: Reports = no_progress,
     **options: Value,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Repair tracks by prediction: link the parts of one, split mixed ones, and leave out false ones.
 
     Reads /camera/samples, writes /camera/retracks: tracks that use the whole log (offline), tracks that use the past

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+import mcaptrack
 from mcaptrack.api.common import as_path, log_location, names_of, optional_path
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import Camera, EachLog, Force, Output, PathLike, Reports, Sidecar, no_progress
@@ -16,7 +17,6 @@ from mcaptrack.location import local_name
 if TYPE_CHECKING:
     from mcaptrack import log as logs
     from mcaptrack import pipeline
-    from mcaptrack.api.running import RunResult
     from mcaptrack.geometry.zones import Zone
 
 #: Heading in the help, and the zones that are counted by default.
@@ -55,7 +55,7 @@ def zones(
     sidecar: Sidecar = None,
     force: Force = False,
     progress: Reports = no_progress,
-) -> RunResult:
+) -> mcaptrack.RunResult:
     """Count visits of zones and crossings of lines by the tracks of a log, and write them into the log.
 
     Beside each channel of tracks, such as /camera/retracks/full, go .../zones/visits, .../zones/crossings, and counts
