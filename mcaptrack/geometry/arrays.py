@@ -24,7 +24,7 @@ Bytes = NDArray[np.uint8]
 Record = TypeVar("Record", bound=tuple[Any, ...])
 
 
-def taken(record: Record, which: Bools | Ints | slice) -> Record:
+def taken(record: Record, which: Bools | Ints | Indices | slice) -> Record:
     """Some members of all arrays of a record."""
     return type(record)(*(taken(part, which) if isinstance(part, tuple) else part[which] for part in record))
 

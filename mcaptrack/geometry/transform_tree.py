@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints, taken
 from mcaptrack.geometry.clocks import NS_PER_S
 
 if TYPE_CHECKING:
@@ -82,10 +82,6 @@ class PoseSamples(NamedTuple):
     log_ns: Ints
     translation: Floats
     quaternion: Floats
-
-    def take(self, which: Indices) -> PoseSamples:
-        """Return the poses at these indices."""
-        return PoseSamples(self.stamp_ns[which], self.log_ns[which], self.translation[which], self.quaternion[which])
 
     def is_off_clock(self) -> bool:
         """Whether the stamps are of another clock than the log time, or missing."""
@@ -216,7 +212,7 @@ def clean(
         is_pose = np.isfinite(samples.translation).all(axis=1) & np.isfinite(length) & (length > _UNIT)
     if not is_pose.all():
         findings.append(f"{_count(int((~is_pose).sum()), 'pose')} without a rotation or a position are left out")
-        samples, length = samples.take(np.flatnonzero(is_pose)), length[is_pose]
+        samples, length = taken(samples, np.flatnonzero(is_pose)), length[is_pose]
     if not len(length):
         return None, findings
     if (count := int((np.abs(length - 1) > _UNIT).sum())) > 0:
@@ -224,7 +220,7 @@ def clean(
     samples = samples._replace(quaternion=samples.quaternion / length[:, None])
     if not is_latched and samples.stamp_ns.any() and not samples.stamp_ns.all() and not on_log_time:
         findings.append(f"{_count(int((samples.stamp_ns == 0).sum()), 'pose')} without a stamp are left out")
-        samples = samples.take(np.flatnonzero(samples.stamp_ns))
+        samples = taken(samples, np.flatnonzero(samples.stamp_ns))
     if on_log_time or not samples.stamp_ns.any():
         if not on_log_time and not is_latched:
             findings.append("its stamps are 0, so that the log time is taken")
@@ -249,7 +245,7 @@ def _static(parent: str, child: str, samples: PoseSamples, messages: int) -> tup
     has_stamps = samples.stamp_ns.all() and (np.diff(samples.stamp_ns) >= 0).all()
     since = samples.stamp_ns if has_stamps else samples.log_ns
     is_new = np.append(True, _differs(samples))
-    kept = samples.take(np.flatnonzero(is_new))
+    kept = taken(samples, np.flatnonzero(is_new))
     series = TransformSeries(parent, child, True, messages, since[is_new], kept.translation, kept.quaternion)
     many = f"it is static, but changes {_count(len(kept.stamp_ns) - 1, 'time')}; each pose is taken until the next"
     return series, [many] if len(kept.stamp_ns) > 1 else []
@@ -258,11 +254,11 @@ def _static(parent: str, child: str, samples: PoseSamples, messages: int) -> tup
 def _dynamic(parent: str, child: str, samples: PoseSamples, messages: int) -> tuple[TransformSeries, list[str]]:
     samples, findings = _one_pass(samples)
     order = np.argsort(samples.stamp_ns, kind="stable")
-    samples = samples.take(order)
+    samples = taken(samples, order)
     is_last = np.append(np.diff(samples.stamp_ns) > 0, True)
     if (differing := int((_differs(samples) & ~is_last[:-1]).sum())) > 0:
         findings.append(f"{_count(differing, 'stamp')} have several poses, of which the last is taken")
-    kept = samples.take(np.flatnonzero(is_last))
+    kept = taken(samples, np.flatnonzero(is_last))
 
     def series_of(poses: PoseSamples) -> TransformSeries:
         is_static = len(poses.stamp_ns) == 1
@@ -271,7 +267,7 @@ def _dynamic(parent: str, child: str, samples: PoseSamples, messages: int) -> tu
     series = series_of(kept)
     if len(single := _single_outliers(series)):
         findings.append(f"{_count(len(single), 'pose')} far from those before and after are left out")
-        series = series_of(kept.take(np.delete(np.arange(len(kept.stamp_ns)), single)))
+        series = series_of(taken(kept, np.delete(np.arange(len(kept.stamp_ns)), single)))
     if len(series.gaps):
         longest = float(np.diff(series.t_ns)[series.gaps].max()) / NS_PER_S
         text = f"{_count(len(series.gaps), 'gap')}, the longest of {longest:.3g} s"
@@ -323,7 +319,7 @@ def _one_pass(samples: PoseSamples) -> tuple[PoseSamples, list[str]]:
     back_s = max(int(stamps[:start].max()) - int(stamps[start]) for start in starts[1:]) / NS_PER_S
     told = f"its clock goes back {_count(len(starts) - 1, 'time')}, by up to {back_s:.3g} s"
     left_out = _count(int((~is_kept).sum()), "pose")
-    return samples.take(np.flatnonzero(is_kept)), [f"{told}; {left_out} of times that it had before are left out"]
+    return taken(samples, np.flatnonzero(is_kept)), [f"{told}; {left_out} of times that it had before are left out"]
 
 
 def _differs(samples: PoseSamples) -> Bools:

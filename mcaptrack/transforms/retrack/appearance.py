@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_starts
 from mcaptrack.transforms.retrack.assignments import Tracks
 
@@ -161,8 +161,8 @@ def calibrate(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> Appea
 
     None if no two tracks that are there at one time were seen before and after a gap.
     """
-    tracks = tracks.take(tracks.look >= 0)
-    tracks = tracks.take(np.lexsort((tracks.step, tracks.source)))
+    tracks = taken(tracks, tracks.look >= 0)
+    tracks = taken(tracks, np.lexsort((tracks.step, tracks.source)))
     if len(tracks.look) < 2:
         return None
     blocks, noise = _blocks(values, tracks, step_s)

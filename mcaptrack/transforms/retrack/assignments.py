@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.ragged import find_rows, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
@@ -32,10 +32,6 @@ class Tracks(NamedTuple):
     sample: Ints
     xy_m: Floats
     look: Ints
-
-    def take(self, which: Ints | Bools) -> Tracks:
-        """Some of the assignments, in this order."""
-        return taken(self, which)
 
     @property
     def order(self) -> Ints:

@@ -71,12 +71,12 @@ class TrackEnds(NamedTuple):
         forward, backward = filtered(model, trajectories)
         first, last = trajectories.first[:-1], trajectories.first[1:] - 1
         steps = trajectories.step[first], trajectories.step[last]
-        return cls(model, trajectories, *steps, backward.take(first), forward.take(last))
+        return cls(model, trajectories, *steps, taken(backward, first), taken(forward, last))
 
     def gaps(self, i: Ints, j: Ints) -> Gaps:
         """The gaps (E,) from the ends of tracks ``i`` to the beginnings of tracks ``j``."""
         seconds = np.asarray((self.begins[j] - self.ends[i]) * self.model.step_s, np.float64)
-        return Gaps(self.ended.take(i), self.begun.take(j), seconds)
+        return Gaps(taken(self.ended, i), taken(self.begun, j), seconds)
 
 
 def link_tracks(
@@ -331,7 +331,7 @@ class Tracked(NamedTuple):
         """The gaps (J,) from assignments ``before`` to ``after``."""
         steps = self.tracks.step[after] - self.tracks.step[before]
         seconds = np.asarray(steps * step_s, np.float64)
-        return Gaps(self.forward.take(before), self.backward.take(after), seconds)
+        return Gaps(taken(self.forward, before), taken(self.backward, after), seconds)
 
 
 class Joins(NamedTuple):
@@ -360,7 +360,7 @@ def cut_joins(
     after a cut is a track of its own, for linking to decide about, with an id above all others. The probability at cuts
     is that by motion alone: linking looks at ``appearance``, too.
     """
-    ordered = tracks.take(order := tracks.order)
+    ordered = taken(tracks, order := tracks.order)
     joins = find_joins(tracked_of(model, ordered), model)
     is_right = _CUTS.probability(joins.features)
     questioned = with_appearance(is_right, joins, ordered, appearance) < max(_QUESTIONED, min_confidence)
@@ -389,7 +389,7 @@ def tracked_of(model: MotionModel, tracks: Tracks) -> Tracked:
     """Tracks (C,), ordered by track, then step, with their states."""
     _, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     forward, backward = filtered(model, trajectories)
-    return Tracked(tracks, forward.take(row), backward.take(row))
+    return Tracked(tracks, taken(forward, row), taken(backward, row))
 
 
 def find_joins(tracked: Tracked, model: MotionModel) -> Joins:

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.ragged import group_index, ragged_range
 
 #: Standard deviation of measured positions per axis in metres, until it is estimated.
@@ -26,10 +26,6 @@ class State(NamedTuple):
 
     mean: Floats
     cov: Floats
-
-    def take(self, which: Bools | Ints | slice) -> State:
-        """The states of some of the tracks."""
-        return State(self.mean[which], self.cov[which])
 
 
 @dataclass(frozen=True)

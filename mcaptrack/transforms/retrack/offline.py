@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.angles import wrapped
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.colour_histograms import BINS, mean_shares
@@ -95,14 +95,14 @@ def fix_tracks(tracks: Tracks, fixed: Collection[int]) -> Tracks:
     for name in np.unique(source[is_fixed]).tolist():
         own = np.flatnonzero(source == name)
         ends[name] = int(own[step[own].argmin()]), int(own[step[own].argmax()])
-    taken: set[int] = set()
+    used: set[int] = set()
     node: dict[int, int] = {}
     for name in sorted(ends, key=lambda key: -int((source == key).sum())):
         names, counts = np.unique(track[source == name], return_counts=True)
-        free = [int(name) for name in names[np.argsort(-counts, kind="stable")] if int(name) not in taken]
+        free = [int(name) for name in names[np.argsort(-counts, kind="stable")] if int(name) not in used]
         node[name] = free[0] if free else following
         following += not free
-        taken.add(node[name])
+        used.add(node[name])
         out[source == name] = node[name]
     for name in np.unique(track[is_fixed]).tolist():
         own = np.flatnonzero(track == name)
@@ -117,7 +117,7 @@ def fix_tracks(tracks: Tracks, fixed: Collection[int]) -> Tracks:
             elif after is not None and ends[after][0] == own[high]:
                 out[run] = node[after]
             else:
-                out[run] = rest if name in taken else name
+                out[run] = rest if name in used else name
                 following = rest + 1
     return tracks._replace(track=np.where(out < 0, track, out))
 
@@ -298,10 +298,6 @@ class TrackRows(NamedTuple):
         out += self.share * (values[self.after] - out)
         return out
 
-    def take(self, which: Bools | Ints | slice) -> TrackRows:
-        """Some of the rows."""
-        return TrackRows(self.track[which], self.step[which], self.before[which], self.after[which], self.share[which])
-
 
 class Moved(NamedTuple):
     """Where smoothing moves rows (R,) to: positions (R, 2) in m, and what is added to x_px and y_px, (R, 2), if any."""
@@ -407,14 +403,14 @@ def vote(rows: Rows) -> tuple[int, int]:
 def rows_by_step(rows: TrackRows, samples: LogSamples, moved: Moved | None, steps: Sequence[int]) -> Iterator[Rows]:
     """The rows of tracks at each of ``steps``, ordered by id; each track has the class of most of its rows."""
     order = np.lexsort((rows.track, rows.step))
-    rows, moved = rows.take(order), moved and moved.take(order)
+    rows, moved = taken(rows, order), moved and moved.take(order)
     ends = np.append(0, np.searchsorted(rows.step, steps, "right"))
     votes = np.empty(len(order), [("track_id", np.int64), ("class_id", np.uint32)])
     votes["track_id"], votes["class_id"] = rows.track, samples.column("class_id")[rows.before]
     vote(votes)
     for low, high in spans_of(ends):
         here = slice(ends[low], ends[high])
-        part = _rows(rows.take(here), samples)
+        part = _rows(taken(rows, here), samples)
         part["class_id"] = votes["class_id"][here]
         if moved is not None:
             part["x_m"], part["y_m"] = moved.xy_m[here].T
@@ -462,7 +458,7 @@ def offline_tracks(
     look = np.full(len(step), -1) if descriptors is None else descriptors.find(seen_ns, source)
     tracks = Tracks(step, track, source, sample, xy, look)
     if not options.shares_samples:
-        tracks = tracks.take(np.unique(sample, return_index=True)[1])
+        tracks = taken(tracks, np.unique(sample, return_index=True)[1])
     seen = Appearance.of(options.looks, tracks, model.step_s)
     appearance = seen if seen and seen.calibration.tells_apart else None
     if options.link_s > 0 and len(tracks.step):
@@ -470,7 +466,7 @@ def offline_tracks(
     if options.resolve_swaps and len(tracks.step) and not movers.on_ground:
         tracks = _without_swaps(model, tracks, appearance)
     tracks = fix_tracks(tracks, options.fixed_ids)
-    tracks = tracks.take(tracks.order)
+    tracks = taken(tracks, tracks.order)
     rows = TrackRows.of(tracks.step, tracks.track, tracks.sample)
     is_decided = DECISIONS in options.writes.values()
     moved: Moved | None = None
@@ -481,7 +477,7 @@ def offline_tracks(
     if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
         _, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
         forward, backward, smoothed = smooth(model, trajectories)
-        states = forward.take(row), backward.take(row)
+        states = taken(forward, row), taken(backward, row)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             when = times_ns[np.minimum(np.searchsorted(steps, rows.step), len(times_ns) - 1)]
             moved = moved_to(smoothed.mean[:, :2] * movers.unit_m, rows, samples, options.ground_planes, when)
@@ -506,10 +502,10 @@ def offline_tracks(
     if is_decided and states is not None:
         decided = Decided(Tracked(tracks, *states), np.where(is_fixed, np.inf, odds), keeps, appearance)
         decisions = decision_rows(decided, model, samples, steps)
-    by_step = rows_by_step(rows.take(left), samples, moved and moved.take(left), steps)
+    by_step = rows_by_step(taken(rows, left), samples, moved and moved.take(left), steps)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
     if (stored := options.stored_looks) is not None:
-        kept = tracks.take(keeps[of] & (tracks.look >= 0))
+        kept = taken(tracks, keeps[of] & (tracks.look >= 0))
         track_of = np.full(len(stored.t_ns), -1)
         track_of[kept.look] = kept.track
         looks = appearance_rows(stored, track_of, times_ns)

@@ -137,7 +137,7 @@ class OnlineLinks:
             (is_written | is_observed) & (np.arange(count) <= first[which]) & ~self._are_named(alive.ids)[which]
         )
         of = which[rows]
-        new = taken(alive, of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=state.take(rows))
+        new = taken(alive, of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=taken(state, rows))
         over = np.flatnonzero(alive.over < _NEVER)
         lost = joined([self._lost, taken(alive, over)])
         # a lost track was written before it was over; or else it has to continue another one
@@ -184,7 +184,7 @@ class OnlineLinks:
             fits &= (lost.last < new.began[part, None]) & (is_written[part, None] | (lost.hits >= self._confirm_hits))
             row, candidate = np.nonzero(fits)
             row, gap_s = row + low, np.asarray(gaps_s[row, candidate], np.float64)
-            gaps = linking.Gaps(lost.state.take(candidate), new.state.take(row), gap_s)
+            gaps = linking.Gaps(taken(lost.state, candidate), taken(new.state, row), gap_s)
             is_near = linking.are_in_reach(gaps)
             candidate, row, gaps = candidate[is_near], row[is_near], taken(gaps, is_near)
             before, after, gap_s = gaps

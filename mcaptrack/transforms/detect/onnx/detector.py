@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.geometry.arrays import Image
+from mcaptrack.geometry.arrays import Image, taken
 from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
 from mcaptrack.notices import warn
@@ -442,9 +442,9 @@ class _Run:
         """Rows of the wanted classes, within the picture, in reading order."""
         unknown, count = np.unique(boxes.label[~np.isin(boxes.label, list(self._names))], return_counts=True)
         self._unknown.update(dict(zip(unknown.tolist(), count.tolist(), strict=True)))
-        boxes = boxes.take(np.isin(boxes.label, self._wanted))
+        boxes = taken(boxes, np.isin(boxes.label, self._wanted))
         xyxy = np.clip(boxes.xyxy, 0, [*size, *size])
-        boxes = boxes._replace(xyxy=xyxy).take((xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1]))
+        boxes = taken(boxes._replace(xyxy=xyxy), (xyxy[:, 2] > xyxy[:, 0]) & (xyxy[:, 3] > xyxy[:, 1]))
         order = np.lexsort((boxes.score, boxes.label, boxes.xyxy[:, 0], boxes.xyxy[:, 1]))
         x1, y1, x2, y2 = boxes.xyxy[order].T
         numbers = [self._numbers[label] for label in boxes.label[order].tolist()]

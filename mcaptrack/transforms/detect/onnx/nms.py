@@ -10,7 +10,7 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Image, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Image, Ints, taken
 
 #: So many boxes of a picture, the likeliest, are looked at: pairs of them are compared.
 _MOST: Final = 1000
@@ -28,10 +28,6 @@ class Boxes(NamedTuple):
     xyxy: Floats
     score: Floats
     label: Ints
-
-    def take(self, which: Ints | Bools) -> Boxes:
-        """Some of them."""
-        return Boxes(self.xyxy[which], self.score[which], self.label[which])
 
     @classmethod
     def joined(cls, parts: list[Boxes]) -> Boxes:
@@ -57,13 +53,13 @@ def suppress(boxes: Boxes, max_iou: float) -> Boxes:
         Those that are kept, the likeliest first.
 
     """
-    boxes = boxes.take(_by_score(boxes)[:_MOST])
+    boxes = taken(boxes, _by_score(boxes)[:_MOST])
     beaten_by = np.triu(_overlaps(boxes.xyxy)[0] > max_iou, 1) & (boxes.label[:, None] == boxes.label)
     kept = np.ones(len(boxes.score), bool)
     while True:  # after n rounds the n likeliest are settled; usually three rounds are enough for all
         again = ~(beaten_by & kept[:, None]).any(axis=0)
         if (again == kept).all():
-            return boxes.take(kept)
+            return taken(boxes, kept)
         kept = again
 
 
@@ -92,7 +88,7 @@ def join_tiles(parts: list[Boxes], tiles: list[tuple[int, int, int, int]], max_i
     tile = np.repeat(np.arange(len(parts)), [len(part.score) for part in parts])
     cut = np.concatenate([_cut(part.xyxy, tile, tiles) for part, tile in zip(parts, tiles, strict=True)])
     order = _by_score(boxes)[:_MOST]
-    boxes, tile, cut = boxes.take(order), tile[order], cut[order]
+    boxes, tile, cut = taken(boxes, order), tile[order], cut[order]
     overlap, inner = _overlaps(boxes.xyxy)
     area = _areas(boxes.xyxy)
     is_cut = np.asarray(cut.any(axis=1))
@@ -106,13 +102,13 @@ def join_tiles(parts: list[Boxes], tiles: list[tuple[int, int, int, int]], max_i
     score = boxes.score.copy()
     others = np.where(part_of, overlap, -1.0)[is_gone].argmax(axis=1) if is_gone.any() else []
     np.maximum.at(score, others, boxes.score[is_gone])
-    boxes, left = boxes._replace(score=score).take(~is_gone), np.flatnonzero(~is_gone)
+    boxes, left = taken(boxes._replace(score=score), ~is_gone), np.flatnonzero(~is_gone)
     group = _groups(facing[np.ix_(left, left)])
     xyxy, score = boxes.xyxy.copy(), boxes.score.copy()
     np.minimum.at(xyxy[:, :2], group, boxes.xyxy[:, :2])
     np.maximum.at(xyxy[:, 2:], group, boxes.xyxy[:, 2:])
     np.maximum.at(score, group, boxes.score)
-    return suppress(Boxes(xyxy, score, boxes.label).take(np.unique(group)), max_iou)
+    return suppress(taken(Boxes(xyxy, score, boxes.label), np.unique(group)), max_iou)
 
 
 def _by_score(boxes: Boxes) -> Ints:
