@@ -59,18 +59,16 @@ def call(*words: object, folder: Path | None = None, environment: Mapping[str, s
     return Outcome(code, out.getvalue(), err.getvalue())
 
 
-def done(*words: object, folder: Path | None = None, environment: Mapping[str, str] | None = None) -> Outcome:
+def done(*words: object, folder: Path | None = None) -> Outcome:
     """Run a command that has to succeed."""
-    outcome = call(*words, folder=folder, environment=environment)
+    outcome = call(*words, folder=folder)
     assert outcome.code == 0, outcome.err
     return outcome
 
 
-def printed(
-    *words: object, folder: Path | None = None, environment: Mapping[str, str] | None = None
-) -> tuple[str, str]:
+def printed(*words: object, folder: Path | None = None) -> tuple[str, str]:
     """What a command that has to succeed prints to stdout and stderr."""
-    return done(*words, folder=folder, environment=environment)[1:]
+    return done(*words, folder=folder)[1:]
 
 
 def start(*words: object, folder: Path | None = None) -> subprocess.Popen[str]:

@@ -135,8 +135,6 @@ class TestResults:
         scores = mcaptrack.evaluate("log.mcap", gate_m=1.0)
         (row,) = [r for r in scores.rows() if (r["tracks"], r["similarity"]) == ("/camera/retracks", "metres")]
         assert scores.score("IDF1", "retracks", "metres") == row["IDF1"]
-        with pytest.raises(McaptrackError, match="2 results fit `tracks='retracks'`"):
-            scores.score("IDF1", "retracks")
 
     def test_scores_below_a_limit_are_listed(self, place):
         scores = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=1.0)

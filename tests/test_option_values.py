@@ -9,8 +9,9 @@ import logging
 import sys
 from contextlib import redirect_stdout
 from contextvars import copy_context
+from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 import pytest
@@ -72,11 +73,12 @@ def setting(kind: Any, many: bool = False, **declared: Any) -> Setting:
 
 VALUES = [
     *((int, value, value) for value in (3, 2**63 - 1, 1 - 2**63)),
-    *((int, value, None) for value in (2**63, -(2**64), 3.0, True)),
+    *((int, value, None) for value in (2**63, -(2**64), 3.0, True, "1")),
     *((float, value, value) for value in (3, 0.5)),
-    *((float, value, None) for value in (2**63, False)),
-    *((str, value, wanted) for value, wanted in ((25, "25"), (2.5, "2.5"), ("", ""), (True, None))),
-    *((bool, False, False), (bool, 1, None), (Path, "a", "a"), (Path, 1, None)),
+    *((float, value, None) for value in (2**63, False, "1", date(1979, 5, 27))),
+    *((str, value, wanted) for value, wanted in ((25, "25"), (2.5, "2.5"), ("", ""), (True, None), ([["a"]], None))),
+    *((bool, False, False), (bool, 1, None), (bool, "no", None)),
+    *((Path, "a", "a"), (Path, 1, None), (Path, {"a": 1}, None), (Literal["a"], 1, None)),
 ]
 
 

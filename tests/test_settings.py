@@ -125,16 +125,6 @@ def test_an_option_has_the_same_value_from_every_source(command, folder, monkeyp
             assert {name: params[name] for name in rest} == rest, (way, setting.name)
 
 
-@EVERY_COMMAND
-def test_the_environment_turns_switches_on_and_off(command, monkeypatch):
-    for setting in options_of(command):
-        for word, value in (("1", True), ("TRUE", True), ("yes", True), ("on", True), ("0", False), ("off", False)):
-            if setting.kind is bool:
-                monkeypatch.setenv(setting.variable, word)
-                assert parsed(command)[setting.parameter] is value
-                monkeypatch.delenv(setting.variable)
-
-
 def test_the_strongest_source_wins(folder, monkeypatch):
     def value(*words: str) -> Any:
         return parsed("track", *words)["max_age_s"]
@@ -282,28 +272,29 @@ class TestFiles:
     """A file that is missing, damaged or hostile is refused in one line."""
 
     CASES = {
-        "nested deeply": b"[track]\nmax-age-s = " + b"[" * 5000 + b"]" * 5000,
-        "a number of 5000 digits": b"[track]\nmax-age-frames = " + b"9" * 5000,
-        "a number of 4000 digits": b"[track]\nmax-age-s = 1" + b"0" * 4000,
-        "no UTF-8": b"[track]\ncost = '\xff'",
-        "no TOML": b"[track\n",
-        "a command that is none": b"[trak]\nmin-iou = 1",
-        "an option without a command": b"min-iou = 1",
-        "a value instead of a table": b"track = 1",
-        "a name with a line end": b'[track]\n"a\\nb\\u001b[2J" = 1',
-        "a value with a line end": b'[track]\ncost = "a\\nb\\u001b[2J"',
-        "a value of many": b"[track]\nmax-age-s = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15]",
-        "bytes of nothing": b"\0" * 100,
+        b"[track]\nmax-age-s = " + b"[" * 5000 + b"]" * 5000: "is not valid TOML: it is nested too deeply",
+        b"[track]\nmax-age-frames = " + b"9" * 5000: "is not valid TOML: Exceeds the limit",
+        b"[track]\nmax-age-s = 1" + b"0" * 4000: "[track] max-age-s is too large a number for TOML",
+        b"[track]\ncost = '\xff'": "is not valid TOML: 'utf-8' codec can't decode",
+        b"[track\n": "is not valid TOML: Expected ']'",
+        b"[trak]\nmin-iou = 1": "there is no command trak; did you mean track?",
+        b"min-iou = 1": "there is no command min-iou",
+        b"track = 1": "track is a command; write its options below [track]",
+        b'[track]\n"a\\nb\\u001b[2J" = 1': r"track has no option a\nb\x1b[2J",
+        b'[track]\ncost = "a\\nb\\u001b[2J"': r'track has no option cost; write set = ["cost=a\nb\x1b[2J"]',
+        b"[track]\nmax-age-s = [1, 2, 3, 4, 5, 6, 7]": "[track] max-age-s needs a number, not [1, 2, 3, 4, 5, 6, ...]",
+        b"[track]\nmin-iou = true": "[track] min-iou needs a number, not True",
+        b"\0" * 100: "is not valid TOML: Invalid statement",
     }
 
     @pytest.mark.parametrize("place", ["working folder", "config folder", "--config"])
-    @pytest.mark.parametrize("data", CASES.values(), ids=CASES)
-    def test_a_file_that_is_not_toml_is_refused(self, data, place, folder):
+    def test_a_file_that_is_not_toml_is_refused(self, place, folder):
         path = {"working folder": folder / "mcaptrack.toml", "config folder": user_file()}.get(place, folder / "a.toml")
-        put(path, "").write_bytes(data)
-        words = refused("track", "x.mcap", *(["--config", str(path)] if place == "--config" else []))
-        assert path.name in words
-        assert len(words) < 500
+        for data, said in self.CASES.items():
+            put(path, "").write_bytes(data)
+            words = refused("track", "x.mcap", *(["--config", str(path)] if place == "--config" else []))
+            assert re.fullmatch(rf"mcaptrack: \S*{path.name}:? {re.escape(said)}.*\n", words)
+            assert len(words) < 500
 
     def test_a_file_that_is_too_large_is_not_read(self, folder):
         path = folder / "mcaptrack.toml"
@@ -333,16 +324,6 @@ class TestFiles:
 
     def test_a_named_file_has_to_exist(self):
         assert "there is no such file" in refused("track", "x.mcap", "--config", "none.toml")
-
-    @EVERY_COMMAND
-    def test_a_value_of_the_wrong_type_is_refused(self, command, folder):
-        for setting in options_of(command):
-            wrong = {bool: ['"no"', "1"], int: ['"1"', "1.5", "true"], float: ['"1"', "true", "1979-05-27"]}
-            wrong |= {Path: ["1", "true", "{a = 1}"], str: ["true", "[[1]]", "1979-05-27"]}
-            for value in wrong.get(setting.kind, ["1", "true"]):
-                path = put(folder / "a.toml", f"[{command}]\n{setting.name} = {value}\n")
-                words = refused(command, *ARGUMENTS.get(command, ["x.mcap"]), "--config", str(path))
-                assert f"[{command}] {setting.name} needs " in words
 
     @EVERY_COMMAND
     def test_a_variable_of_the_wrong_type_is_refused(self, command, monkeypatch):
