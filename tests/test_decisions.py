@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from mcaptrack import log
 from mcaptrack.evaluation.events import lifecycle_of
+from mcaptrack.geometry.arrays import taken
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import linking as join_steps
@@ -99,7 +100,7 @@ def test_joins_and_cuts_equal_the_reference(seed):
     )
     pieces, wanted_cuts = cut(SLOW, paths, ids, 0.5)
     order = rng.permutation(len(step))
-    made, cuts = cut_joins(MODEL, assigned(step, track, source, xy).take(order), 0.5)
+    made, cuts = cut_joins(MODEL, taken(assigned(step, track, source, xy), order), 0.5)
     names = zip(track[order].tolist(), step[order].tolist(), strict=True)
     assert made.track.tolist() == [pieces[name][at] for name, at in names]
     np.testing.assert_allclose(np.column_stack(cuts), np.array(wanted_cuts).reshape(-1, 3), rtol=1e-6, atol=1e-9)

@@ -8,6 +8,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
@@ -398,7 +399,7 @@ def test_rows_between_samples_are_interpolated(seed: int, part_rows: int, monkey
     between = scene.track_rows.between(scene.samples.column("x_m"))
     order = np.lexsort((scene.track_rows.track, scene.track_rows.step))
     np.testing.assert_allclose(between[order], [one["x_m"] for step in sorted(wanted) for one in wanted[step]])
-    some = scene.track_rows.take(slice(2, 6))
+    some = taken(scene.track_rows, slice(2, 6))
     for part, whole in zip(some, scene.track_rows, strict=True):
         assert part.tolist() == whole[2:6].tolist()
     is_sample = scene.track_rows.is_sample[order].tolist()

@@ -61,7 +61,7 @@ class Printed:
 class Called(Generic[T]):
     """A command that calls its function: how options become arguments, and how it prints what this returns.
 
-    ``given`` has the options of the call. Subclasses override what differs.
+    ``values`` are the options of the call, by name. Subclasses override what differs.
     """
 
     #: A class with the options that the function has no use for, as attributes.
@@ -70,7 +70,7 @@ class Called(Generic[T]):
     most_used: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
-        self.name, self.given = name, values
+        self.name, self.values = name, values
 
     @classmethod
     def declaration(cls, name: str) -> Callable[..., T]:
@@ -97,11 +97,11 @@ class Called(Generic[T]):
         names = {option.name: option.name for option in options_of(declared)}
         placed = arguments_of(declared).items()
         names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
-        return command(name, declared, lambda given: cls(name, given).run(names), cls.options(), cls.most_used)
+        return command(name, declared, lambda values: cls(name, values).run(names), cls.options(), cls.most_used)
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function; ``names`` has the name on the command line of each."""
-        return {parameter: self.given[name] for parameter, name in names.items()}
+        return {parameter: self.values[name] for parameter, name in names.items()}
 
     def data(self, done: T) -> dict[str, Any]:
         """Return a result as values of JSON."""
@@ -125,7 +125,7 @@ class Once(Called[T]):
 
     def run(self, names: Mapping[str, str]) -> None:
         """Call the function with its ``arguments``, and print what it returns."""
-        with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
+        with common.Talk(self.values["quiet"], self.values["verbose"]).open() as talk:
             arguments = self.arguments(names)
             with stdout_to_stderr():
                 done = common.with_progress(self.function, talk.progress)(**arguments)
@@ -135,7 +135,7 @@ class Once(Called[T]):
 
     def print_result(self, done: T, talk: common.Talk) -> None:
         """Print the result: for people, or as JSON."""
-        if self.given["json"]:
+        if self.values["json"]:
             common.print_json(self.data(done))
         else:
             self.show(done, talk)

@@ -24,7 +24,7 @@ class Demo(Once["DemoResult"]):
 
     def data(self, done: DemoResult) -> dict[str, Any]:
         """Return the scores as values of JSON."""
-        return {"scene": self.given["scene"], "seed": self.given["seed"], "results": done.scores.rows()}
+        return {"scene": self.values["scene"], "seed": self.values["seed"], "results": done.scores.rows()}
 
     def show(self, done: DemoResult, talk: common.Talk) -> None:
         """Print the scores, the files, and commands to try next."""
@@ -32,7 +32,7 @@ class Demo(Once["DemoResult"]):
         show(
             *_side_by_side(sort, retracked, "tracker" if done.truth.suffix == ".csv" else "SORT"),
             "",
-            *_over_seeds(self.given["scene"], self.given["seed"]),
+            *_over_seeds(self.values["scene"], self.values["seed"]),
             "",
             f"video    {done.video}",
             f"log      {done.log}",

@@ -74,20 +74,20 @@ class Docs(Once[Pages]):
 
     def print_result(self, done: Pages, talk: common.Talk) -> None:
         """Print the list, or the page."""
-        with common.printed_to(self.given["output"], self.given["force"]):
+        with common.printed_to(self.values["output"], self.values["force"]):
             super().print_result(done, talk)
 
     def data(self, done: Pages) -> dict[str, Any]:
         """Return the list, or the page, as values of JSON."""
         titles = [{"name": name, "title": _title(path)} for name, path in done.items()]
-        return {"pages": titles} if self.given["page"] is None else {**titles[0], "text": _text(done)}
+        return {"pages": titles} if self.values["page"] is None else {**titles[0], "text": _text(done)}
 
     def show(self, done: Pages, talk: common.Talk) -> None:
         """Print the list; or the page, on a terminal with its headings and tables."""
-        if self.given["page"] is None:
+        if self.values["page"] is None:
             width = max(map(len, done)) + 2
             show(*(f"{name:<{width}}{_title(path)}" for name, path in done.items()))
-        elif self.given["output"] is None and sys.stdout.isatty():
+        elif self.values["output"] is None and sys.stdout.isatty():
             from rich.markdown import Markdown
 
             console().print(Markdown(_text(done)))

@@ -22,8 +22,8 @@ class Doctor(Once["DoctorResult"]):
 
     def show(self, done: DoctorResult, talk: common.Talk) -> None:
         """Print a line for each thing that is there, or lacking."""
-        if not self.given["quiet"]:
-            lines = list(_lines(done, self.given["verbose"]))
+        if not self.values["quiet"]:
+            lines = list(_lines(done, self.values["verbose"]))
             width = max(len(name) for name, _ in lines)
             show(*(f"{name:<{width}}  {value}" for name, value in lines))
 

@@ -69,10 +69,10 @@ class Evaluate(Once["Scores"]):
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns become files, text becomes gates."""
-        truth = self.given["truth"]
+        truth = self.values["truth"]
         return super().arguments(names) | {
-            "gate_m": _gates(self.given["gate_m"]),
-            "tracks": expand(self.given["inputs"], folders=True),
+            "gate_m": _gates(self.values["gate_m"]),
+            "tracks": expand(self.values["inputs"], folders=True),
             "truth": expand(truth) if truth else None,
         }
 
@@ -82,14 +82,14 @@ class Evaluate(Once["Scores"]):
 
     def print_result(self, done: Scores, talk: common.Talk) -> None:
         """Print the scores, or write them to a file, and draw curves."""
-        if self.given["curves"] is not None:
-            done.draw_curves(self.given["curves"], self.given["force"])
-        with common.printed_to(self.given["output"], self.given["force"]):
+        if self.values["curves"] is not None:
+            done.draw_curves(self.values["curves"], self.values["force"])
+        with common.printed_to(self.values["output"], self.values["force"]):
             super().print_result(done, talk)
 
     def show(self, done: Scores, talk: common.Talk) -> None:
         """Print a table, or rows of CSV."""
-        (_print_csv if self.given["csv"] else print_results)(done)
+        (_print_csv if self.values["csv"] else print_results)(done)
 
     def code(self, done: Scores) -> int:
         """Return the exit code, and print the scores that are below their limits."""

@@ -43,12 +43,12 @@ class Check(EachLog["LogCheck"]):
     def print_result(self, results: Sequence[LogCheck], totals: Mapping[str, Any]) -> None:
         """Print the findings in each file."""
         files = [file for checked in results for file in checked.files]
-        with common.printed_to(self.given["output"], self.given["force"]):
-            if self.given["json"]:
+        with common.printed_to(self.values["output"], self.values["force"]):
+            if self.values["json"]:
                 common.print_json({"results": [_as_json(file) for file in files], **totals})
             elif not self.many.json_lines:
                 for file in files:
-                    _print_check(file, self.given["quiet"])
+                    _print_check(file, self.values["quiet"])
 
     def code(self, results: Sequence[LogCheck]) -> int:
         """Return the exit code: 1 if there are errors."""
@@ -94,7 +94,7 @@ class Recover(EachLog["LogRecovery"]):
         """Return the damaged logs: results beside a log are saved by themselves, logs that were saved are left out."""
         from mcaptrack.fleet import find_logs
 
-        return find_logs(self.given["logs"], each=True, leave_out=_RECOVERED)
+        return find_logs(self.values["logs"], each=True, leave_out=_RECOVERED)
 
     def suffix(self) -> str:
         """Return the end of the names of outputs."""
@@ -103,9 +103,9 @@ class Recover(EachLog["LogRecovery"]):
     def show(self, log: Location, done: LogRecovery, talk: common.Talk) -> None:
         """Print what was saved and what was lost."""
         talk.say(f"{done.output}: {done.messages} messages in {done.chunks} chunks are saved")
-        for loss in done.lost if self.given["verbose"] else done.lost[:_SHOWN]:
+        for loss in done.lost if self.values["verbose"] else done.lost[:_SHOWN]:
             talk.say(f"lost: {loss}")
-        if len(done.lost) > _SHOWN and not self.given["verbose"]:
+        if len(done.lost) > _SHOWN and not self.values["verbose"]:
             talk.say(f"lost: {len(done.lost) - _SHOWN} more; -v shows them")
         if not done.lost:
             talk.say("nothing was lost")
@@ -132,7 +132,7 @@ class Drop(EachLog["DropResult"]):
         """Return the logs: the command takes one name, since those of channels follow."""
         from mcaptrack.fleet import find_logs
 
-        return find_logs([self.given["logs"]])
+        return find_logs([self.values["logs"]])
 
     def show(self, log: Location, done: DropResult, talk: common.Talk) -> None:
         """Print what was removed."""

@@ -30,9 +30,9 @@ class Ingest(EachLog["IngestResult"]):
         """Return the inputs, each once, with the names of their logs."""
         from mcaptrack.fleet import NamedLog
 
-        sources = expand(self.given["inputs"], each=True)
-        only_one_output(sources, self.given["output"] or self.given["into"])
-        if self.given["into"] is not None and self.many.output_dir is not None:
+        sources = expand(self.values["inputs"], each=True)
+        only_one_output(sources, self.values["output"] or self.values["into"])
+        if self.values["into"] is not None and self.many.output_dir is not None:
             raise McaptrackError("--into and --output-dir are two places for the same results; give one")
         return [NamedLog(source, default_log(Path(source))) for source in dict.fromkeys(sources)]
 

@@ -148,7 +148,7 @@ class EachLog(Called[T]):
         """Return the inputs."""
         from mcaptrack.fleet import find_logs
 
-        return find_logs(self.given["logs"])
+        return find_logs(self.values["logs"])
 
     def suffix(self) -> str:
         """Return the end of the names of outputs in ``--output-dir``."""
@@ -164,7 +164,7 @@ class EachLog(Called[T]):
 
     def print_result(self, results: Sequence[T], totals: Mapping[str, Any]) -> None:
         """Print the results of all logs, with totals if there are several: as JSON."""
-        if self.given["json"]:
+        if self.values["json"]:
             common.print_json({"results": [self.data(done) for done in results], **totals})
 
     def code(self, results: Sequence[T]) -> int:
@@ -173,7 +173,7 @@ class EachLog(Called[T]):
 
     def run(self, names: Mapping[str, str]) -> None:
         """Call the function with each log and its ``arguments``, and print what it returns."""
-        with common.Talk(self.given["quiet"], self.given["verbose"]).open() as talk:
+        with common.Talk(self.values["quiet"], self.values["verbose"]).open() as talk:
             self.inputs = self.logs()
             arguments = self.arguments(names)
             results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
@@ -195,7 +195,7 @@ class EachLog(Called[T]):
             return [], {}
         if many.output_dir is not None and output is not None:
             raise McaptrackError("--output and --output-dir are two places for the same results; give one")
-        if many.json_lines and self.given["json"]:
+        if many.json_lines and self.values["json"]:
             raise McaptrackError("--json prints one object, and --json-lines one for each log; give one")
         if output is not None:
             options["output"] = output

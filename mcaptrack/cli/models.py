@@ -30,11 +30,11 @@ class Models(Once[tuple[Model, ...] | Path]):
     @property
     def function(self) -> Callable[..., tuple[Model, ...] | Path]:
         """The function: another one fetches."""
-        return mcaptrack.get_model if self.given["words"] else mcaptrack.models
+        return mcaptrack.get_model if self.values["words"] else mcaptrack.models
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: the model to fetch, if there is one, and from where."""
-        words, source = self.given["words"] or [], self.given["source"]
+        words, source = self.values["words"] or [], self.values["source"]
         if not words and source is not None:
             raise McaptrackError("--from goes with get and the name of a model")
         if words and (words[0] != "get" or len(words) != 2):
@@ -45,13 +45,13 @@ class Models(Once[tuple[Model, ...] | Path]):
     def data(self, done: tuple[Model, ...] | Path) -> dict[str, Any]:
         """Return the models, or the file that was fetched, as values of JSON."""
         if isinstance(done, Path):
-            return {"name": self.given["words"][1], "path": str(done)}
+            return {"name": self.values["words"][1], "path": str(done)}
         return {"models": [{**asdict(model), "path": _file_of(model)} for model in done]}
 
     def show(self, done: tuple[Model, ...] | Path, talk: common.Talk) -> None:
         """Print the models, or where the weights are."""
         if isinstance(done, Path):
-            talk.say(f"{done}: {command('run', 'LOG', '--detector', self.given['words'][1])} uses it")
+            talk.say(f"{done}: {command('run', 'LOG', '--detector', self.values['words'][1])} uses it")
             return
         for model in done:
             where = _file_of(model) or f"not fetched; {command('models', 'get', model.name)} fetches it"
@@ -62,7 +62,7 @@ class Models(Once[tuple[Model, ...] | Path]):
                 f"  source    {model.source}",
                 f"  file      {where}",
             )
-            if self.given["verbose"]:
+            if self.values["verbose"]:
                 show(f"  sha256    {model.sha256}", *(f"  url       {url}" for url in model.urls))
 
 

@@ -62,11 +62,11 @@ class Query(Once[Any]):
     @property
     def function(self) -> Callable[..., Any]:
         """The function: another one lists the tables."""
-        return mcaptrack.list_tables if self.given["tables"] else mcaptrack.query
+        return mcaptrack.list_tables if self.values["tables"] else mcaptrack.query
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: what the words of the command line mean."""
-        given, output = self.given, self.given["output"]
+        given, output = self.values, self.values["output"]
         paths, sql = _asked(given["words"] or [], given["file"], given["tables"])
         if given["tables"]:
             warn_unused("--tables lists what could be asked", "form", "rows")
@@ -80,14 +80,14 @@ class Query(Once[Any]):
 
     def print_result(self, done: Any, talk: common.Talk) -> None:
         """Print the answer, or write it to a file."""
-        output, json = self.given["output"], self.given["json"]
-        if self.given["tables"]:
-            with common.printed_to(output, self.given["force"]):
+        output, json = self.values["output"], self.values["json"]
+        if self.values["tables"]:
+            with common.printed_to(output, self.values["force"]):
                 _print_tables(done, json)
         elif self._form == "table":
             limit = _SHOWN if sys.stdout.isatty() and output is None else 0
-            with common.printed_to(output, self.given["force"]):
-                note = _print_answer(done, limit if self.given["rows"] is None else self.given["rows"])
+            with common.printed_to(output, self.values["force"]):
+                note = _print_answer(done, limit if self.values["rows"] is None else self.values["rows"])
             if note:
                 talk.say(note)
         else:

@@ -24,7 +24,7 @@ class Render(EachLog["RenderResult"]):
 
     def suffix(self) -> str:
         """Return the end of the names of outputs."""
-        return default_suffix(**{name: self.given[name] for name in ("compare", "heatmap", "blur", "gif")})
+        return default_suffix(**{name: self.values[name] for name in ("compare", "heatmap", "blur", "gif")})
 
     def show(self, log: Location, done: RenderResult, talk: common.Talk) -> None:
         """Print what was drawn."""
@@ -32,7 +32,7 @@ class Render(EachLog["RenderResult"]):
 
     def line(self, done: RenderResult) -> str:
         """Return what was drawn in a line."""
-        if self.given["heatmap"]:
+        if self.values["heatmap"]:
             return f"where people of {', '.join(done.views)} spend their time"
         drawn = f" with {', '.join(done.views)}" if done.views else ""
         hidden = f", people hidden in {', '.join(done.blurred)}" if done.blurred else ""

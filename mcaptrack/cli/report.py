@@ -18,7 +18,7 @@ class ReportCommand(Once["ReportResult"]):
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns and folders become logs."""
-        return super().arguments(names) | {"log": expand(self.given["logs"], folders=True)}
+        return super().arguments(names) | {"log": expand(self.values["logs"], folders=True)}
 
     def data(self, done: ReportResult) -> dict[str, Any]:
         """Return the numbers of the page."""
@@ -28,5 +28,5 @@ class ReportCommand(Once["ReportResult"]):
         """Print where the page is, and with ``--json`` its numbers."""
         count = done.data["summary"]["logs"] if "summary" in done.data else len(done.data["logs"])
         talk.say(f"{done.page}: {count} log{'s' if count > 1 else ''}, {done.size / 1e6:.2f} MB")
-        if self.given["json"]:
+        if self.values["json"]:
             common.print_json(self.data(done))

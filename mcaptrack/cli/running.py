@@ -89,7 +89,7 @@ class Run(RunsStages):
         with stdout_to_stderr():
             settings, stages = settings_of("events"), configured(chosen)
         arguments |= {s.option: stages.pop(s.name) for s in STAGES.values() if s.option in chosen}
-        if self.given["follows"]:
+        if self.values["follows"]:
             arguments["follows"] = self._in_order()
         watched = EventOptions(*(settings.get(name) for name in ("similarity", "gate_m", "min_iou")))
         return arguments | {"events": watched if arguments["events"] else False, "stages": stages}
@@ -109,7 +109,7 @@ class Run(RunsStages):
                 "it judges each log by itself, and a second run does only what is missing",
             ),
             "--output-dir": (many.output_dir, place),
-            "--output": (self.given["output"], place),
+            "--output": (self.values["output"], place),
         }
         for name, (is_given, why) in refused.items():
             if is_given:

@@ -30,13 +30,13 @@ class Info(EachLog["LogInfo"]):
 
     def run(self, names: Mapping[str, str]) -> None:
         """Run the command; what it prints goes to a file, if one is named."""
-        with common.printed_to(self.given["output"], self.given["force"]):
+        with common.printed_to(self.values["output"], self.values["force"]):
             super().run(names)
 
     def show(self, log: Location, done: LogInfo, talk: common.Talk) -> None:
         """Print the channels."""
-        if not self.given["json"]:
-            _print(done.to_json(), self.given["verbose"])
+        if not self.values["json"]:
+            _print(done.to_json(), self.values["verbose"])
 
     def data(self, done: LogInfo) -> dict[str, Any]:
         """Return the channels as values of JSON."""
@@ -51,7 +51,7 @@ class Export(EachLog["ExportResult"]):
         """Whether all logs have one output: a folder of tables."""
         from mcaptrack.tables import FORMATS
 
-        return self.given["form"] in FORMATS
+        return self.values["form"] in FORMATS
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the logs. Raises McaptrackError if two would have the same tables."""
@@ -64,14 +64,14 @@ class Export(EachLog["ExportResult"]):
 
     @property
     def _folder(self) -> Path | None:
-        folder: Path | None = self.given["output"] or self.given["output_dir"]
+        folder: Path | None = self.values["output"] or self.values["output_dir"]
         return folder
 
     def suffix(self) -> str:
         """Return the end of the names of bags and files."""
         from mcaptrack.tables.exchange import ends_with
 
-        form: str = self.given["form"]
+        form: str = self.values["form"]
         return ".rosbag2" if form.startswith("rosbag2") else ends_with(form)
 
     def show(self, log: Location, done: ExportResult, talk: common.Talk) -> None:
@@ -92,7 +92,7 @@ class Export(EachLog["ExportResult"]):
         """Print the results; bring the catalogue of several logs in one folder up to date."""
         from mcaptrack.tables.catalogue import refresh
 
-        if self._folder is not None and self.given["form"] == "parquet" and len(self.given["logs"]) > 1:
+        if self._folder is not None and self.values["form"] == "parquet" and len(self.values["logs"]) > 1:
             refresh(self._folder)
         super().print_result(results, totals)
 

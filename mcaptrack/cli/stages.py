@@ -59,17 +59,17 @@ class StageCommand(RunsStages):
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function, and make the transform, unless the boxes of a log decide which."""
         stage, owners = STAGES[self.name], _owners(self.kinds)
-        wanted = {option: self.given[option] for option in owners if self.given.get(option) is not None}
-        for option, value in values_set(self.name, self.given.get("set"), self.kinds).items():
+        wanted = {option: self.values[option] for option in owners if self.values.get(option) is not None}
+        for option, value in values_set(self.name, self.values.get("set"), self.kinds).items():
             if option in wanted and is_on_command_line(option):
                 raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
             wanted[option] = value
-        make = Maker.of(stage, self.given, wanted, owners)
+        make = Maker.of(stage, self.values, wanted, owners)
         with stdout_to_stderr():
-            self._transform = None if is_open(stage, self.given) else make()
+            self._transform = None if is_open(stage, self.values) else make()
             arguments: dict[str, Any] = {"stages": configured(), "make": make}
         where = ("topic", "to", "frame", "camera", "output", "sidecar", "force", "mode")
-        return arguments | {name: self.given[name] for name in where if name in names}
+        return arguments | {name: self.values[name] for name in where if name in names}
 
     @classmethod
     def function_of(

@@ -34,7 +34,7 @@ class Train(Once["TrainResult"]):
         """Return the arguments of the function: patterns and folders become files."""
         from mcaptrack.training.sources import SYNTHETIC
 
-        sources, validate = self.given["sources"], self.given["validate"]
+        sources, validate = self.values["sources"], self.values["validate"]
         synthetic = [SYNTHETIC] if Path(SYNTHETIC) in sources else []
         paths = expand([source for source in sources if source != Path(SYNTHETIC)])
         more = {"sources": [*synthetic, *paths], "validate": expand(validate) if validate else None}

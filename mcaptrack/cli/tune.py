@@ -42,7 +42,7 @@ class Tune(Once["TuneResult"]):
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns become files, texts become ranges."""
-        given, output = self.given, self.given["output"]
+        given, output = self.values, self.values["output"]
         read_toml(output)  # a file that can't be edited is refused before the search
         tracker = given["tracker"] if self._has_tracker else None
         tuned = (tracker or "sort").replace(":", ".") if self._has_tracker else given["stage"]
@@ -61,7 +61,7 @@ class Tune(Once["TuneResult"]):
 
     def print_result(self, done: TuneResult, talk: common.Talk) -> None:
         """Write the settings to the file, and print them with their scores."""
-        given, output, metric = self.given, self.given["output"], done.metric
+        given, output, metric = self.values, self.values["output"], done.metric
         if given["truth"]:
             warn_unused("files of detections are of no camera", "camera", "topic")
             if given["ground_plane"] is None:

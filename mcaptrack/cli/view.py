@@ -57,10 +57,10 @@ class ViewCommand(Once["LogServer"]):
         lines += [("log", "  ".join(done.logs))]
         lines += [("report", done.report)] if done.report else []
         lines += [(f"layout, {name}", address) for name, address in done.layouts.items()]
-        lines += [] if done.layouts else [("layout", f"none yet: {command('run', self.given['path'])} makes one")]
+        lines += [] if done.layouts else [("layout", f"none yet: {command('run', self.values['path'])} makes one")]
         width = max(len(name) for name, _ in lines) + 2
         show(*(f"{name:<{width}}{what}" for name, what in lines))
-        most = self.given["links"]
+        most = self.values["links"]
         for event in done.events[:most]:
             show("", f"event {event.event}, {event.topic}: {event.text}", f"  {event.link}")
         rest = len(done.events) - min(most, len(done.events))

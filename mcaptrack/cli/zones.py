@@ -26,27 +26,27 @@ class Zones(EachLog["RunResult"]):
 
     def run(self, names: Mapping[str, str]) -> None:
         """Run the command."""
-        logs = self.given["logs"]
+        logs = self.values["logs"]
         if str(logs[0]) != _DRAW or (len(logs) == 1 and Path(_DRAW).exists()):
             super().run(names)
             return
         if len(logs) == 1:
             raise McaptrackError("`zones draw` needs a log: name it after draw")
         counting = ("zones", "topic", "margin_m", "max_gap_s", "sidecar")
-        extra = {f"--{name.replace('_', '-')}": self.given[name] for name in counting}
+        extra = {f"--{name.replace('_', '-')}": self.values[name] for name in counting}
         if len(logs) > 2 or any(value is not None for value in extra.values()):
             unused = next((name for name, value in extra.items() if value is not None), f"another log ({logs[-1]})")
             raise McaptrackError(f"`zones draw` takes one log, --camera, --output and --force, not {unused}")
-        options = {name: self.given[name] for name in ("camera", "output", "force")}
+        options = {name: self.values[name] for name in ("camera", "output", "force")}
         page = mcaptrack.draw_zones(logs[1], **options)
-        if self.given["json"]:
+        if self.values["json"]:
             common.print_json({"log": str(logs[1]), "page": str(page)})
-        elif not self.given["quiet"]:
+        elif not self.values["quiet"]:
             say(f"{page}: open it in a browser, draw, and download the file for --zones")
 
     def show(self, log: Location, done: RunResult, talk: common.Talk) -> None:
         """Print the totals of zones and lines."""
-        if not self.given["json"]:
+        if not self.values["json"]:
             print_zones(done)
         where = f"results are in {done.written_to}" if done.written_to else "everything was up to date"
         where += f": {done.written_because}" if done.written_to and done.written_because else ""
