@@ -319,7 +319,7 @@ class TestCommand:
         assert result.exit_code == 0, result.output
         lines = result.stdout.splitlines()
         assert [line.split("  ")[0].strip() for line in lines[1:7:3]] == ["as they are", "with 0.2 m of noise"]
-        assert f"predict log.mcap --predictor red:{tmp_path / 'out' / 'red.safetensors'}" in result.stdout
+        assert f"predict LOG --predictor red:{tmp_path / 'out' / 'red.safetensors'}" in result.stdout
         assert load(tmp_path / "out" / "red.safetensors").card["licence"] == "that of the data it was trained on"
         assert "holds a training; --resume goes on with it, --force replaces it" in self.run(*words).stderr
         again = self.run(*words, "--resume", "--json", "-q")
