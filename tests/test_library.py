@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import collections.abc
 import dataclasses
 import doctest
 import importlib
@@ -10,11 +11,13 @@ import inspect
 import json
 import logging
 import math
+import os
 import re
 import shutil
+import types
 import warnings
 from pathlib import Path
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -390,6 +393,23 @@ class TestDocumentation:
     def test_types_of_parameters_and_results_are_there_for_those_who_ask(self, name):
         hints = get_type_hints(getattr(mcaptrack, name))
         assert hints.keys() == {*inspect.signature(getattr(mcaptrack, name)).parameters, "return"}
+
+    @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name in GROUP.commands])
+    def test_values_of_another_type_are_refused_by_the_name_of_their_parameter(self, name):
+        function = getattr(mcaptrack, name)
+        parameters = inspect.signature(function).parameters.values()
+        needed = {p.name: "a.mcap" for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD}
+        checked = {str, bool, os.PathLike, collections.abc.Sequence, collections.abc.Mapping, type(None)}
+        hints = get_type_hints(function)
+        union = (Union, types.UnionType)
+        parts = {
+            p: get_args(hint) if get_origin(hint) in union else (hint,) for p, hint in hints.items() if p != "return"
+        }
+        kinds = {p: {get_origin(kind) or kind for kind in of} for p, of in parts.items()}
+        for parameter in (p for p, of in kinds.items() if of <= checked):
+            with pytest.raises(McaptrackError, match=rf"^`{parameter}=` is .*, not 7$"):
+                function(**{**needed, parameter: 7})
+        assert [p for p in needed if kinds[p] <= checked] or not needed
 
     @pytest.mark.parametrize("name", CLASSES)
     def test_classes_document_their_attributes(self, name):

@@ -278,10 +278,10 @@ def with_dashes(text: str, flags: dict[str, str]) -> str:
 
 
 def checked(function: Callable[P, T]) -> Callable[P, T]:
-    """Check arguments before a function runs: paths, those of a ``Literal``, those with a range, and ``progress``.
+    """Check arguments before a function runs: their types, paths, choices, ranges, and ``progress``.
 
-    The function raises McaptrackError, and does nothing, if a value is an empty name of a file, none of the choices, or
-    out of the range that ``Option`` declares.
+    The function raises McaptrackError, and does nothing, if a value is of another type than text, a path, True or
+    False, where these are declared, an empty name of a file, none of the choices, or out of the range of ``Option``.
     """
     signature = inspect.signature(function)
 
@@ -296,8 +296,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
                 raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
             if choices:
                 _check_choice(name, value, choices)
-            if kinds and set(kinds) <= {str, type(None)} and not isinstance(value, tuple(kinds)):
-                raise McaptrackError(f"`{name}=` is text, not {value!r:.40}")
+            _check_type(name, value, kinds)
             if ends := _ranges(function).get(name):
                 _check_range(name, value, ends, is_whole=float not in kinds)
             if name == "progress" and not callable(value):
@@ -379,6 +378,16 @@ def _name_in_words(kind: Any) -> str:
     return {os.PathLike: "path", Callable: "callable"}.get(origin) or str(kind.__name__)
 
 
+#: What types of arguments are called in errors.
+_TYPES: Final[Mapping[Any, str]] = {
+    bool: "True or False",
+    os.PathLike: "the name of a file or folder",
+    str: "text",
+    Sequence: "several of these",
+    Mapping: "a mapping",
+}
+
+
 @cache
 def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
     """The types that each parameter may have. That of the result is left out: it may be known to type checkers only."""
@@ -408,6 +417,21 @@ def _holds_paths(kind: Any) -> bool:
 
 def _name_of(path: Any) -> Any:
     return os.fspath(path) if isinstance(path, os.PathLike) else path
+
+
+def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
+    """Raise McaptrackError for a value of another type. Types that aren't in ``_TYPES`` are not checked here."""
+    types = [get_origin(kind) or kind for kind in kinds if kind is not type(None)]
+    if not types or not set(types) <= set(_TYPES) or isinstance(value, tuple(types)):
+        return
+    if value is None and type(None) in kinds:
+        return
+    if bool in types and type(value).__name__ in ("bool", "bool_"):  # NumPy's
+        return
+    meant = " or ".join(
+        text for kind, text in _TYPES.items() if kind in types and (kind, os.PathLike in types) != (str, True)
+    )
+    raise McaptrackError(f"`{name}=` is {meant}, not {value!r:.40}")
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:

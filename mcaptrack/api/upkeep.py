@@ -243,6 +243,8 @@ def drop(
     if not names_of(topics):
         raise McaptrackError("name the channels to remove with `topics=`")
     copy = None if output is None else log_output(output, path)
+    if in_place and copy is not None:
+        raise McaptrackError("`in_place=True` and `output=` are two places for the same result; give one")
     if copy is not None:
         refuse_overwrite(copy, force)
         if is_same_file(copy, path):

@@ -56,8 +56,8 @@ def values_set(command: str, texts: Sequence[str] | None, kinds: Mapping[str, ty
     for text in texts or ():
         written, equals, value = text.partition("=")
         name = written.strip().lstrip("-").replace("-", "_")
-        if not equals:
-            refuse_usage(f"{where} needs name=value, as in --set {name}=0.5, not {text!r}")
+        if not equals or not name:
+            refuse_usage(f"{where} needs name=value, as in --set {name or 'name'}=0.5, not {text!r}")
         if name not in owners:
             hint = nearest(name, owners) or f"; there are {listed(sorted(owners))}"
             refuse_usage(f"{where} {text}: there is no parameter {name}{hint}")

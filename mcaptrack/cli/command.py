@@ -39,7 +39,7 @@ def usage_in_one_line(command: str = "") -> Iterator[None]:
         yield
     except _UsageError as error:
         error.message = _message(error)
-        text = " ".join(error.format_message().replace("Value error, ", "").rstrip(".").split())
+        text = " ".join(error.format_message().rstrip(".").split())
         if hasattr(error, "possibilities"):
             text = _unknown_option(error)
         page = f"mcaptrack {command} {ALL}" if command else "mcaptrack --help"
@@ -52,7 +52,8 @@ def _message(error: Any) -> str:
     for fault in error.__cause__.errors() if hasattr(error.__cause__, "errors") else ():
         if fault["type"] in _NOT:
             return f"{fault['input']!r} is not {_NOT[fault['type']]}"
-    return re.sub(r"Got unexpected extra argument(?:s|\(s\))? \((.*)\)", r"too many arguments: \1", str(error.message))
+    message = str(error.message).replace("Value error, ", "")
+    return re.sub(r"Got unexpected extra argument(?:s|\(s\))? \((.*)\)", r"too many arguments: \1", message)
 
 
 def _unknown_option(error: Any) -> str:
