@@ -7,6 +7,7 @@ import os
 import resource
 import shutil
 from collections.abc import Callable
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -225,8 +226,7 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize("names", PAIRS, ids=" ".join)
-@pytest.mark.parametrize("form", one_in(3, ["parquet", "csv", "jsonl", "arrow"]))
+@pytest.mark.parametrize(("names", "form"), one_in(5, product(PAIRS, ["parquet", "csv", "jsonl", "arrow"])))
 def test_tables_of_another_log_are_never_replaced_unasked(names, form, tmp_path):
     one, other = (log_of(tmp_path / name, offset) for offset, name in enumerate(names))
     folder = tmp_path / "T"
