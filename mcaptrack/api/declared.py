@@ -428,10 +428,9 @@ def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
         return
     if bool in types and type(value).__name__ in ("bool", "bool_"):  # NumPy's
         return
-    meant = " or ".join(
-        text for kind, text in _TYPES.items() if kind in types and (kind, os.PathLike in types) != (str, True)
-    )
-    raise McaptrackError(f"`{name}=` is {meant}, not {value!r:.40}")
+    is_path = os.PathLike in types  # which text is a name of, too
+    meant = [text for kind, text in _TYPES.items() if kind in types and not (is_path and kind is str)]
+    raise McaptrackError(f"`{name}=` is {' or '.join(meant)}, not {value!r:.40}")
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:

@@ -12,6 +12,7 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, fits, read_frames
+from mcaptrack.pipeline.staleness import OFF
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame
 from mcaptrack.schema.camera_motion import frames_to_path
@@ -22,7 +23,6 @@ from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.protocol import traits_of
 
 STAGE: Final = "motion"
-_OFF: Final = "off"
 
 
 class SideInputs(NamedTuple):
@@ -34,7 +34,7 @@ class SideInputs(NamedTuple):
 
 def uses_motion(transform: Transform | None) -> bool:
     """Whether a transform takes camera motion into account where it is known."""
-    return getattr(transform, "camera_motion", _OFF) != _OFF
+    return getattr(transform, "camera_motion", OFF) != OFF
 
 
 def is_motion_wanted(opened: log.Log, transform: Transform, boxes: str, jobs: Sequence[Job]) -> bool:

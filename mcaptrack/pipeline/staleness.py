@@ -17,7 +17,8 @@ from mcaptrack.sources.cameras import camera_at, chain_of, is_plane, name_above,
 from mcaptrack.sources.corrections import CORRECTED, corrections_of
 from mcaptrack.transforms import STAGES
 
-_OFF: Final = "off"
+#: The value of ``camera_motion`` that takes no motion into account.
+OFF: Final = "off"
 #: Of more ground planes than this, a channel holds the digest.
 _MOST_RECORDED: Final = 100
 #: The stage that takes corrections over.
@@ -61,10 +62,10 @@ def is_motion_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     topic = motion_topic(camera_at(opened, prefix).prefix)
     if topic not in opened.channels or topic in provenance.references:
         return False
-    usual = _OFF
+    usual = OFF
     if provenance.transform in STAGES and "transform" not in provenance.plugins:
-        usual = getattr(STAGES[provenance.transform].default, "camera_motion", _OFF)
-    return bool(provenance.parameters.get("camera_motion", usual) != _OFF)
+        usual = getattr(STAGES[provenance.transform].default, "camera_motion", OFF)
+    return bool(provenance.parameters.get("camera_motion", usual) != OFF)
 
 
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:
