@@ -276,6 +276,20 @@ class Log:
         self.results = results
         self.channels |= results.channels
 
+    @contextmanager
+    def overlaid(self, overlay: Log) -> Iterator[None]:
+        """Read the channels of another log as if they were in this one, within a block."""
+        holder, channels = self.parts[-1], [dict(part.channels) for part in self.parts]
+        holder.results = overlay
+        for part in self.parts[:-1]:
+            part.channels |= overlay.channels
+        try:
+            yield
+        finally:
+            holder.results = None
+            for part, before in zip(self.parts, channels, strict=True):
+                part.channels = before
+
     def __enter__(self) -> Self:
         return self
 
@@ -337,7 +351,7 @@ class Log:
     @property
     def parts(self) -> tuple[Log, ...]:
         """The log itself, and its sidecar if it has one."""
-        return (self,) if self.results is None else (self, self.results)
+        return (self,) if self.results is None else (self, *self.results.parts)
 
     @property
     def size(self) -> int:
@@ -351,7 +365,7 @@ class Log:
 
     def part(self, topic: str) -> Log:
         """The part (log or sidecar) that holds a topic."""
-        return self.results if self.results is not None and topic in self.results.channels else self
+        return self.results.part(topic) if self.results is not None and topic in self.results.channels else self
 
     @property
     def start_ns(self) -> int:
