@@ -23,6 +23,7 @@ from tests.commands import done
 from tests.logs import write_channels
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
+runner = importlib.import_module("mcaptrack.pipeline.runner")
 steps = importlib.import_module("mcaptrack.pipeline.steps")
 
 
@@ -134,10 +135,10 @@ def test_empty_results_are_explained_by_the_input_or_the_transform():
         ([none, some], "no samples of /camera/tracks: "),
     ):
         with notices.collected() as said:
-            run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
+            runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
         assert [one.message.startswith(words) for one in said] == [True]
     with notices.collected() as said:
-        run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
+        runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
     assert said == []
 
 

@@ -200,7 +200,7 @@ def show_log(
     progress: Progress,
 ) -> Player:
     """Return a player, or a still of a time, of an open log. See ``Recording.show``."""
-    with warnings_about(opened.path) as warnings:
+    with warnings_about(opened.path) as warnings, pipeline.with_views(opened) as (opened, _):
         source = PictureSource(opened, pipeline.find_camera(opened, camera), topics)
         if at_s is None:
             shown = _player(opened, source, choice, max_mb, progress)

@@ -99,7 +99,6 @@ def motion(
     camera: Camera = None,
     output: Output = None,
     sidecar: Sidecar = None,
-    views: Views = False,
     force: Force = False,
     stages: Stages = None,
     progress: Reports = no_progress,
@@ -142,7 +141,7 @@ def motion(
     from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("motion", transform, options)
-    return run_stage("motion", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
+    return run_stage("motion", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
 @declared(most_used=("tracker", "max_age_s", "min_hits_s", "min_iou", "min_score", "output", "topic", "to", "force"))

@@ -271,24 +271,13 @@ class Log:
             self.channels[topic] = first._replace(messages=sum(channel.messages for channel in those))
 
     def attach_results(self, results: Log, is_new: bool) -> None:
-        """Add the channels of a sidecar, which takes new channels from now on."""
+        """Add the channels of a sidecar, which takes new channels from now on; to a log that has one, of a further log."""
         results.is_new = is_new
-        self.results = results
+        if self.results is None:
+            self.results = results
+        else:
+            self.results.attach_results(results, is_new)
         self.channels |= results.channels
-
-    @contextmanager
-    def overlaid(self, overlay: Log) -> Iterator[None]:
-        """Read the channels of another log as if they were in this one, within a block."""
-        holder, channels = self.parts[-1], [dict(part.channels) for part in self.parts]
-        holder.results = overlay
-        for part in self.parts[:-1]:
-            part.channels |= overlay.channels
-        try:
-            yield
-        finally:
-            holder.results = None
-            for part, before in zip(self.parts, channels, strict=True):
-                part.channels = before
 
     def __enter__(self) -> Self:
         return self

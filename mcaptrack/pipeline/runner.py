@@ -198,7 +198,7 @@ def warn_findings(
 
 
 class Finish(Protocol):
-    """What a run does at its end with what it made, such as finding events: ``name`` stands in reports."""
+    """A step at the end of a run with what it made, such as finding events; ``name`` stands in reports."""
 
     name: ClassVar[str]
 

@@ -1,4 +1,4 @@
-"""What is done around a transform: steps before it, inputs beside its main one, and steps after it.
+"""Steps before and after a transform, and its inputs beside the main one.
 
 A stage declares its steps (``Stage.before``, ``Stage.after``) and channels that it reads beside its main one
 (``Stage.also_reads``); a transform declares what else it takes from the log, as fields made with ``context()``. The
@@ -359,7 +359,7 @@ def _on_pictures(work: Work) -> None:
 
 
 def _without_unseen(work: Work) -> None:
-    """Leave out rows of people outside of the picture whom nobody detected."""
+    """Leave out rows outside of the picture without a detection."""
     opened, prefix, _ = work.state
     if not traits_of(work.transform).keeps_unseen:
         work.outputs |= without_unseen(work.outputs, lambda: picture_size(opened, camera_at(opened, prefix).pictures))

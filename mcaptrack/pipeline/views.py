@@ -39,7 +39,7 @@ from mcaptrack.pipeline.drawing import (
 from mcaptrack.pipeline.motion import path_with
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock, scene_on_pictures
 from mcaptrack.pipeline.staleness import digest_of, read_planes
-from mcaptrack.pipeline.write import LAYOUTS, RunState, Views, add_views, attachment_of, write_by_time
+from mcaptrack.pipeline.write import RunState, Views, add_views, write_by_time
 from mcaptrack.schema import (
     COUNTS,
     DETECTIONS,
@@ -89,7 +89,7 @@ def make_views(
     gone: Collection[str] = (),
     is_written: bool = False,
 ) -> Views | None:
-    """Draw the channels of a camera whose views are due, and make its layouts.
+    """Draw the channels of a camera with a view that is due, and make its layouts.
 
     Parameters
     ----------
@@ -171,11 +171,11 @@ def make_views(
     return drawn._replace(layouts=layouts.make(channels))
 
 
-# The channels whose views are due.
+# Channels with views that are due.
 
 
 def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw]:
-    """Return the channels that get views, by topic: those of this run, and others of the camera whose views are due."""
+    """Return the channels that get views, by topic: those of this run, and others with a view that is due."""
     opened, _, results = state
     shown = {
         topic: ChannelToDraw(
@@ -332,14 +332,14 @@ def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Fram
 
 
 @contextmanager
-def with_views(opened: log.Log) -> Iterator[dict[str, bytes]]:
-    """Add the views that are due to an open log, from a temporary file; yield the layouts for all of it, by name.
+def with_views(opened: log.Log) -> Iterator[tuple[log.Log, dict[str, bytes]]]:
+    """Yield a log with the views that are due, which are in a temporary file, and the layouts for all of it, by name.
 
-    The log itself stays as it is. It yields nothing if no view is due.
+    It yields the log itself, and no layouts, if no view is due. The log on the disk stays as it is.
     """
     due = [camera for camera in cameras(opened) if channels_to_draw(RunState(opened, camera.prefix, {}), camera)]
     if not due:
-        yield {}
+        yield opened, {}
         return
     made_layouts: dict[str, bytes] = {}
     with TemporaryDirectory(prefix="mcaptrack-views-") as folder:
@@ -347,16 +347,10 @@ def with_views(opened: log.Log) -> Iterator[dict[str, bytes]]:
         with log.create(path) as writer:
             streams = []
             for camera in due:
-                state = RunState(opened, camera.prefix, {})
-                if drawn := make_views(state, read_planes(opened, camera.prefix) or ()):
+                if drawn := make_views(RunState(opened, camera.prefix, {}), read_planes(opened, camera.prefix) or ()):
                     made_layouts |= drawn.layouts
                     streams += add_views(writer, (*drawn.first, *drawn.last), PROTOBUF)
             write_by_time(writer, streams)
-        with log.read(path) as overlay, opened.overlaid(overlay):
-            yield made_layouts
-
-
-def layouts_of(opened: log.Log) -> dict[str, bytes]:
-    """Return the layouts that a log keeps, by name."""
-    kept = {name: opened.attachment(attachment_of(name)) for name in LAYOUTS}
-    return {name: content for name, content in kept.items() if content is not None}
+        with log.read(opened.path) as complete:
+            complete.attach_results(log.read(path), is_new=False)
+            yield complete, made_layouts
