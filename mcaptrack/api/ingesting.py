@@ -27,7 +27,7 @@ from mcaptrack.api.options import (
 from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import sibling
-from mcaptrack.notices import Notice, warn
+from mcaptrack.notices import Notice
 
 if TYPE_CHECKING:
     from mcaptrack.sources.ingest import IngestReport
@@ -232,13 +232,13 @@ def ingest(
 
     """
     from mcaptrack import log as logs
-    from mcaptrack.api.common import as_path, log_output, optional_path, paths_of, warn_unused, warnings_about
+    from mcaptrack.api.common import as_path, log_output, optional_path, paths_of, warnings_about
     from mcaptrack.files import is_same_file, refuse_overwrite
     from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
     from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
     from mcaptrack.sources.ingest.labels.content import WantedClasses
-    from mcaptrack.sources.ingest.labels.delimited import check_keys, parse_columns
+    from mcaptrack.sources.ingest.labels.delimited import parse_columns
     from mcaptrack.sources.ingest.sidecar import SidecarChoice
 
     if into is not None and output is not None:
@@ -254,7 +254,7 @@ def ingest(
         quality=quality,
         keyframe_interval_s=keyframe_interval_s,
         ground_plane=optional_path(ground_plane),
-        calibration=() if calibration is None else tuple(paths_of(calibration)),
+        calibration=tuple(paths_of(calibration)),
         calibration_name=calibration_name,
         calibration_unit=calibration_unit,
         point=point,
@@ -264,13 +264,12 @@ def ingest(
         frames=frames,
         role=role,
         motion=optional_path(motion),
-        columns=parse_columns(columns) if isinstance(columns, str) else check_keys(columns) if columns else None,
+        columns=parse_columns(columns) if columns else None,
         size=parse_size(size),
         classes=None if classes is None else WantedClasses(classes),
         frame_id=frame,
         scene=scene,
     )
-    changes = None
     with warnings_about(path) as warnings:
         if into is None:
             target = default_log(path) if output is None else log_output(output, path)
@@ -282,28 +281,11 @@ def ingest(
                 opened.lock()
                 report = make_log(path, target, options, into=opened, force=force, progress=progress)
                 written_to = opened.parts[-1].path
-            changes = _changes(target, report) if role == "corrections" else None
             if place.why:
                 report.remarks.append(place.words(written_to))
             if written_to == target:
                 update_metadata(target)
-        for lost in report.lost:
-            warn(f"lost: {lost}", "lost")
-        warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)
-        warn_unused("there is no label file", columns=columns is not None and not report.has_labels)
-        warn_unused("no label file is of a detector's format", size=size is not None and not report.uses_size)
-        is_unused = classes is not None and not report.uses_classes
-        warn_unused("there are no tracks and no ground truth", classes=is_unused)
-        without_3d = not report.holds_boxes_3d
-        warn_unused("there are no 3D boxes", frame=frame is not None and without_3d)
-        warn_unused("there are no tables of nuScenes", scene=scene is not None and without_3d)
-        is_calibrated = bool(options.calibration) or any(topic.endswith("/calibration") for topic in report.messages)
-        without_plane = ground_plane is None and not is_calibrated
-        warn_unused("there is no ground plane", point=point != "foot" and without_plane)
-        about = {"calibration_name": calibration_name is not None, "calibration_unit": calibration_unit != "auto"}
-        warn_unused("there is no calibration", **{} if is_calibrated else about)
-        keep = "the channels of a recording keep their names"
-        warn_unused(keep, camera=camera != "camera" and not report.uses_camera)
+        changes = _changes(target, report) if role == "corrections" else None
     return IngestResult(
         log=target,
         messages=report.messages,
