@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperOption
 
 from mcaptrack.api.declared import Parameter
 from mcaptrack.cli.flags import RUNNING
@@ -181,7 +181,7 @@ class Command(TyperCommand):
         with usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         for option in self.params:
-            if option.param_type_name == "option" and not option.multiple and not option.is_flag:
+            if isinstance(option, TyperOption) and not option.multiple and not option.is_flag:
                 _refuse_several(args_before, option.opts)
         return left
 
