@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,6 +23,7 @@ from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.location import Location
 from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace, read_named_frames
+from mcaptrack.pipeline.choice_of_cameras import split_by_lack
 from mcaptrack.pipeline.rebuild import fuser_of, plugins_of
 from mcaptrack.pipeline.runner import Report, outdated_by
 from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
@@ -403,9 +405,7 @@ def _able(opened: log.Log, names: Sequence[str], scene: str) -> tuple[list[Camer
     """Return the cameras that can be fused, of these or of all, and why others can't be, by name."""
     scenes = {scene, *scenes_of(opened)}
     ours = [camera for camera in cameras(opened) if camera.prefix not in scenes]
-    wanted = cameras_named(opened, names, ours) if names else ours
-    lacks = {camera.prefix[1:]: why for camera in wanted if (why := _lack(opened, camera))}
-    return [camera for camera in wanted if camera.prefix[1:] not in lacks], lacks
+    return split_by_lack(cameras_named(opened, names, ours) if names else ours, partial(_lack, opened))
 
 
 def _topics(prefix: str) -> dict[str, Schema]:
