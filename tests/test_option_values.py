@@ -187,6 +187,15 @@ OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recov
 FIRST = {"drop": ["x.mcap", "/a"], "demo": [], "query": ["x.mcap", "select 1"]}
 
 
+@pytest.mark.parametrize("twice", [["-o", "a.html", "-ob.html"], ["--output=a.html", "-o", "b.html"]])
+def test_an_option_of_one_value_is_not_given_two(folder, twice):
+    outcome = call("report", "x.mcap", *twice)
+    assert (outcome.code, "--output is given as a.html and as b.html; give one" in outcome.err) == (2, True), (
+        outcome.err
+    )
+    assert "can't be" in call("report", "x.mcap", "-o", "a.html", "-o", "a.html", "--", "-ob.html").err
+
+
 def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_are_there(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("b.mcap", "a.mcap", "a.results.mcap", "other.results.mcap", "deep/er/c.mcap", "d[1].mcap"):

@@ -470,6 +470,8 @@ def test_the_page_stands_beside_the_log_which_it_never_replaces(finished, tmp_pa
     code, _, err = call("report", path, "-o", path, "--force")
     assert code == 1
     assert "is a log" in err
+    code, _, err = call("report", path, "-o", tmp_path / "walk.pdf")
+    assert (code, "walk.pdf: the page is written as HTML" in err) == (1, True)
     assert path.read_bytes() == before
 
 

@@ -62,8 +62,8 @@ def log_location(path: PathLike) -> Location:
     return location
 
 
-def paths_of(paths: PathLike | Sequence[PathLike]) -> list[Path]:
-    """Return one path, or several, as a list."""
+def paths_of(paths: PathLike | Sequence[PathLike] | None) -> list[Path]:
+    """Return one path, several, or none, as a list."""
     return [as_path(path) for path in _each(paths)]
 
 
@@ -72,7 +72,9 @@ def locations_of(paths: PathLike | Sequence[PathLike]) -> list[Location]:
     return [as_location(path) for path in _each(paths)]
 
 
-def _each(paths: PathLike | Sequence[PathLike]) -> Iterable[PathLike]:
+def _each(paths: PathLike | Sequence[PathLike] | None) -> Iterable[PathLike]:
+    if paths is None:
+        return ()
     is_several = isinstance(paths, Iterable) and not isinstance(paths, str | bytes | os.PathLike)
     return paths if is_several else [paths]  # type: ignore[list-item,return-value]  # one of the two
 
@@ -109,10 +111,10 @@ def clock_offsets(seconds_by_camera: Mapping[str, float] | None) -> dict[str, fl
     return offsets
 
 
-def log_output(path: PathLike, source: Location) -> Path:
+def log_output(path: PathLike, source: Location | None = None) -> Path:
     """Return the path of a log to write, made from ``source``.
 
-    Raises McaptrackError for a name that does not end with .mcap. Callers check whether it is ``source`` itself.
+    Raises McaptrackError for a name that does not end with .mcap, and for ``source`` itself.
     """
     target = as_path(path)
     if target.is_dir():
@@ -120,7 +122,9 @@ def log_output(path: PathLike, source: Location) -> Path:
 
         refuse_non_mcap(target)
         raise McaptrackError(f"{target} is a folder; give the name of a file")
-    if target.suffix.lower() != ".mcap" and not is_same_file(target, source):
+    if source is not None and is_same_file(target, source):
+        raise McaptrackError(f"{source} is both input and output; give another name with `output=`, or leave it out")
+    if target.suffix.lower() != ".mcap":
         raise McaptrackError(f"{target} is not a name for a log: logs are MCAP files; give a name that ends with .mcap")
     return target
 

@@ -225,21 +225,18 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
     Python takes more than a command line can say: of ``str | Sequence[str]`` an option takes several texts, of
     ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path, of ``Mapping[str, float]`` texts such as a=1.
     """
-    parts = _parts(hint)
-    if any(get_origin(part) is Mapping for part in parts) and str not in parts:
+    members: dict[Any, list[Any]] = {}  # those of all parts of a kind together, such as all choices
+    for part in _parts(hint):
+        members.setdefault(get_origin(part) or part, []).extend(get_args(part))
+    if Mapping in members and str not in members:
         return str, True
-    several = [get_args(part)[0] for part in parts if get_origin(part) is Sequence]
-    if several:
-        return on_command_line(several[0])[0], True
-    if any(get_origin(part) is os.PathLike for part in parts):
+    if Sequence in members:
+        return on_command_line(members[Sequence][0])[0], True
+    if os.PathLike in members:
         return Path, False
-    kind = next((part for part in parts if get_origin(part) is Literal), None)
-    if kind is not None:
-        names = tuple(name for part in parts if get_origin(part) is Literal for name in get_args(part))
-        return Literal[names], False
-    return next(
-        kind for kind in (str, bool, int, float) if kind in parts and (kind is not int or float not in parts)
-    ), False
+    if Literal in members:
+        return Literal[tuple(members[Literal])], False
+    return next(kind for kind in (str, bool, float, int) if kind in members), False
 
 
 def _parts(hint: Any) -> list[Any]:
@@ -421,10 +418,8 @@ def _name_of(path: Any) -> Any:
 
 def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
     """Raise McaptrackError for a value of another type. Types that aren't in ``_TYPES`` are not checked here."""
-    types = [get_origin(kind) or kind for kind in kinds if kind is not type(None)]
-    if not types or not set(types) <= set(_TYPES) or isinstance(value, tuple(types)):
-        return
-    if value is None and type(None) in kinds:
+    types = {get_origin(kind) or kind for kind in kinds}
+    if not types & {*_TYPES} or not types <= {*_TYPES, type(None)} or isinstance(value, tuple(types)):
         return
     if bool in types and type(value).__name__ in ("bool", "bool_"):  # NumPy's
         return

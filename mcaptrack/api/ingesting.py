@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import datetime as dt
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -27,7 +28,7 @@ from mcaptrack.api.options import (
 from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import sibling
-from mcaptrack.notices import Notice, warn
+from mcaptrack.notices import Notice
 
 if TYPE_CHECKING:
     from mcaptrack.sources.ingest import IngestReport
@@ -83,7 +84,24 @@ class IngestResult:
     warnings: tuple[Notice, ...]
     has_labels: bool
     uses_camera: bool
-    changes: Mapping[str, Any] | None = None
+    changes: Mapping[str, Any] | None
+
+    @classmethod
+    def of(
+        cls, log: Path, report: IngestReport, warnings: Iterable[Notice], changes: Mapping[str, Any] | None
+    ) -> IngestResult:
+        """The result of making ``log``."""
+        return cls(
+            log=log,
+            messages=report.messages,
+            notes=tuple(report.remarks),
+            details=tuple(report.notes),
+            lost=tuple(report.lost),
+            warnings=tuple(dict.fromkeys(warnings)),
+            has_labels=report.has_labels,
+            uses_camera=report.uses_camera,
+            changes=changes,
+        )
 
 
 @declared(
@@ -231,15 +249,12 @@ def ingest(
     ['/camera/ground_plane', '/camera/truth', '/camera/video']
 
     """
-    from mcaptrack import log as logs
-    from mcaptrack.api.common import as_path, log_output, optional_path, paths_of, warn_unused, warnings_about
+    from mcaptrack.api.common import as_path, log_output, optional_path, paths_of, warnings_about
     from mcaptrack.files import is_same_file, refuse_overwrite
     from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
-    from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
     from mcaptrack.sources.ingest.labels.content import WantedClasses
-    from mcaptrack.sources.ingest.labels.delimited import check_keys, parse_columns
-    from mcaptrack.sources.ingest.sidecar import SidecarChoice
+    from mcaptrack.sources.ingest.labels.delimited import parse_columns
 
     if into is not None and output is not None:
         raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
@@ -254,7 +269,7 @@ def ingest(
         quality=quality,
         keyframe_interval_s=keyframe_interval_s,
         ground_plane=optional_path(ground_plane),
-        calibration=() if calibration is None else tuple(paths_of(calibration)),
+        calibration=tuple(paths_of(calibration)),
         calibration_name=calibration_name,
         calibration_unit=calibration_unit,
         point=point,
@@ -264,57 +279,41 @@ def ingest(
         frames=frames,
         role=role,
         motion=optional_path(motion),
-        columns=parse_columns(columns) if isinstance(columns, str) else check_keys(columns) if columns else None,
+        columns=parse_columns(columns) if columns else None,
         size=parse_size(size),
         classes=None if classes is None else WantedClasses(classes),
         frame_id=frame,
         scene=scene,
     )
-    changes = None
+    make = partial(make_log, path, options=options, progress=progress)
     with warnings_about(path) as warnings:
         if into is None:
             target = default_log(path) if output is None else log_output(output, path)
             refuse_overwrite(target, force or is_same_file(target, path))
-            report = make_log(path, target, options, progress=progress)
+            report = make(target)
         else:
-            target, place = as_path(into), SidecarChoice(sidecar)
-            with logs.read(target, sidecar=place) as opened:
-                opened.lock()
-                report = make_log(path, target, options, into=opened, force=force, progress=progress)
-                written_to = opened.parts[-1].path
-            changes = _changes(target, report) if role == "corrections" else None
-            if place.why:
-                report.remarks.append(place.words(written_to))
-            if written_to == target:
-                update_metadata(target)
-        for lost in report.lost:
-            warn(f"lost: {lost}", "lost")
-        warn_unused("there is no label file", label_format=label_format != "auto" and not report.has_labels)
-        warn_unused("there is no label file", columns=columns is not None and not report.has_labels)
-        warn_unused("no label file is of a detector's format", size=size is not None and not report.uses_size)
-        is_unused = classes is not None and not report.uses_classes
-        warn_unused("there are no tracks and no ground truth", classes=is_unused)
-        without_3d = not report.holds_boxes_3d
-        warn_unused("there are no 3D boxes", frame=frame is not None and without_3d)
-        warn_unused("there are no tables of nuScenes", scene=scene is not None and without_3d)
-        is_calibrated = bool(options.calibration) or any(topic.endswith("/calibration") for topic in report.messages)
-        without_plane = ground_plane is None and not is_calibrated
-        warn_unused("there is no ground plane", point=point != "foot" and without_plane)
-        about = {"calibration_name": calibration_name is not None, "calibration_unit": calibration_unit != "auto"}
-        warn_unused("there is no calibration", **{} if is_calibrated else about)
-        keep = "the channels of a recording keep their names"
-        warn_unused(keep, camera=camera != "camera" and not report.uses_camera)
-    return IngestResult(
-        log=target,
-        messages=report.messages,
-        notes=tuple(report.remarks),
-        details=tuple(report.notes),
-        lost=tuple(report.lost),
-        warnings=tuple(dict.fromkeys(warnings)),
-        has_labels=report.has_labels,
-        uses_camera=report.uses_camera,
-        changes=changes,
-    )
+            target = as_path(into)
+            report = _add_to(target, sidecar, partial(make, force=force))
+        changes = _changes(target, report) if role == "corrections" else None
+    return IngestResult.of(target, report, warnings, changes)
+
+
+def _add_to(log: Path, sidecar: bool | None, make: Callable[..., IngestReport]) -> IngestReport:
+    """Add what is made of an input to a log, or to the results beside it, and say where it is."""
+    from mcaptrack import log as logs
+    from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
+    from mcaptrack.sources.ingest.sidecar import SidecarChoice
+
+    place = SidecarChoice(sidecar)
+    with logs.read(log, sidecar=place) as opened:
+        opened.lock()
+        report = make(log, into=opened)
+        written_to = opened.parts[-1].path
+    if place.why:
+        report.remarks.append(place.words(written_to))
+    if written_to == log:
+        update_metadata(log)
+    return report
 
 
 def _changes(path: Path, report: IngestReport) -> dict[str, Any] | None:

@@ -12,10 +12,10 @@ from typing import Annotated, Any, Final
 from mcaptrack import log as logs
 from mcaptrack.api.common import detail, locations_of, log_location, optional_path, warn_unused
 from mcaptrack.api.declared import Argument, declared
-from mcaptrack.api.options import LOGS, Camera, Force, PathLike, Reports, no_progress, output
+from mcaptrack.api.options import LOGS, Camera, Force, PathLike, Progress, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
-from mcaptrack.location import distinct_names, local_name, parse
+from mcaptrack.location import Location, distinct_names, local_name, parse
 from mcaptrack.notices import Notice, collected
 from mcaptrack.tables.catalogue import is_folder_of_tables, read_catalogue
 from mcaptrack.viewing import report as pages
@@ -113,46 +113,57 @@ def report(
 
     """
     places = locations_of(log)
-    for place in places:
-        if isinstance(place, Path) and is_folder_of_tables(place):
-            if len(places) != 1:
-                raise McaptrackError(
-                    f"{places[0]} and others: a page is about logs, or about one folder of tables; give one"
-                )
-            return _report_on_tables(place, optional_path(output), camera, force)
-    paths = [log_location(path) for path in places]
-    if not paths:
+    tables = [place for place in places if is_folder_of_tables(place)]
+    if not places:
         raise McaptrackError("there is no log to report on; give one, or several")
-    if output is None and len(paths) != 1:
-        raise McaptrackError(f"{len(paths)} logs become one page; name it with `output=`")
-    target = optional_path(output) or local_name(paths[0], ".report.html")
-    if any(is_same_file(path, target) for path in paths):
-        raise McaptrackError(f"{target} is a log; give the page another name with `output=`")
+    if tables and len(places) > 1:
+        raise McaptrackError(f"{places[0]} and others: a page is about logs, or about one folder of tables; give one")
+    paths = [] if tables else [log_location(path) for path in places]
+    target = _page_of(paths, optional_path(output))
     refuse_overwrite(target, force)
+    with collected() as warnings:
+        if tables:
+            warn_unused("the page is about all cameras of all logs", camera=camera is not None)
+            text, data = _about_tables(tables[0], target.parent)
+        else:
+            text, data = _about_logs(paths, camera, progress)
+        content = text.encode("utf-8")
+        publish_bytes(target, content)
+    return ReportResult(target, len(content), data, tuple(dict.fromkeys(warnings)))
+
+
+def _page_of(logs_: Sequence[Location], output: Path | None) -> Path:
+    """Return the page to write: by default beside the only log. Raises McaptrackError for other files than pages."""
+    if output is None and len(logs_) != 1:
+        what = f"{len(logs_)} logs" if logs_ else "all logs of the tables"
+        raise McaptrackError(f"the page about {what} needs a name; give one with `output=`")
+    page = output or local_name(logs_[0], ".report.html")
+    if any(is_same_file(log, page) for log in logs_):
+        raise McaptrackError(f"{page} is a log; give the page another name with `output=`")
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise McaptrackError(f"{page}: the page is written as HTML; give a name that ends with .html")
+    return page
+
+
+def _about_logs(paths: Sequence[Location], camera: str | None, progress: Progress) -> tuple[str, dict[str, Any]]:
+    """Return the page about logs, and its numbers."""
     real = [place_of(path) for path in paths]
     files, names = (distinct_names(some, real) for some in ([p.name for p in paths], [p.stem for p in paths]))
     reports = []
-    with collected() as warnings:
-        for done, path in enumerate(paths):
-            progress("report", done, len(paths))
-            with logs.read(path) as opened:
-                reports.append(pages.gather(opened, camera, detail, files[done], names[done]))
-                pages.draw(reports[-1], done, len(paths))
-        content = pages.page(reports).encode("utf-8")
-        publish_bytes(target, content)
-        progress("report", len(paths), len(paths))
-    return ReportResult(target, len(content), pages.data(reports), tuple(dict.fromkeys(warnings)))
+    for done, path in enumerate(paths):
+        progress("report", done, len(paths))
+        with logs.read(path) as opened:
+            reports.append(pages.gather(opened, camera, detail, files[done], names[done]))
+            pages.draw(reports[-1], done, len(paths))
+    progress("report", len(paths), len(paths))
+    return pages.page(reports), pages.data(reports)
 
 
-# The page about all logs in a folder of tables.
-
-
-def page_about(where: Path, folder: Path) -> tuple[bytes, dict[str, Any]]:
+def _about_tables(where: Path, folder: Path) -> tuple[str, dict[str, Any]]:
     """Return the page about all logs in a folder of tables, and its numbers; it links to pages from ``folder``."""
     rows = read_catalogue(where)
     data = pages.fleet_data(rows)
-    text = pages.fleet_page(rows, str(where), pages.ELEMENT, data, partial(_page_beside, folder))
-    return text.encode("utf-8"), data
+    return pages.fleet_page(rows, str(where), pages.ELEMENT, data, partial(_page_beside, folder)), data
 
 
 def _page_beside(folder: Path, row: Mapping[str, Any]) -> str:
@@ -162,15 +173,3 @@ def _page_beside(folder: Path, row: Mapping[str, Any]) -> str:
         return ""
     page = local_name(location, ".report.html")
     return os.path.relpath(page, folder.absolute()) if page.is_file() else ""
-
-
-def _report_on_tables(folder: Path, output: Path | None, camera: str | None, force: bool) -> ReportResult:
-    """Write the page about all logs in a folder of tables."""
-    if output is None:
-        raise McaptrackError(f"the page about all logs in {folder} needs a name; give one with `output=`")
-    refuse_overwrite(output, force)
-    with collected() as warnings:
-        warn_unused("the page is about all cameras of all logs", camera=camera is not None)
-        content, data = page_about(folder, output.parent)
-        publish_bytes(output, content)
-    return ReportResult(output, len(content), data, tuple(dict.fromkeys(warnings)))

@@ -130,7 +130,7 @@ def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001 
     True
     """
     if create:
-        target = log_output(path, Path(path))
+        target = log_output(path)
         if target.exists():
             raise McaptrackError(f"{target} exists; open it without `create=True`, or give a new log another name")
         refuse_overwrite(target, force=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -142,66 +143,64 @@ def render(
     from mcaptrack import pipeline
     from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
     from mcaptrack.files import is_same_file, refuse_overwrite
-    from mcaptrack.foxglove.views import SCENE_SUFFIX, SUFFIX
     from mcaptrack.location import local_name
     from mcaptrack.sources.cameras import camera_at
+    from mcaptrack.viewing import comparing, rendering
     from mcaptrack.viewing.blur.recording import blurrable, write_blurred_log
-    from mcaptrack.viewing.comparing import compare as draw_comparison
-    from mcaptrack.viewing.comparing import find_panels
     from mcaptrack.viewing.heat_map import draw_heat_map
-    from mcaptrack.viewing.rendering import RenderOptions
-    from mcaptrack.viewing.rendering import render as draw_video
-    from mcaptrack.viewing.rendering import render_from_above as draw_from_above
 
     path = log_location(log)
     refuse_both(compare=compare, heatmap=heatmap, blur=blur is not None)
     suffix = default_suffix(compare=compare, heatmap=heatmap, blur=blur, gif=gif)
     target = optional_path(output) or local_name(path, suffix)
     is_log = target.suffix.lower() == ".mcap"
-    if is_log and is_same_file(target, path):
+    if is_same_file(target, path):
         raise McaptrackError(f"{target} is the log itself; give another name, so that the pictures aren't lost")
     if is_log and blur is None:
         raise McaptrackError(f"{target}: a log is written only with `blur=`; a video is rendered to .mp4 or .gif")
     refuse_overwrite(target, force)
-    options = RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
-    with warnings_about(path) as warnings, logs.read(path) as opened:
+    options = rendering.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
+    views: Sequence[str] = ()
+    blurred: Sequence[str] = ()
+    with warnings_about(path) as warnings, ExitStack() as stack:
+        opened = stack.enter_context(logs.read(path))
+        if not is_log:
+            opened, _ = stack.enter_context(pipeline.with_views(opened))
         warn_unused("the name of the output says what is written", gif=gif and output is not None)
         if is_log:
-            of_video = {"topic": topic, "width": width, "max_fps": max_fps, "start_s": start_s, "end_s": end_s}
-            warn_unused("the whole log is written", **{name: bool(value) for name, value in of_video.items()})
-            only = None if camera is None else pipeline.find_camera(opened, camera)
-            done = write_blurred_log(opened, blurrable(opened, only), target, progress)
-            notices = tuple(dict.fromkeys(warnings))
-            return RenderResult(path, target, sum(done.pictures.values()), (), notices, tuple(done.pictures))
-        if blur is not None:
-            hidden = blurrable(opened, None if camera is None else pipeline.find_camera(opened, camera))
+            period = {"start_s": bool(start_s), "end_s": end_s is not None}
+            of_video = {"topic": bool(topic), "width": width is not None, "max_fps": max_fps is not None}
+            warn_unused("the whole log is written", **of_video, **period)
+            counts = write_blurred_log(opened, blurrable(opened, camera), target, progress).pictures
+            count, blurred = sum(counts.values()), tuple(counts)
+        elif blur is not None:
+            hidden = blurrable(opened, camera)
             pictures = _one_of(opened, list(hidden), camera)
-            prefix = pipeline.find_camera(opened, camera) if topic else ""
-            views = list(pipeline.find_views(opened, prefix, names_of(topic)).views) if topic else []
-            count = draw_video(opened, pictures, views, target, options, progress, hidden[pictures])
-            notices = tuple(dict.fromkeys(warnings))
-            return RenderResult(path, target, count, tuple(views), notices, (pictures,))
-        prefix = pipeline.find_camera(opened, camera)
-        if heatmap:
-            warn_unused("a heat map is one picture", max_fps=max_fps is not None, gif=gif and output is None)
-            pictures_of = camera_at(opened, prefix).pictures
-            heat = draw_heat_map(opened, prefix, names_of(topic), pictures_of, target, options)
-            return RenderResult(path, target, 1, (heat.topic,), tuple(dict.fromkeys(warnings)))
-        if compare:
-            warn_unused("SORT's tracks, re-tracked ones and ground truth are drawn", topic=bool(topic))
-            pictures_of = camera_at(opened, prefix).pictures
-            panels = find_panels(opened, prefix, SCENE_SUFFIX if pictures_of is None else SUFFIX)
-            follow = partial(pipeline.robot_path, opened, prefix, panels[1].view)
-            count = draw_comparison(opened, pictures_of, panels, target, options, follow, progress)
-            drawn = tuple(panel.view for panel in panels)
-            return RenderResult(path, target, count, drawn, tuple(dict.fromkeys(warnings)))
-        shown = pipeline.find_views(opened, prefix, names_of(topic))
-        if shown.pictures:
-            count = draw_video(opened, shown.pictures, shown.views, target, options, progress)
+            if topic:
+                views = pipeline.find_views(opened, pipeline.find_camera(opened, camera), names_of(topic)).views
+            count = rendering.render(opened, pictures, views, target, options, progress, hidden[pictures])
+            blurred = (pictures,)
         else:
-            follow = partial(pipeline.robot_path, opened, prefix, shown.views[0])
-            count = draw_from_above(opened, shown.views, target, options, follow, progress)
-    return RenderResult(path, target, count, tuple(shown.views), tuple(dict.fromkeys(warnings)))
+            prefix = pipeline.find_camera(opened, camera)
+            own_pictures = camera_at(opened, prefix).pictures
+            if heatmap:
+                warn_unused("a heat map is one picture", max_fps=max_fps is not None, gif=gif and output is None)
+                heat = draw_heat_map(opened, prefix, names_of(topic), own_pictures, target, options)
+                count, views = 1, (heat.topic,)
+            elif compare:
+                warn_unused("SORT's tracks, re-tracked ones and ground truth are drawn", topic=bool(topic))
+                panels = comparing.find_panels(opened, prefix, own_pictures)
+                follow = partial(pipeline.robot_path, opened, prefix, panels[1].view)
+                count = comparing.compare(opened, own_pictures, panels, target, options, follow, progress)
+                views = [panel.view for panel in panels]
+            else:
+                views, pictures = pipeline.find_views(opened, prefix, names_of(topic))
+                follow = partial(pipeline.robot_path, opened, prefix, views[0])
+                if pictures:
+                    count = rendering.render(opened, pictures, views, target, options, progress)
+                else:
+                    count = rendering.render_from_above(opened, views, target, options, follow, progress)
+    return RenderResult(path, target, count, tuple(views), tuple(dict.fromkeys(warnings)), tuple(blurred))
 
 
 def _one_of(opened: logs.Log, pictures: Sequence[str], camera: str | None) -> str:

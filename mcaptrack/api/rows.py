@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from mcaptrack import tables
 from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import PERSON, UNKNOWN, class_name, is_person
@@ -229,22 +230,26 @@ def detections(
         ("source_id",): source_ids,
     }
     if is_supervision(boxes):
-        if scores is not None or classes is not None or box_format not in (None, "xyxy"):
-            raise McaptrackError("supervision.Detections have scores, classes and a box format; give no others")
-        if any(values is not None for values in in_space.values()):
-            raise McaptrackError("supervision.Detections are boxes in pixels; give positions without them")
+        others = (scores, classes, *in_space.values())
+        if box_format not in (None, "xyxy") or any(values is not None for values in others):
+            raise McaptrackError("supervision.Detections are boxes in pixels with scores and classes; give no others")
         return frame_of_supervision(boxes, t_ns, index, DETECTIONS)
     columns = columns_in_space(in_space)
     if boxes is None and positions_m is None:
         raise McaptrackError("detections need boxes in pixels (`boxes=`), or positions in metres (`positions_m=`)")
-    if boxes is None and box_format is not None:
-        raise McaptrackError("`box_format=` says what the columns of `boxes=` are, and there are none")
-    if boxes is not None and box_format not in ("xyxy", "xywh"):
-        raise McaptrackError("say what the columns of boxes are with `box_format='xyxy'` or `box_format='xywh'`")
     classes = classes if class_names is None else numbers_of(classes, class_names)
     columns |= {"score": scores, "class_id": classes}
-    pixels = None if boxes is None or box_format is None else boxes_of(boxes, box_format)
-    return frame_of(DETECTIONS, pixels, columns, t_ns, index)
+    return frame_of(DETECTIONS, _in_pixels(boxes, box_format), columns, t_ns, index)
+
+
+def _in_pixels(boxes: Any, box_format: BoxFormat | None) -> Floats | None:
+    if boxes is None and box_format is not None:
+        raise McaptrackError("`box_format=` says what the columns of `boxes=` are, and there are none")
+    if boxes is None:
+        return None
+    if box_format is None:
+        raise McaptrackError("say what the columns of boxes are with `box_format='xyxy'` or `box_format='xywh'`")
+    return boxes_of(boxes, box_format)
 
 
 def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], dict[int, str]]:
@@ -282,31 +287,33 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], di
 
 def _of_frames(rows: Any, schema: Schema | None, names: dict[int, str]) -> tuple[Schema, list[Frame]]:
     """The schema and the frames of an iterable; adds the names of classes that its members give to ``names``."""
-    if isinstance(rows, Frame):
-        rows = [rows]
     if is_supervision(rows):
         raise McaptrackError(
             "supervision.Detections have no time; give them by time in nanoseconds: {t_ns: detections}"
         )
     if not isinstance(rows, Iterable) or isinstance(rows, str | bytes):
         raise McaptrackError(f"rows are frames, an array, a table or supervision.Detections, not {kind_of(rows)}")
-    frames = [_frame(item, schema, names) for item in (rows.items() if hasattr(rows, "items") else rows)]
-    if schema is None:
-        layouts = {frame.rows.dtype.names for frame in [frame for frame in frames if len(frame.rows)] or frames}
-        fitting = [kind for kind in (DETECTIONS, TRACKS) if layouts and all(map(kind.has_columns, layouts))]
-        if not fitting:
-            raise McaptrackError(
-                "it is not clear whether these are detections or tracks; all frames have to be of one kind, and "
-                "without frames the topic has to end in detections or tracks"
-            )
-        schema = fitting[0]
-        frames = [frame if len(frame.rows) else frame._replace(rows=schema.empty()) for frame in frames]
+    members = [rows] if isinstance(rows, Frame) else rows.items() if hasattr(rows, "items") else rows
+    frames = [_frame(item, schema, names) for item in members]
+    schema = schema or _schema_of(frames)
     return schema, [_checked(schema, frame) for frame in frames]
+
+
+def _schema_of(frames: Sequence[Frame]) -> Schema:
+    """The schema that all frames fit; any fits one without rows beside others with some."""
+    layouts = {frame.rows.dtype.names for frame in [frame for frame in frames if frame.rows.size] or frames}
+    for schema in (DETECTIONS, TRACKS):
+        if layouts and all(map(schema.has_columns, layouts)):
+            return schema
+    raise McaptrackError(
+        "it is not clear whether these are detections or tracks; all frames have to be of one kind, and without frames "
+        "the topic has to end in detections or tracks"
+    )
 
 
 def _checked(schema: Schema, frame: Frame) -> Frame:
     try:
-        return frame._replace(rows=schema.check(frame.rows))
+        return frame._replace(rows=schema.check(frame.rows) if frame.rows.size else schema.empty())
     except ValueError as error:
         raise McaptrackError(f"the frame at {frame.t_ns} ns: {error}") from None
 

@@ -40,7 +40,7 @@ from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
 from mcaptrack.evaluation import tuning as searching
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.notices import Notice, collected
-from mcaptrack.registry import blamed
+from mcaptrack.registry import Entry, blamed
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
 from mcaptrack.transforms import STAGES, Transform
@@ -182,8 +182,7 @@ def tune(
     base = transform_of(stage, tracker, {})
     is_own = STAGES[stage].is_built_in(type(base))
     entry = None if is_own else STAGES[stage].entry(type(base))
-    with blamed(entry, "could not be made with the ends of `search=`") if entry else nullcontext():
-        ranges = _ranges(type(base), search)
+    ranges = _ranges(type(base), search, entry)
     chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
     notes, trials_file = Notes(), optional_path(study)
@@ -235,8 +234,8 @@ def tune(
     )
 
 
-def _ranges(kind: type[Transform], search: Search | None) -> dict[str, Range]:
-    """Return the ranges to search: those that are asked for, or all that are declared."""
+def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -> dict[str, Range]:
+    """Return the ranges to search: those that are asked for, or all that are declared; ``entry`` as in ``tune``."""
     declared = declared_ranges(kind)
     if not search:
         return declared
@@ -252,8 +251,9 @@ def _ranges(kind: type[Transform], search: Search | None) -> dict[str, Range]:
             if not low <= high:
                 raise McaptrackError(f"`search=` needs a range from low to high for {name}, not {low:g} to {high:g}")
             whole = declared[name].whole
-            for end in span:
-                kind(**{name: int(end) if whole else end})  # both ends have to be allowed
+            with blamed(entry, "could not be made with the ends of `search=`") if entry else nullcontext():
+                for end in span:
+                    kind(**{name: int(end) if whole else end})  # both ends have to be allowed
             out[name] = Range(low, high, whole)
     return out
 

@@ -12,7 +12,7 @@ from mcaptrack.api.common import log_file, log_location, log_output, names_of, w
 from mcaptrack.api.declared import Argument, OneOfMany, Option, declared
 from mcaptrack.api.options import FILES, EachLog, Force, Output, PathLike, Reports, no_progress, output
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.files import refuse_overwrite
 from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice
 
@@ -159,8 +159,6 @@ def recover(
 
     path = log_location(log)
     target = local_name(path, ".recovered.mcap") if output is None else log_output(output, path)
-    if is_same_file(target, path):
-        raise McaptrackError(f"{path} is both input and output; give another name with `output=`")
     refuse_overwrite(target, force)
     with warnings_about(path) as warnings:
         done = logs.recover(path, target, progress)
@@ -235,78 +233,81 @@ def drop(
 
     """
     from mcaptrack import log as logs
-    from mcaptrack.schema.provenance import Provenance
-    from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
-    from mcaptrack.sources.ingest.sidecar import recording_of
 
-    path = log_file(log)
-    if not names_of(topics):
-        raise McaptrackError("name the channels to remove with `topics=`")
+    path, patterns = log_file(log), names_of(topics)
     copy = None if output is None else log_output(output, path)
+    if not patterns:
+        raise McaptrackError("name the channels to remove with `topics=`")
     if in_place and copy is not None:
         raise McaptrackError("`in_place=True` and `output=` are two places for the same result; give one")
-    if copy is not None:
-        refuse_overwrite(copy, force)
-        if is_same_file(copy, path):
-            raise McaptrackError(f"{path} is both input and output; leave `output=` out to change it in place")
-    results = logs.results_path(path)
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
-            dropped = _chosen(opened, names_of(topics))
-            holds = {Path(part.path): [c for c in part.recorded if c.topic in dropped] for part in opened.parts}
-            messages = sum(channel.messages for gone in holds.values() for channel in gone)
-            before = sum(part.size for part in opened.parts)
-            recorded = {c.topic for c in holds[path] if Provenance.from_metadata(c.metadata) is None}
-            if recorded and copy is None and not in_place and (recording := recording_of(opened)):
-                raise McaptrackError(
-                    f"{path} is {recording}, which ROS tools read; `output=` writes a copy without "
-                    f"{', '.join(sorted(recorded))}, `in_place=True` changes it all the same"
-                )
-        targets = {path: copy or path, results: logs.results_path(copy) if copy else results}
-        if copy is not None and results in holds:
-            refuse_overwrite(targets[results], force)
-        for part, gone in holds.items():
-            if gone or copy is not None:
-                target = targets[part] if copy else None
-                with (
-                    logs.read(part, sidecar=False) as opened,
-                    logs.extend(opened, target, drop={c.topic for c in gone}),
-                ):
-                    pass
-                if copy is None and part == path:
-                    update_metadata(path)
-        after = sum(targets[part].stat().st_size for part in holds)
-    return DropResult(copy or path, tuple(sorted(dropped)), messages, before, after, tuple(dict.fromkeys(warnings)))
+            dropped = _with_descriptions(opened, _chosen(opened, patterns))
+            parts, before = [Path(part.path) for part in opened.parts], sum(part.size for part in opened.parts)
+            if copy is None and not in_place:
+                _refuse_for_ros_tools(opened, dropped)
+        targets = parts
+        if copy is not None:
+            targets = [copy, logs.results_path(copy)][: len(parts)]
+            for target in targets:
+                refuse_overwrite(target, force)
+        messages = sum(_remove(dropped, part, target) for part, target in zip(parts, targets, strict=True))
+        after = sum(target.stat().st_size for target in targets)
+    return DropResult(targets[0], tuple(sorted(dropped)), messages, before, after, tuple(dict.fromkeys(warnings)))
+
+
+def _refuse_for_ros_tools(opened: logs.Log, dropped: set[str]) -> None:
+    """Raise McaptrackError if ROS tools may have to read recorded channels among those to remove."""
+    from mcaptrack.schema.provenance import Provenance
+    from mcaptrack.sources.ingest.sidecar import recording_of
+
+    own = [channel for channel in opened.parts[0].recorded if channel.topic in dropped]
+    recorded = sorted({channel.topic for channel in own if Provenance.from_metadata(channel.metadata) is None})
+    if recorded and (recording := recording_of(opened)):
+        raise McaptrackError(
+            f"{opened.path} is {recording}, which ROS tools read; `output=` writes a copy without "
+            f"{', '.join(recorded)}, `in_place=True` changes it all the same"
+        )
+
+
+def _remove(topics: set[str], part: Path, target: Path) -> int:
+    """Write a file without some topics to ``target``, which may be the file itself; return the messages removed."""
+    from mcaptrack import log as logs
+    from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
+
+    with logs.read(part, sidecar=False) as opened:
+        channels = [channel for channel in opened.recorded if channel.topic in topics]
+        if not channels and target == part:
+            return 0
+        with logs.extend(opened, None if target == part else target, drop=topics):
+            pass
+    update_metadata(target)
+    return sum(channel.messages for channel in channels)
 
 
 def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
-    """Return the topics that fit any of the patterns, with the channels that only describe them.
-
-    Raises McaptrackError for a pattern that fits none.
-    """
-    from mcaptrack.foxglove.views import SCENE_SUFFIX
-    from mcaptrack.schema.provenance import REFINE, Provenance
-
+    """Return the topics that fit any of the patterns. Raises McaptrackError for a pattern that fits none."""
     chosen: set[str] = set()
     for pattern in patterns:
         fitting = {pattern} & opened.channels.keys()
-        if any(letter in pattern for letter in "*?["):  # most are names, and there may be thousands
+        if not {*"*?["}.isdisjoint(pattern):  # most are names, and there may be thousands
             fitting |= {topic for topic in opened.channels if fnmatchcase(topic, pattern)}
         if not fitting:
             opened.channel(pattern)  # raises, with the channels that there are
         chosen |= fitting
-    provenances = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
-    # The outline of a corrected plane is drawn as the view of the plane that was given.
-    outlines = {
-        provenance.input + SCENE_SUFFIX
-        for topic in chosen
-        if (provenance := provenances[topic]) and provenance.transform == REFINE
-    }
-    chosen |= outlines & provenances.keys()
-    for transform in ("events", "view"):  # in this order: events have views
-        chosen |= {
-            topic
-            for topic, provenance in provenances.items()
-            if provenance and provenance.transform == transform and provenance.input in chosen
-        }
     return chosen
+
+
+def _with_descriptions(opened: logs.Log, topics: set[str]) -> set[str]:
+    """Return the topics with those that only describe one of them."""
+    from mcaptrack.foxglove.views import SCENE_SUFFIX
+    from mcaptrack.schema.provenance import REFINE
+    from mcaptrack.sources.cameras import provenance_of
+
+    made = {topic: how for topic in opened.channels if (how := provenance_of(opened, topic))}
+    # The outline of a corrected plane is drawn as the view of the plane that was given.
+    planes = {made[topic].input for topic in topics & made.keys() if made[topic].transform == REFINE}
+    out = topics | {plane + SCENE_SUFFIX for plane in planes} & made.keys()
+    for transform in ("events", "view"):  # in this order: events have views
+        out |= {topic for topic, how in made.items() if how.transform == transform and how.input in out}
+    return out

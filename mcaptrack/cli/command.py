@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperOption
 
 from mcaptrack.api.declared import Parameter
 from mcaptrack.cli.flags import RUNNING
@@ -181,7 +181,7 @@ class Command(TyperCommand):
         with usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         for option in self.params:
-            if option.name == "topic" and not option.multiple:
+            if isinstance(option, TyperOption) and not option.multiple and not option.is_flag:
                 _refuse_several(args_before, option.opts)
         return left
 
@@ -227,7 +227,7 @@ def _refuse_several(args: Sequence[str], options: Sequence[str]) -> None:
     """Refuse several values of an option that takes one: the last would count, and the others be ignored."""
     names = {value: None for option in options for value in _values_of(args, option)}
     if len(names) > 1:
-        refuse_usage(f"{options[0]} is given as {' and as '.join(names)}; give one, and call the command once for each")
+        refuse_usage(f"{options[0]} is given as {' and as '.join(names)}; give one")
 
 
 def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
@@ -239,6 +239,8 @@ def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
             yield "".join(args[number + 1 : number + 2])
         elif word.startswith(f"{option}="):
             yield word.partition("=")[2]
+        elif word.startswith(option) and not option.startswith("--"):
+            yield word.removeprefix(option)
 
 
 _DEFAULT: Final = 3

@@ -271,7 +271,7 @@ class Log:
             self.channels[topic] = first._replace(messages=sum(channel.messages for channel in those))
 
     def attach_results(self, results: Log, is_new: bool) -> None:
-        """Add the channels of a sidecar, which takes new channels from now on; to a log that has one, of a further log."""
+        """Add the channels of a sidecar, which takes new channels from now on; beside one that is there already."""
         results.is_new = is_new
         if self.results is None:
             self.results = results

@@ -394,7 +394,7 @@ def calibrate_cameras(
     for name in clock_offset_s:
         if name not in chosen:
             raise McaptrackError(f"`clock_offset_s=` has {name}, which is not compared; {', '.join(chosen)} are")
-    sources, _, _, _ = read_sources(opened, compared, clock_offset_s)
+    sources = read_sources(opened, compared, clock_offset_s).sources
     cameras = {camera.prefix[1:]: camera for camera in compared}
     sources = [_given(opened, source, cameras[source.view.name], reference) for source in sources]
     chosen = [source.view.name for source in sources]  # without those that have no messages, which was said
@@ -488,7 +488,7 @@ def _in_turns(
         ]
         if turn == _TURNS - 1:
             break
-        _, _, _, late_s, _ = compared_cameras(right, fuser, given_offset_s)
+        late_s = compared_cameras(right, fuser, given_offset_s).offset_s
         late = {name: seconds for name, seconds in late_s.items() if name not in given_offset_s and seconds}
         if not late:
             progress(1, 1)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Final, NamedTuple
 
 from mcaptrack import log
@@ -34,25 +35,35 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
     McaptrackError if no camera has anything to begin with, and for names that the log doesn't have, or that can't be
     run.
     """
-    every, scenes = cameras(opened), scenes_of(opened)
-    if names:
-        wanted = cameras_named(opened, names, every)
-        wanted_scenes = tuple(camera.prefix for camera in wanted if camera.prefix in scenes)
-        wanted = [camera for camera in wanted if camera.prefix not in scenes]
-    else:
-        wanted_scenes = ()
-        wanted = [camera for camera in every if camera.prefix not in scenes and not _is_truth_of_scene(opened, camera)]
-        wanted = [camera for camera in wanted if not camera.in_space or has_own_channels(opened, camera)] or wanted
-        if len(wanted) + len(scenes) < 2 or all(camera.in_space for camera in wanted):
-            return None
-    lacks = {camera.prefix[1:]: why for camera in wanted if (why := _lack(opened, camera))}
-    chosen = tuple(camera.prefix for camera in wanted if camera.prefix[1:] not in lacks)
+    named, scenes = cameras_named(opened, names, cameras(opened)), scenes_of(opened)
+    wanted = [camera for camera in named if camera.prefix not in scenes] if names else _usual(opened, scenes)
+    if not names and not wanted:
+        return None
+    wanted_scenes = tuple(camera.prefix for camera in named if camera.prefix in scenes)
+    chosen, lacks = split_by_lack(wanted, partial(_lack, opened))
     if not chosen and not wanted_scenes:
         why = "; ".join(f"{name} {reason}" for name, reason in lacks.items())
         raise McaptrackError(f"{opened.path} has no camera to begin with: {why}")
     for name, reason in lacks.items() if names else ():
         raise McaptrackError(f"{opened.path}: {name} {reason}; leave it out of `camera=`")
-    return ChosenCameras(chosen, lacks, wanted_scenes)
+    return ChosenCameras(tuple(camera.prefix for camera in chosen), lacks, wanted_scenes)
+
+
+def split_by_lack(wanted: Sequence[Camera], lack: Callable[[Camera], str]) -> tuple[list[Camera], dict[str, str]]:
+    """Return the cameras that lack nothing, and what the others lack, by name."""
+    lacks = {camera.prefix[1:]: why for camera in wanted if (why := lack(camera))}
+    return [camera for camera in wanted if camera.prefix[1:] not in lacks], lacks
+
+
+def _usual(opened: log.Log, scenes: Sequence[str]) -> list[Camera]:
+    """Return the cameras of a run that names none, but none if there is no choice between several with pictures.
+
+    Those that are only boxes in space are left out.
+    """
+    usual = [camera for camera in cameras(opened) if camera.prefix not in scenes]
+    usual = [camera for camera in usual if not _is_truth_of_scene(opened, camera)]
+    usual = [camera for camera in usual if not camera.in_space or has_own_channels(opened, camera)]
+    return usual if len(usual) + len(scenes) > 1 and not all(camera.in_space for camera in usual) else []
 
 
 def _is_truth_of_scene(opened: log.Log, camera: Camera) -> bool:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,6 +23,7 @@ from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.location import Location
 from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace, read_named_frames
+from mcaptrack.pipeline.choice_of_cameras import split_by_lack
 from mcaptrack.pipeline.rebuild import fuser_of, plugins_of
 from mcaptrack.pipeline.runner import Report, outdated_by
 from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
@@ -88,7 +90,7 @@ def fuse_cameras(
                 f"{opened.path}: {topic} {describe_origin(opened, topic)}; give the scene another name with `to=`"
             )
     with collected() as warnings:
-        out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress, is_asked)
+        out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress, bool(names) and is_asked, is_asked)
     state = RunState(opened, prefix, out)
     drawn = None
     if views:
@@ -123,26 +125,35 @@ def fuse_again(
     provenance = provenance_of(opened, target)
     if provenance is None or provenance.transform != FUSE:
         return {}
-    names = [str(name) for name in provenance.parameters["cameras"]]
-    is_open = adds and not provenance.parameters.get("cameras_given")
-    more = [name for name in fusable(opened, (), prefix)[0] if name not in names] if is_open else []
-    before, why_not = fuser_of(provenance, fuser)
-    is_other = fuser is not None and (before is None or FUSION.choice(before) != FUSION.choice(fuser))
-    if not (force or more or is_other or is_stale(opened, target)):
+    parameters = provenance.parameters
+    names, is_chosen = list(map(str, parameters["cameras"])), bool(parameters.get("cameras_given"))
+    more = sorted({*fusable(opened, (), prefix)[0]} - {*names}) if adds and not is_chosen else []
+    wanted, other, why_not = _fuser_again(provenance, fuser, force)
+    if not (other or more or force or is_stale(opened, target)):
         return {}
-    wanted = fuser if fuser is not None and (is_other or force) else before
     if wanted is None:
         raise McaptrackError(f"{opened.path}: {target} can't be made again: {why_not}")
-    offset_s = dict(zip(names, provenance.parameters["clock_offset_s"], strict=True))
-    given_offset_s = {name: float(offset_s[name]) for name in provenance.parameters.get("clock_offsets_given", ())}
-    why = f"was made by the {FUSION.entry(type(before))}" if is_other and before else "was made by another fuser"
-    if not is_other:
-        why = f"was made without {', '.join(more)}" if more else "was made from earlier detections or ground planes"
+    why = f"was made without {', '.join(more)}" if more else "was made from earlier detections or ground planes"
+    how = "as before"
+    if other:
+        why, how = other, f"by the {FUSION.entry(type(wanted))}"
+    offset_s = dict(zip(names, parameters["clock_offset_s"], strict=True))
+    given_offset_s = {name: float(offset_s[name]) for name in parameters.get("clock_offsets_given", ())}
     names = sorted((*names, *more)) if more else names
-    how = f"by the {FUSION.entry(type(wanted))}" if is_other else "as before"
     say(f"{target} {why}: fusing {', '.join(names)} again, {how}")
-    is_chosen = bool(provenance.parameters.get("cameras_given"))
-    return _fuse(opened, names, prefix, wanted, given_offset_s, progress, is_asked=is_chosen, is_again=True)
+    return _fuse(opened, names, prefix, wanted, given_offset_s, progress, is_chosen, takes_strangers=True)
+
+
+def _fuser_again(
+    provenance: Provenance, named: Transform | None, force: bool
+) -> tuple[Transform | None, str, McaptrackError | None]:
+    """The fuser to make a scene again with, what to say if it is another than before, and why there is none."""
+    before, why_not = fuser_of(provenance, named)
+    if named is None:
+        return before, "", why_not
+    if before is not None and FUSION.choice(before) == FUSION.choice(named):
+        return named if force else before, "", None
+    return named, f"was made by {'another fuser' if before is None else f'the {FUSION.entry(type(before))}'}", None
 
 
 # Gather the boxes of the cameras of a log at one time, and compare the cameras.
@@ -262,10 +273,17 @@ def frames_in_words(frames: Mapping[str, str]) -> str:
     return ", ".join(f"{name} in {frame}" for name, frame in frames.items())
 
 
-def read_sources(
-    opened: log.Log, chosen: Sequence[Camera], clock_offset_s: Mapping[str, float]
-) -> tuple[list[Source], dict[str, str], dict[str, str], str]:
-    """The detections of the cameras; the digests of what they were read from; the classes, and the frame of metres."""
+class Detected(NamedTuple):
+    """The detections of cameras; the digests of what they were read from; the classes, and the frame of metres."""
+
+    sources: list[Source]
+    references: dict[str, str]
+    classes: dict[str, str]
+    frame_id: str
+
+
+def read_sources(opened: log.Log, chosen: Sequence[Camera], clock_offset_s: Mapping[str, float]) -> Detected:
+    """Read the detections of the cameras."""
     names = [camera.prefix[1:] for camera in chosen]
     for name in clock_offset_s:
         if name not in names:
@@ -298,12 +316,20 @@ def read_sources(
         raise McaptrackError(f"{opened.path} has no detections to fuse: all channels are empty")
     if len(set(frames_of.values())) > 1:
         raise McaptrackError(f"{opened.path}: the ground planes are in different frames: {frames_in_words(frames_of)}")
-    return sources, references, classes, next(iter(frames_of.values()))
+    return Detected(sources, references, classes, next(iter(frames_of.values())))
 
 
-def compared_cameras(
-    sources: list[Source], fuser: FootFuser, given_offset_s: Mapping[str, float]
-) -> tuple[Gathered, FootFuser, tuple[Offset, ...], dict[str, float], Shared]:
+class Compared(NamedTuple):
+    """Cameras as they agree: what they see at one time, a fuser that knows them, and what was found about each."""
+
+    gathered: Gathered
+    fuser: FootFuser
+    offsets: tuple[Offset, ...]
+    offset_s: dict[str, float]
+    shared: Shared
+
+
+def compared_cameras(sources: list[Source], fuser: FootFuser, given_offset_s: Mapping[str, float]) -> Compared:
     """Estimate how well the cameras agree, and the offsets of clocks that are not given."""
     offset_s = {source.view.name: given_offset_s.get(source.view.name, 0.0) for source in sources}
     for _ in range(3):
@@ -328,7 +354,7 @@ def compared_cameras(
         sources = [
             source._replace(t_ns=source.t_ns - shift_ns) if source.view.name == worst else source for source in sources
         ]
-    return gathered, replace(fuser, views=views), offsets, offset_s, shared
+    return Compared(gathered, replace(fuser, views=views), offsets, offset_s, shared)
 
 
 def warn_disagreeing(
@@ -374,24 +400,21 @@ def fusable(opened: log.Log, names: Sequence[str] = (), scene: str = "/world") -
 
     They can if two cameras have detections and a measured ground plane, in the same frame.
     """
-    scenes = {scene, *scenes_of(opened)}
-    ours = [
-        camera for camera in cameras(opened) if camera.prefix not in scenes and (not names or _has_name(camera, names))
-    ]
-    lacks = {our: _lack(opened, our) for our in ours}
-    able = [camera for camera, why in lacks.items() if not why]
-    listed = [camera.prefix[1:] for camera in able]
-    frames = {name: frame_of_plane(opened, camera) for name, camera in zip(listed, able, strict=True)}
-    if len(able) < 2:
-        why = "; ".join(f"{camera.prefix[1:]} {reason}" for camera, reason in lacks.items() if reason)
-        return [], f"only {listed[0]} can be fused, since {why}" if able else why
+    able, lacks = _able(opened, sorted(names), scene)
+    frames = {camera.prefix[1:]: frame_of_plane(opened, camera) for camera in able}
+    why = "; ".join(f"{name} {reason}" for name, reason in lacks.items())
+    if len(frames) < 2:
+        return [], f"only {next(iter(frames))} can be fused, since {why}" if frames else why
     if len(set(frames.values())) > 1:
         return [], f"their ground planes are in different frames, {frames_in_words(frames)}"
-    return listed, "; ".join(f"{camera.prefix[1:]} {why}" for camera, why in lacks.items() if why)
+    return [*frames], why
 
 
-def _has_name(camera: Camera, names: Sequence[str]) -> bool:
-    return any(name.strip("/") in names for name in camera.names)
+def _able(opened: log.Log, names: Sequence[str], scene: str) -> tuple[list[Camera], dict[str, str]]:
+    """Return the cameras that can be fused, of these or of all, and why others can't be, by name."""
+    scenes = {scene, *scenes_of(opened)}
+    ours = [camera for camera in cameras(opened) if camera.prefix not in scenes]
+    return split_by_lack(cameras_named(opened, names, ours) if names else ours, partial(_lack, opened))
 
 
 def _topics(prefix: str) -> dict[str, Schema]:
@@ -407,67 +430,72 @@ def _fuse(
     fuser: Transform,
     clock_offset_s: Mapping[str, float],
     progress: Callable[[str, int, int], None],
-    is_asked: bool = True,
-    is_again: bool = False,
+    is_chosen: bool,
+    takes_strangers: bool,
 ) -> dict[str, Made]:
-    """Fuse cameras as ``fuse_cameras`` does, and return the channels by topic."""
-    topics = _topics(prefix)
-    target = next(iter(topics))
+    """Fuse cameras as ``fuse_cameras`` does, and return the channels by topic.
+
+    ``is_chosen`` says that the user named the cameras, ``takes_strangers`` that they are fused even if they don't see
+    the same people.
+    """
     with collected() as warnings:
-        chosen = _chosen(opened, names, prefix)
-        sources, references, classes, frame_id = read_sources(opened, chosen, clock_offset_s)
-        gathered, feet, offsets, offset_s, shared = compared_cameras(sources, _feet_of(fuser), clock_offset_s)
-        fuser = _with_views(fuser, feet)
-        if shared.are_strangers and not is_asked and not is_again:
-            raise McaptrackError(f"{shared}; `mcaptrack.fuse` fuses them nevertheless")
-        collectors = [FrameCollector(schema) for schema in topics.values()]
-        results: Iterator[tuple[Frame, ...]]
-        if FUSION.is_built_in(type(fuser)):
-            results = feet.fused(gathered.joined(feet))
-        else:
-            results = guarded(FUSION.entry(type(fuser)), fuser, gathered)
-        for count, result in enumerate(results, start=1):
-            progress(FUSE, count, len(gathered))
-            by_suffix = dict(zip(fuser.writes, result, strict=True))
-            for suffix, collector in zip(("", "sightings"), collectors, strict=True):
-                collector.append(by_suffix[suffix])
-        if shared.are_strangers:
-            warn(str(shared), "cameras-disagree")
-        warn_disagreeing(opened.path, feet.views, offsets, offset_s, clock_offset_s)
+        detected = read_sources(opened, _chosen(opened, names, prefix), clock_offset_s)
+        compared = compared_cameras(detected.sources, _feet_of(fuser), clock_offset_s)
+        gathered, views, offset_s = compared.gathered, compared.fuser.views, compared.offset_s
+        if compared.shared.are_strangers and not takes_strangers:
+            raise McaptrackError(f"{compared.shared}; `mcaptrack.fuse` fuses them nevertheless")
+        fuser = _with_views(fuser, compared.fuser)
+        detections, sightings = _results(fuser, compared, progress)
+        if compared.shared.are_strangers:
+            warn(str(compared.shared), "cameras-disagree")
+        warn_disagreeing(opened.path, views, compared.offsets, offset_s, clock_offset_s)
         if gathered.left_out:
             warn(
                 f"{gathered.left_out} frames of {gathered.at.view.name} are left out: they are before time 0, as its "
                 "clock is late",
                 "left-out",
             )
-    for notice in warnings:
-        warn(notice.message, notice.code)
-    own = {field.name: getattr(fuser, field.name) for field in fields(fuser) if not field.metadata.get("context")}
     parameters = {
-        **own,
+        **{field.name: getattr(fuser, field.name) for field in fields(fuser) if not field.metadata.get("context")},
         "fuser": FUSION.entry(type(fuser)).name,
-        "cameras": [view.name for view in feet.views],
-        "clock_offset_s": [offset_s[view.name] for view in feet.views],
+        "cameras": [view.name for view in views],
+        "clock_offset_s": [offset_s[view.name] for view in views],
         "clock_offsets_given": sorted(clock_offset_s),
-        **({"cameras_given": True} if names and is_asked else {}),
-        "detects": [[round(rate, 4) for rate in view.detects] for view in feet.views],
-        "false_share": [round(view.false_share, 4) for view in feet.views],
+        **({"cameras_given": True} if is_chosen else {}),
+        "detects": [[round(rate, 4) for rate in view.detects] for view in views],
+        "false_share": [round(view.false_share, 4) for view in views],
     }
     how = Provenance(
         FUSE,
         parameters,
-        references=references,
-        classes=classes,
-        frame_id=frame_id,
+        references=detected.references,
+        classes=detected.classes,
+        frame_id=detected.frame_id,
         plugins=plugins_of(FUSION, fuser),
         warnings=[(notice.code, notice.message) for notice in warnings],
     )
-    out: dict[str, Made] = {}
-    for (topic, schema), collector in zip(topics.items(), collectors, strict=True):
-        if first := out.get(target):  # the second one belongs to the scene, too, and not to a camera of its own
-            how = replace(how, input=target, input_digest=first.provenance.digest)
-        out[topic] = Made.of(schema, collector.done(), how)
-    return out
+    target, below = _topics(prefix)
+    scene = Made.of(DETECTIONS, detections, how)
+    # The sightings belong to the scene, too, and not to a camera of their own.
+    of_scene = replace(how, input=target, input_digest=scene.provenance.digest)
+    return {target: scene, below: Made.of(SIGHTINGS, sightings, of_scene)}
+
+
+def _results(fuser: Transform, compared: Compared, progress: Callable[[str, int, int], None]) -> list[Sequence[Frame]]:
+    """Run the fuser; return the frames of detections, and those of the sightings that they are made of."""
+    collectors = {"": FrameCollector(DETECTIONS), "sightings": FrameCollector(SIGHTINGS)}
+    gathered = compared.gathered
+    results: Iterator[tuple[Frame, ...]]
+    if FUSION.is_built_in(type(fuser)):
+        results = compared.fuser.fused(gathered.joined(compared.fuser))
+    else:
+        results = guarded(FUSION.entry(type(fuser)), fuser, gathered)
+    for count, result in enumerate(results, start=1):
+        progress(FUSE, count, len(gathered))
+        by_suffix = dict(zip(fuser.writes, result, strict=True))
+        for suffix, collector in collectors.items():
+            collector.append(by_suffix[suffix])
+    return [collector.done() for collector in collectors.values()]
 
 
 def _feet_of(fuser: Transform) -> FootFuser:
@@ -487,12 +515,9 @@ def _with_views(fuser: Transform, feet: FootFuser) -> Transform:
 
 def _chosen(opened: log.Log, names: Sequence[str], scene: str) -> list[Camera]:
     """The cameras to fuse. Raises McaptrackError if one is not there, or lacks something."""
-    ours = [camera for camera in cameras(opened) if camera.prefix != scene]
-    wanted = cameras_named(opened, names, ours) if names else ours
-    lacks = {camera.prefix[1:]: why for camera in wanted if (why := _lack(opened, camera))}
-    if names and lacks:
-        raise McaptrackError(f"{opened.path}: {next(iter(lacks))} {next(iter(lacks.values()))}")
-    chosen = [camera for camera in wanted if camera.prefix[1:] not in lacks]
+    chosen, lacks = _able(opened, names, scene)
+    for name, why in lacks.items() if names else ():
+        raise McaptrackError(f"{opened.path}: {name} {why}")
     if not chosen:
         why = "; ".join(f"{name} {why}" for name, why in lacks.items()) or "it has no camera"
         raise McaptrackError(f"{opened.path} has no detections to fuse: {why}")

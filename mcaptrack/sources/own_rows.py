@@ -147,13 +147,7 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
 def time_of(t_ns: Any) -> int:
     """Return a time in whole nanoseconds. Raises McaptrackError for anything else, such as seconds."""
     value = t_ns.astype("datetime64[ns]").astype(np.int64) if isinstance(t_ns, np.datetime64) else t_ns
-    try:
-        whole = as_index(value)
-    except TypeError:
-        raise McaptrackError(f"`t_ns=` needs {_IN_NS}, not {kind_of(t_ns)}") from None
-    if not 0 <= whole <= LAST_NS:
-        raise McaptrackError(f"`t_ns=` needs nanoseconds since 1970 from 0 to {LAST_NS}, not {whole}")
-    return whole
+    return _whole_number(value, 0, LAST_NS, f"`t_ns=` needs {_IN_NS}, since 1970 from 0 to {LAST_NS}")
 
 
 def times_of(values: Any, name: str) -> Ints:
@@ -170,12 +164,17 @@ def times_of(values: Any, name: str) -> Ints:
 
 def number_of(index: Any) -> int:
     """Return a frame number. Raises McaptrackError for anything else."""
+    wanted = f"`index=` needs the whole number of a picture, from 0 to {_LAST_INDEX}"
+    return _whole_number(index, UNNUMBERED, _LAST_INDEX, wanted)
+
+
+def _whole_number(value: Any, least: int, most: int, wanted: str) -> int:
     try:
-        whole = as_index(index)
+        whole = as_index(value)
     except TypeError:
-        raise McaptrackError(f"`index=` needs the whole number of a picture, not {kind_of(index)}") from None
-    if not UNNUMBERED <= whole <= _LAST_INDEX:
-        raise McaptrackError(f"`index=` needs the number of a picture, from 0 to {_LAST_INDEX}, not {whole}")
+        raise McaptrackError(f"{wanted}, not {kind_of(value)}") from None
+    if not least <= whole <= most:
+        raise McaptrackError(f"{wanted}, not {whole}")
     return whole
 
 
@@ -271,12 +270,7 @@ def checked_names(classes: Mapping[int, str] | None) -> dict[int, str]:
             f"`classes=` is a mapping of numbers to names, as in {{2: 'bicycle'}}, not {classes!r:.40}"
         )
     for number, name in (classes or {}).items():
-        try:
-            whole = as_index(number)
-        except TypeError:
-            raise McaptrackError(f"a class is a whole number from 0 to {_LAST_CLASS}, not {number!r:.40}") from None
-        if not UNKNOWN <= whole <= _LAST_CLASS:
-            raise McaptrackError(f"a class is a whole number from 0 to {_LAST_CLASS}, not {whole}")
+        whole = _whole_number(number, UNKNOWN, _LAST_CLASS, f"a class is a whole number from 0 to {_LAST_CLASS}")
         out[whole] = _checked_name(whole, name)
     return out
 

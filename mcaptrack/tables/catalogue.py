@@ -12,10 +12,11 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
+from mcaptrack.location import Location
 from mcaptrack.tables.build import with_recording
 from mcaptrack.tables.fields import RECORDING, TABLES
 
@@ -26,9 +27,9 @@ _MEMBERS: Final = b"mcaptrack.members"
 _PREFIX: Final = "recording="
 
 
-def is_folder_of_tables(folder: Path) -> bool:
+def is_folder_of_tables(place: Location) -> TypeGuard[Path]:
     """Whether logs were exported to a folder as Parquet files."""
-    return bool(_members(folder))
+    return isinstance(place, Path) and bool(_members(place))
 
 
 def read_catalogue(folder: Path) -> list[dict[str, Any]]:

@@ -90,11 +90,12 @@ def tracker_name(provenance: Provenance | None) -> str:
     return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
 
-def find_panels(opened: log.Log, prefix: str, suffix: str = views.SUFFIX) -> list[Panel]:
+def find_panels(opened: log.Log, prefix: str, pictures: str | None) -> list[Panel]:
     """Return what can be compared: SORT's tracks, re-tracked ones, and ground truth if there is any.
 
-    ``suffix`` is that of the views to draw. Raises McaptrackError if the log lacks the views of one of the first two.
+    Without ``pictures`` they are scenes. Raises McaptrackError if the log lacks the views of one of the first two.
     """
+    suffix = views.SCENE_SUFFIX if pictures is None else views.SUFFIX
     names = (("", "tracks", ""), ("re-tracked", "retracks", FULL), ("ground truth", "truth", ""))
     out = []
     for title, name, rest in names:

@@ -31,7 +31,15 @@ from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag2 import open_recording
 from mcaptrack.sources.ingest.calibration import is_calibration
-from mcaptrack.sources.ingest.job import FOR_VIDEOS, MOTION, IngestJob, IngestOptions, IngestReport, Progress
+from mcaptrack.sources.ingest.job import (
+    CALIBRATION,
+    FOR_VIDEOS,
+    MOTION,
+    IngestJob,
+    IngestOptions,
+    IngestReport,
+    Progress,
+)
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.content import OTHERS, Format
 from mcaptrack.sources.ingest.labels.cvat import is_cvat
@@ -220,14 +228,35 @@ def ingest(
             job.write(writer, has_clock=bool(into and into.metadata(CLOCK)))
         job.check(output)
         job.report.warnings, job.report.has_labels = warned, job.has_labels
-        job.report.uses_classes = bool(job.roles - {"detections"})
-        job.report.holds_boxes_3d = isinstance(job, Boxes3DJob)
-        is_sized = bool(job.options.calibration) and not job.pictures
-        job.report.uses_size = is_sized or any(labels.format in OTHERS for labels in job.labels.values())
         job.report.uses_camera = bool(job.has_labels or job.has_ground_given or job.options.motion) or isinstance(
             job, VideoJob
         )
+    for lost in job.report.lost:
+        warn(f"lost: {lost}", "lost")
+    _warn_unused(job, options)
     return job.report
+
+
+def _warn_unused(job: IngestJob, options: IngestOptions) -> None:
+    """Warn of options that were given and change nothing."""
+    is_calibrated = bool(options.calibration) or any(topic.endswith(f"/{CALIBRATION}") for topic in job.report.messages)
+    is_sized = bool(job.options.calibration) and not job.pictures
+    uses: dict[str, tuple[object, *tuple[str, ...]]] = {
+        "there is no label file": (job.has_labels, "label_format", "columns"),
+        "no label file is of a detector's format": (
+            is_sized or any(labels.format in OTHERS for labels in job.labels.values()), "size",
+        ),
+        "there are no tracks and no ground truth": (job.roles - {"detections"}, "classes"),
+        "there are no 3D boxes": (isinstance(job, Boxes3DJob), "frame_id"),
+        "there are no tables of nuScenes": (isinstance(job, Boxes3DJob), "scene"),
+        "there is no ground plane": (options.ground_plane or is_calibrated, "point"),
+        "there is no calibration": (is_calibrated, "calibration_name", "calibration_unit"),
+        "the channels of a recording keep their names": (job.report.uses_camera, "camera"),
+    }  # fmt: skip
+    for reason, (is_used, *names) in uses.items():
+        for name in () if is_used else names:
+            if given := options.given(name):
+                warn(f"{given} changes nothing here: {reason}", "option-not-used")
 
 
 # Ingest the motion of a camera alone, for the pictures or the detections of an existing log.

@@ -67,7 +67,7 @@ MOTION: Final = "motion"
 
 #: Options that apply only to videos, and options that are written otherwise than they are named here.
 FOR_VIDEOS: Final = ("image_format", "quality", "keyframe_interval_s")
-_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time"}
+_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "frame"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,9 +122,7 @@ class IngestReport:
     """The result of ``ingest``: messages by topic, ``remarks``, details (``notes``), and what was lost.
 
     ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
-    ``uses_classes``: some of them are tracks or ground truth, which are of chosen classes. ``uses_size``: some of them
-    are in a format of a detector, in which the size of pictures counts.
-    ``uses_camera``: topics below the camera's name were written. ``holds_boxes_3d``: the labels are 3D boxes.
+    ``uses_camera``: topics below the camera's name were written.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
@@ -133,10 +131,7 @@ class IngestReport:
     lost: list[str] = field(default_factory=list)
     warnings: list[Notice] = field(default_factory=list)
     has_labels: bool = False
-    uses_classes: bool = False
-    uses_size: bool = False
     uses_camera: bool = False
-    holds_boxes_3d: bool = False
 
 
 #: The last parts of the topics of the ground plane and the calibration that a user gave.

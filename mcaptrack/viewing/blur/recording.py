@@ -21,7 +21,7 @@ from mcaptrack.geometry.arrays import Bools, Image
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import Camera, cameras
+from mcaptrack.sources.cameras import Camera, cameras, find_camera
 from mcaptrack.sources.foreign.decoding import MessageType, ros_types
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.video import EncodedPicture, H264Encoder, decode_bgr, encode_image
@@ -46,12 +46,13 @@ class Blurred(NamedTuple):
     sources: tuple[str, ...]
 
 
-def blurrable(opened: log.Log, only: str | None = None) -> dict[str, HiddenPeople]:
-    """The channels of pictures in which people can be hidden, each with what to hide.
+def blurrable(opened: log.Log, camera_name: str | None = None) -> dict[str, HiddenPeople]:
+    """The channels of pictures in which people can be hidden, each with what to hide: of all cameras, or of one.
 
-    ``only`` is the prefix of one camera. Raises McaptrackError if there are none; warns of cameras without boxes, of
-    boxes in space that can't be placed in the pictures, and of pictures that no detector saw.
+    Raises McaptrackError if there are none; warns of cameras without boxes, of boxes in space that can't be placed in
+    the pictures, and of pictures that no detector saw.
     """
+    only = None if camera_name is None else find_camera(opened, camera_name)
     out: dict[str, HiddenPeople] = {}
     with_pictures: list[Camera] = [
         camera for camera in cameras(opened) if camera.pictures and (only is None or camera.prefix == only)

@@ -354,28 +354,28 @@ _RANKED: Final = ("frame", "t", "class", "id")
 IGNORED: Final = re.compile(r"[\s_\-.()\[\]/:]+|px$|pixels$")
 
 
-def parse_columns(text: str) -> dict[str, str]:
-    """Columns by key from "x=left,y=top". Raises McaptrackError if it isn't of this form."""
+def parse_columns(columns: str | Mapping[str, str]) -> dict[str, str]:
+    """Columns by key, from "x=left,y=top" or a mapping. Raises McaptrackError if it isn't of this form."""
     out: dict[str, str] = {}
-    for part in filter(None, (part.strip() for part in text.split(","))):
-        key, equals, column = (word.strip() for word in part.partition("="))
-        if not equals or not column:
+    if isinstance(columns, str):
+        parts = (part.partition("=") for part in columns.split(",") if part.strip())
+        pairs = [(key.strip(), column.strip()) for key, _, column in parts]
+    else:
+        pairs = [*columns.items()]
+    for key, column in pairs:
+        if not isinstance(column, str) or not column:
+            part = f"{key}={column}"
             raise McaptrackError(f"`columns=` is like x=left,y=top,w=width,h=height,frame=frame, not {part!r:.60}")
         if key in out:
             raise McaptrackError(f"`columns=` names {key} twice")
         if column in out.values():
             raise McaptrackError(f"`columns=` names {column} for {key} and for another key")
         out[key] = column
-    return check_keys(out)
-
-
-def check_keys(columns: Mapping[str, str]) -> dict[str, str]:
-    """Check the keys of columns. Raises McaptrackError, with the known ones."""
     allowed = (*KEYS, *KEYS_3D)
-    unknown = [key for key in columns if key not in allowed]
+    unknown = [key for key in out if key not in allowed]
     if unknown:
         raise McaptrackError(f"`columns=` knows no {str(unknown[0])!r:.40}; it knows {', '.join(allowed)}")
-    return dict(columns)
+    return out
 
 
 def _named(where: str, header: Sequence[str], chosen: Mapping[str, str]) -> dict[str, int]:
