@@ -18,7 +18,7 @@ from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import VIEW, Provenance, digest
 from mcaptrack.sources.cameras import provenance_of
-from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
+from mcaptrack.sources.sidecar import check_topics, encoding_for
 
 #: Log time in ns, channel number, sequence number and payload of a message.
 Numbered = tuple[int, int, int, bytes]
