@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+from collections.abc import Mapping
+from typing import Final, Literal, TypeAlias
 
 #: How pictures are stored.
 ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
@@ -40,3 +41,9 @@ CameraMotionUse = Literal["auto", "on", "off"]
 TableFormat = Literal["parquet", "arrow", "csv", "jsonl"]
 BagFormat = Literal["rosbag2", "rosbag2-sqlite3"]
 ExchangeFormat = Literal["mot", "kitti", "coco", "cvat", "boxes-csv", "rerun"]
+#: The layouts of a log for viewers, and the end of the name of each file; the first one is the default.
+LAYOUTS: Final[Mapping[str, str]] = {
+    "tracking": ".layout.json",
+    "comparing": ".comparing.layout.json",
+    "predictions": ".predictions.layout.json",
+}

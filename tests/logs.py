@@ -12,6 +12,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from mcaptrack import log
+from mcaptrack.pipeline.views import make_views
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from tests.commands import zones_file
@@ -36,6 +38,15 @@ def stock_messages(path: Path) -> list[tuple[str, int, int, bytes]]:
 def our_messages(path: Path) -> dict[str, list[tuple[int, int, bytes]]]:
     with log.read(path) as opened:
         return {topic: [(m.t_ns, m.sequence, m.payload) for m in opened.messages(topic)] for topic in opened.channels}
+
+
+def write_with_views(opened: log.Log, prefix: str, made: dict[str, Made]) -> dict[str, bytes]:
+    """Write channels into a log with their views; returns the layouts."""
+    state = RunState(opened, prefix, made)
+    drawn = make_views(state, ())
+    assert drawn is not None
+    write(state, None, drawn)
+    return dict(drawn.layouts)
 
 
 def write_log(path: Path, messages, kind: str = "rows") -> None:

@@ -21,10 +21,11 @@ from mcaptrack.foxglove import class_colour
 from mcaptrack.foxglove.views import Drawing, MovingCamera
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.pinhole import Lens
-from mcaptrack.pipeline.write import Made, RunState, write
+from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing.blur.people import outlines
+from tests.logs import write_with_views
 from tests.worlds import ns
 
 PX = 0.13  # coordinates are multiples of a quarter of a pixel
@@ -189,7 +190,7 @@ def with_tracks(path: Path, frames: list[Frame] | None = None) -> tuple[dict[str
     frames = frames or [Frame(ns(10 + n / 10), n, rows((7, 3, 14.0 + n, 2.0, 0.0))) for n in range(PICTURES)]
     made = {"/lidar/retracks": Made.of(TRACKS, frames, Provenance("retrack", {}, frame_id="map"))}
     with log.read(path) as opened, notices.listening(lambda _: None), notices.collected() as warned:
-        layouts = write(RunState(opened, "/lidar", made), (), {}, None)
+        layouts = write_with_views(opened, "/lidar", made)
     return layouts, [one.message for one in warned]
 
 

@@ -233,7 +233,7 @@ class TestLogs:
         assert "0 of 4 cameras would be corrected, 1 already: east\n" in told
         assert "east   corrected already by a shift" in told
         with collected():
-            mcaptrack.track(path, camera="east")
+            mcaptrack.track(path, camera="east", views=True)
             drawn = "/east/ground_plane/view/scene"
             gone = mcaptrack.drop(path, "/east/ground_plane/refined").dropped
             assert gone == ("/east/ground_plane/refined", drawn)  # the outline was that of the corrected plane

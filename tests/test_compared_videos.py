@@ -15,12 +15,13 @@ from mcaptrack import log, notices
 from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.pipeline.write import Made, RunState, write
+from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import comparing, from_above, heat_map
 from mcaptrack.viewing.heat_map import Occupancy
 from tests.commands import call, printed
+from tests.logs import write_with_views
 from tests.worlds import ns
 
 
@@ -63,7 +64,7 @@ def crossing_log(path: Path) -> Path:
         for name, how in (("tracks", "track"), ("retracks", "retrack"))
     }
     with log.read(path) as opened, notices.listening(lambda _: None):
-        write(RunState(opened, "/lidar", made), (), {}, None)
+        write_with_views(opened, "/lidar", made)
     return path
 
 

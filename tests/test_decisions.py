@@ -174,7 +174,7 @@ def test_decisions_do_not_outlive_the_method_that_made_them(template, tmp_path):
     done("retrack", path, "-q")
     with log.read(path) as opened:
         assert topic in opened.channels
-    said = done("retrack", path, "--profile", "paper").err
+    said = done("retrack", path, "--profile", "paper", "--views").err
     assert f"{topic} is removed: retrack by consistency makes none" in said
     with log.read(path) as opened:
         assert topic not in opened.channels

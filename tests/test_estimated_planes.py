@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.plane_from_boxes import PlaneFit, plane_from_boxes, whole_people
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.motion import side_inputs
+from mcaptrack.pipeline.motion import boxes_input, motion_input
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, fit_in_words, fit_of, is_poor, make_plane, plane_in_words
 from mcaptrack.pipeline.staleness import planes_to_json
 from mcaptrack.pipeline.write import Made, RunState
@@ -389,16 +388,14 @@ def test_a_scale_is_poor_where_the_ground_has_less_than_two_heights(deep_px, poo
 class TestBesideThePictures:
     """The boxes of people that the estimate of the camera's motion leaves out."""
 
-    MOTION = SimpleNamespace(transform=EstimateMotion())
-
     @staticmethod
-    def found(path: Path, provenance: Provenance, job: Any = MOTION, made: dict[str, Made] = {}) -> Any:  # noqa: B006
+    def found(path: Path, provenance: Provenance, made: dict[str, Made] = {}) -> Any:  # noqa: B006
         with log.read(written(path, provenance, detections())) as opened:
-            return side_inputs(RunState(opened, "/camera", made), job)
+            return boxes_input(RunState(opened, "/camera", made), EstimateMotion())
 
     def test_they_are_those_of_the_log_by_the_time_of_their_picture(self, tmp_path):
         values, references = self.found(tmp_path / "a.mcap", LEARNED)
-        boxes = {t_ns: some.tolist() for t_ns, some in values["known_boxes"].items()}
+        boxes = {t_ns: some.tolist() for t_ns, some in values.items()}
         assert boxes == {frame.t_ns: BOXES[frame.index].tolist() for frame in detections()}
         assert [*references] == ["/camera/detections"]
         assert len(references["/camera/detections"]) == 64
@@ -408,19 +405,19 @@ class TestBesideThePictures:
         frames.append(Frame(ns(9), 90, frames[0].rows[:0]))
         made = {"/camera/detections": Made.of(DETECTIONS, frames, LEARNED)}
         values, references = self.found(tmp_path / "a.mcap", LEARNED, made=made)
-        assert {t_ns: len(some) for t_ns, some in values["known_boxes"].items()} == {ns(n / 10): 3 for n in range(4)}
+        assert {t_ns: len(some) for t_ns, some in values.items()} == {ns(n / 10): 3 for n in range(4)}
         assert references == {"/camera/detections": made["/camera/detections"].provenance.digest}
 
     @pytest.mark.parametrize("detector", ["knn", "median"])
     def test_a_detector_that_needs_a_still_camera_says_nothing(self, tmp_path, detector):
         still = Provenance("detect", {"detector": detector}, "/camera/video")
-        assert self.found(tmp_path / "a.mcap", still) == ({}, {})
+        assert self.found(tmp_path / "a.mcap", still) is None
 
     def test_a_tracker_that_is_to_use_a_motion_that_is_not_known_says_so(self, tmp_path):
         for choice, said in (("auto", 0), ("on", 1)):
-            job = SimpleNamespace(transform=Sort(camera_motion=choice))
-            with collected() as notices:
-                assert self.found(tmp_path / f"{choice}.mcap", LEARNED, job) == ({}, {})
+            path = written(tmp_path / f"{choice}.mcap", LEARNED, detections())
+            with log.read(path) as opened, collected() as notices:
+                assert motion_input(RunState(opened, "/camera", {}), Sort(camera_motion=choice)) is None
             assert len(notices) == said
             if said:
                 assert notices[0].message.startswith("the motion of the camera is not known: /camera/motion needs")

@@ -17,8 +17,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, sequence_of_log
 from mcaptrack.evaluation.event_text import describe, log_messages
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events, lifecycle_of
-from mcaptrack.pipeline import events
 from mcaptrack.pipeline.checks import describe_origin
+from mcaptrack.pipeline.runner import tally
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
@@ -325,7 +325,7 @@ def watched(path: Path, *topics: str, again: bool = False, output: Path | None =
     heard: list[notices.Notice] = []
     with log.read(path) as opened, notices.listening(heard.append):
         watch = pipeline.Watch(EventOptions(**options), topics, again)
-        report = pipeline.run(opened, "/camera", [], output, watch=watch)
+        report = pipeline.run(opened, "/camera", [], output, finishing=[watch])
     assert report.warnings == heard
     return report, [notice.message for notice in heard]
 
@@ -459,13 +459,13 @@ def test_remade_tracks_make_events_out_of_date_until_run(tmp_path):
     def retrack(profile, watch=None):
         with log.read(path) as opened:
             jobs = pipeline.plan_stage(opened, "/camera", "retrack", PROFILES[profile], keep=("",))
-            return pipeline.run(opened, "/camera", jobs, watch=watch)
+            return pipeline.run(opened, "/camera", jobs, finishing=[watch] if watch else [])
 
     assert retrack("default", pipeline.Watch()).stages == ["retrack", "events"]
     assert retrack("default").stale == []
     assert retrack("paper").stale == ["/camera/retracks/counts", "/camera/retracks/events"]
     with log.read(path) as opened:
-        report = pipeline.run(opened, "/camera", [], watch=pipeline.Watch())
+        report = pipeline.run(opened, "/camera", [], finishing=[pipeline.Watch()])
     assert (report.stages, report.stale) == (["events"], [])
 
 
@@ -524,7 +524,7 @@ def written(path: Path, *channels: tuple[str, Provenance | None, list[Frame]], e
 
 def run_watch(path: Path, **options: Any) -> pipeline.Report:
     with log.read(path) as opened, notices.listening(lambda _: None):
-        return pipeline.run(opened, "/camera", [], watch=pipeline.Watch(**options))
+        return pipeline.run(opened, "/camera", [], finishing=[pipeline.Watch(**options)])
 
 
 TRACKED = ("/camera/tracks", Provenance(INGEST, {}, digest="y"), WALK)
@@ -606,8 +606,6 @@ def test_events_are_tallied_by_kind_for_each_channel():
     rows["kind"] = kinds
     made = Made(EVENTS, [Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], Provenance("events", {}))
     text = made._replace(drawn="foxglove.Log")
-    found = events.tally(
-        {"/a/events": made, "/a/events/view/log": text, "/a/counts": Made(COUNTS, [], made.provenance)}
-    )
+    found = tally({"/a/events": made, "/a/events/view/log": text, "/a/counts": Made(COUNTS, [], made.provenance)})
     counted = {"birth": 2, "miss": 1, "parted": 1}
     assert found == {"/a": dict.fromkeys(EVENT_KINDS.values(), 0) | counted}

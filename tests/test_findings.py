@@ -23,7 +23,8 @@ from tests.commands import done
 from tests.logs import write_channels
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
-run = importlib.import_module("mcaptrack.pipeline.runner")  # the package has a function of that name
+runner = importlib.import_module("mcaptrack.pipeline.runner")
+steps = importlib.import_module("mcaptrack.pipeline.steps")
 
 
 @pytest.fixture
@@ -103,7 +104,7 @@ def test_every_run_repeats_the_warnings_even_with_quiet(path):
 
 
 def test_run_warns_of_too_little_memory(path, monkeypatch):
-    monkeypatch.setattr(run, "free_memory", lambda: 1_000_000)
+    monkeypatch.setattr(steps, "free_memory", lambda: 1_000_000)
     said = json.loads(done("track", path, "--json", "-q").out)["warnings"]
     assert [one["code"] for one in said] == ["memory"]
 
@@ -113,13 +114,13 @@ def test_the_memory_warning_begins_at_the_estimated_need(monkeypatch):
     frames = [Frame(n * 100_000_000, n, DETECTIONS.empty(20)) for n in range(1_000)]
     needed = 400_000_000 + 2_000 * 3_000
     for free, is_little in ((needed, False), (needed - 1, True), (None, False)):
-        monkeypatch.setattr(run, "free_memory", lambda free=free: free)
+        monkeypatch.setattr(steps, "free_memory", lambda free=free: free)
         with notices.collected() as said:
-            run.warn_memory(frames)
+            steps.warn_memory(frames)
         assert [one.code for one in said] == ["memory"] * is_little
-    monkeypatch.setattr(run, "free_memory", lambda: 160_000_000)
+    monkeypatch.setattr(steps, "free_memory", lambda: 160_000_000)
     with notices.collected() as said:
-        run.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
+        steps.warn_memory([Frame(n * 40_000_000, n, DETECTIONS.empty(10)) for n in range(50_000)])
     words = (
         "500,000 boxes, of people who are seen for 6 hours together, take about 0.5 GB of memory, and 0.2 GB are "
         "free: re-tracking has all samples in memory"
@@ -134,10 +135,10 @@ def test_empty_results_are_explained_by_the_input_or_the_transform():
         ([none, some], "no samples of /camera/tracks: "),
     ):
         with notices.collected() as said:
-            run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
+            runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), given, [none])
         assert [one.message.startswith(words) for one in said] == [True]
     with notices.collected() as said:
-        run.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
+        runner.warn_no_rows("sample", "/camera/tracks", TRANSFORMS["sample"](), [none, some], [none, some])
     assert said == []
 
 

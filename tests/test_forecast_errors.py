@@ -262,7 +262,7 @@ ERRORS, SCORES = "/camera/predictions/errors", "/camera/predictions/scores"
 
 def watched(path, again: bool = False):
     with log.read(path) as opened:
-        return pipeline.run(opened, "/camera", [], watch=pipeline.Watch(again=again))
+        return pipeline.run(opened, "/camera", [], finishing=[pipeline.Watch(again=again)], views=True)
 
 
 ALL = {"samples": SAMPLES, "predictions": PREDICTED, "retracks": BECAME, "truth": TRUTH}
@@ -328,7 +328,7 @@ def test_forecasts_without_reference_do_not_fail_a_run(tmp_path):
     odd = predictions(lambda n: {1: [(0.0, 0.0)] * (2 if n == 5 else 3)} if n in (5, 6) else {}, 20)
     path = write_channels(tmp_path / "a.mcap", **ALL | {"predictions": odd})
     with log.read(path) as opened, notices.collected() as heard:
-        pipeline.run(opened, "/camera", [], watch=pipeline.Watch())
+        pipeline.run(opened, "/camera", [], finishing=[pipeline.Watch()])
     assert [notice.message for notice in heard] == [
         "no errors of forecasts: /camera/predictions: not all forecasts have 3 steps"
     ]
@@ -341,7 +341,7 @@ def test_a_recorded_channel_is_never_replaced(tmp_path):
     with log.read(path) as opened, log.extend(opened) as writer:
         writer.add_message(writer.add_channel(SCORES, ("", "", b""), "json", {}), 0, 0, b"{}")
     with log.read(path) as opened, notices.collected() as heard:
-        pipeline.run(opened, "/camera", [], watch=pipeline.Watch(again=True))
+        pipeline.run(opened, "/camera", [], finishing=[pipeline.Watch(again=True)])
     assert [notice.message for notice in heard] == [
         f"no errors of /camera/predictions: they would replace {SCORES}, which was recorded by others (no schema)"
     ]

@@ -77,7 +77,7 @@ def stamped(part: Any) -> int:
 def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
     before = content(robot)
     for words in (("detect", "--topic", IMAGES), ("track",), ("retrack",)):
-        mcaptrack(words[0], robot, "-q", *words[1:])
+        mcaptrack(words[0], robot, "-q", "--views", *words[1:])
     after = content(robot)
     assert after[IMAGES] == before[IMAGES]
     prefix = "/robot/front"
@@ -120,7 +120,7 @@ def test_several_cameras_need_a_choice(tmp_path):
     )
     mcaptrack("run", path, "-q", "--topic", "/left/image")
     mcaptrack("detect", path, "-q", "--topic", "/right/image")
-    mcaptrack("track", path, "-q", "--camera", "right")
+    mcaptrack("track", path, "-q", "--camera", "right", "--views")
     with log.read(path) as opened:
         assert pipeline.camera_at(opened, "/right").pictures == "/right/image"
         assert {"/left/retracks", "/right/tracks", "/right/tracks" + SUFFIX} <= set(opened.channels)
@@ -140,7 +140,7 @@ def test_recorded_channels_are_never_replaced(tmp_path):
             McaptrackError, match=r"/eye/detections is there and was recorded by others .*; leave `topic=` out"
         ):
             pipeline.plan_all(opened, "/eye", source="/eye/image")
-    mcaptrack("detect", path, "-q", "--topic", "/eye/image", "--to", "/eye/found")
+    mcaptrack("detect", path, "-q", "--topic", "/eye/image", "--to", "/eye/found", "--views")
     assert content(path)["/eye/detections"] == content_of(before, tmp_path)["/eye/detections"]
     assert [stamped(m) for _, m in annotations(path, "/eye/found")] == [stamp_of(n) for n in range(50)]
 

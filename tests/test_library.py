@@ -90,7 +90,7 @@ class TestTheSameAsTheCommandLine:
     def test_ingest_and_run_give_the_same_bytes(self, place):
         ingested = mcaptrack.ingest("clip.mp4", "b.mcap", ground_plane="plane.txt", truth="truth.txt")
         assert ingested.messages["/camera/video"] == 30
-        assert mcaptrack.run("b.mcap").stages == ("detect", "track", "sample", "predict", "retrack", "events")
+        assert mcaptrack.run("b.mcap").stages == ("detect", "track", "sample", "predict", "retrack", "events", "views")
         assert Path("b.mcap").read_bytes() == Path("log.mcap").read_bytes()
         again = mcaptrack.run("b.mcap")
         assert (again.stages, again.written_to) == ((), None)

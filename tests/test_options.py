@@ -168,7 +168,7 @@ def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypa
     assert [(one["code"], stage.target in one["message"]) for one in left["warnings"]] == [("other-settings", True)]
     again = json.loads(done("run", "a.mcap", "--no-tables", "--force", "--json").out)
     made = [one for one in again["results"][0]["stages"] if one != "motion"]
-    assert made == ["detect", "track", "sample", "predict", "retrack", "events"]
+    assert made == ["detect", "track", "sample", "predict", "retrack", "events", "views"]
     assert stage.made(folder / "a.mcap") == stage.others()
     after = json.loads(done("run", "a.mcap", "--no-tables", "--json").out)["warnings"]
     assert "other-settings" not in [one["code"] for one in after]

@@ -122,7 +122,7 @@ def test_who_leaves_a_picture_that_sways_has_no_row_until_he_is_back(tmp_path: P
     assert [60 in by_height[n] for n in (5, 15, 25, 45, 55, 75)] == [True, False, True, False, True, False]
     assert [by_height[n].get(150) for n in range(41, 46)] == [False] * 5  # missed, but in the picture
     assert len({int(row["track_id"]) for frame in full for row in frame.rows}) == len(PEOPLE)
-    module = sys.modules["mcaptrack.pipeline.runner"]  # the package has a function of this name
+    module = sys.modules["mcaptrack.pipeline.steps"]
     monkeypatch.setattr(module, "without_unseen", lambda channels, _: pytest.fail("rows are left out"))
     done("retrack", "a.mcap", "--profile", "authors", "-q")  # a track goes on outside, as in the paper
     with pytest.raises(pytest.fail.Exception):

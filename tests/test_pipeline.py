@@ -64,7 +64,7 @@ def finished(footage, tmp_path_factory) -> Path:
 def run_all(path: Path) -> tuple[pipeline.Report, list[str]]:
     said: list[str] = []
     with log.read(path) as opened:
-        return pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera", said.append)), said
+        return pipeline.run(opened, "/camera", pipeline.plan_all(opened, "/camera", said.append), views=True), said
 
 
 def run_stage(
@@ -73,7 +73,7 @@ def run_stage(
     said: list[str] = []
     with log.read(path) as opened:
         jobs = pipeline.plan_stage(opened, "/camera", name, transform, say=said.append, **topics)
-        return pipeline.run(opened, "/camera", jobs, output), said
+        return pipeline.run(opened, "/camera", jobs, output, views=True), said
 
 
 def digests(path: Path) -> dict[str, str]:
@@ -89,7 +89,7 @@ def digests(path: Path) -> dict[str, str]:
 
 def test_missing_inputs_are_made_first_and_reported(fresh):
     report, said = run_stage(fresh, "retrack", Retrack())
-    assert report.stages == ["detect", "track", "sample", "retrack"]
+    assert report.stages == ["detect", "track", "sample", "retrack", "views"]
     assert said == [
         "/camera/detections is missing: running detect",
         "/camera/tracks is missing: running track",
@@ -122,7 +122,7 @@ def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fre
         assert pipeline.is_stale(opened, "/camera/tracks")
         assert not pipeline.is_stale(opened, "/camera/samples")  # not yet: it still comes from the tracks there are
     report, said = run_all(fresh)
-    assert report.stages == ["track", "sample", "predict", "retrack"]
+    assert report.stages == ["track", "sample", "predict", "retrack", "views"]
     assert said[0] == "/camera/tracks was made from an earlier /camera/detections: running track again, as before"
     with log.read(fresh) as opened:
         made = {topic: Provenance.from_metadata(c.metadata) for topic, c in opened.channels.items()}

@@ -23,6 +23,7 @@ from mcaptrack.transforms import STAGES, OcSort, Predict, Retrack, Sample, Sort,
 from tests.logs import write_channels
 from tests.worlds import ns, tracks_at, walk
 
+steps = sys.modules["mcaptrack.pipeline.steps"]
 run = sys.modules["mcaptrack.pipeline.runner"]  # the package has a function of this name
 PLANE = GroundPlane((0.1, 0, 0, 0, 0.1, 0, 0, 0, 1), 640, 480)
 Channels = Mapping[str, tuple[Schema, Provenance | None, Sequence[Frame]]]
@@ -372,8 +373,8 @@ def test_free_memory_is_the_least_that_linux_grants(monkeypatch, files, free):
             raise FileNotFoundError
         return files[path.name]
 
-    monkeypatch.setattr(run.Path, "read_text", read_text)
-    assert run.free_memory() == free
+    monkeypatch.setattr(steps.Path, "read_text", read_text)
+    assert steps.free_memory() == free
 
 
 # What is drawn
@@ -400,7 +401,7 @@ def test_a_view_that_others_recorded_stays_and_that_is_said(tmp_path):
     path = write_channels(tmp_path / "a.mcap", channels)
     with log.read(path) as opened:
         before = [message.payload for message in opened.messages("/camera/truth/view/scene")]
-        report = pipeline.run(opened, "/camera", [], tmp_path / "b.mcap")
+        report = pipeline.run(opened, "/camera", [], tmp_path / "b.mcap", views=True)
     words = "no view at /camera/truth/view/scene, which was recorded by others (mcaptrack.Tracks)"
     assert [(one.message, one.code) for one in report.warnings] == [(words, "left-out")]
     with log.read(tmp_path / "b.mcap") as opened:

@@ -317,15 +317,15 @@ def test_results_that_stand_twice_are_said(copied):
     shutil.copytree(copied.parent, other)
     lone = other / "drive.mcap"
     done("drop", lone, *ours(lone))
-    done("track", lone, "--topic", "/lidar/boxes", "--sidecar")
+    done("track", lone, "--topic", "/lidar/boxes", "--sidecar", "--views")
     shutil.copy(lone.with_name("drive.results.mcap"), copied.with_name("drive.results.mcap"))
-    result = done("predict", copied, "--topic", "/lidar/tracks", "--predictor", "cv")
+    result = done("predict", copied, "--topic", "/lidar/tracks", "--predictor", "cv", "--views")
     (line,) = [line for line in result.err.splitlines() if "and in drive.results.mcap" in line]
     assert f"stand in {copied} and in drive.results.mcap; the second is read and replaced" in line
 
 
 def test_topics_that_ros_does_not_accept_are_said(copied):
-    result = done("track", copied, "--topic", "/lidar/boxes", "--to", "/lidar/2nd")
+    result = done("track", copied, "--topic", "/lidar/boxes", "--to", "/lidar/2nd", "--views")
     assert "ROS 2 accepts no topic like /lidar/2nd, /lidar/2nd/view/scene: its tools read these messages" in result.err
     by_rosbags(copied.parent)
     result = done("drop", copied, "/lidar/2nd*")
@@ -384,7 +384,7 @@ def test_times_that_ros_does_not_have_are_refused_in_one_line(tmp_path):
     payloads = cdr_codec(TRACKS).encode_all(rows, np.array([1])) * 20
     path = odd(tmp_path / "a.mcap", "/own/tracks", (name, encoding, data), payloads, 2**31 * 10**9)
     before = path.read_bytes()
-    result = call("predict", path, "--topic", "/own/tracks", "--in-place", "--predictor", "cv")
+    result = call("predict", path, "--topic", "/own/tracks", "--in-place", "--predictor", "cv", "--views")
     assert result.code == 1
     assert "ROS has times from 1970 to 2038 only" in result.err.splitlines()[-1]
     assert path.read_bytes() == before

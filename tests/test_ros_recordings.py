@@ -175,7 +175,7 @@ def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
 
 
 def test_in_place_is_refused_where_results_stand_beside(path):
-    done("detect", path, "--detector", "knn")
+    done("detect", path, "--detector", "knn", "--views")
     before = on_disk(path.parent)
     result = call("track", path, "--in-place")
     assert result.code == 1
@@ -184,7 +184,7 @@ def test_in_place_is_refused_where_results_stand_beside(path):
 
 
 def test_a_copy_without_channels_has_its_results_beside_it(path, tmp_path):
-    done("detect", path, "--detector", "knn")
+    done("detect", path, "--detector", "knn", "--views")
     before = on_disk(path.parent)
     out = tmp_path / "small.mcap"
     done("drop", path, "/robot/front/image", "/robot/front/detections/*", "-o", out)

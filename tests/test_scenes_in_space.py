@@ -14,9 +14,10 @@ from mcaptrack import foxglove, log
 from mcaptrack.foxglove import class_colour
 from mcaptrack.foxglove.views import Drawing
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.pipeline.write import Made, RunState, write
+from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
+from tests.logs import write_with_views
 from tests.worlds import ns, tracks_at
 
 M = 1 / 128 + 1e-9
@@ -229,7 +230,7 @@ def with_tracks(path: Path, frame_id: str = "map") -> dict[str, bytes]:
         "/lidar/retracks/predictions": Made.of(PREDICTIONS, forecasts(), how("retrack", "/lidar/tracks")),
     }
     with log.read(path) as opened:
-        return write(RunState(opened, "/lidar", made), (), {}, None)
+        return write_with_views(opened, "/lidar", made)
 
 
 def frames_drawn(path: Path) -> set[str]:
@@ -310,7 +311,7 @@ def test_people_on_the_ground_plane_keep_their_frame(tmp_path):
     frames = [Frame(ns(1000 + n), n, tracks_at({1: (1.0, 2.0)})) for n in range(3)]
     with log.read(path) as opened:
         made = {"/camera/tracks": Made.of(TRACKS, frames, Provenance("track", {}))}
-        write(RunState(opened, "/camera", made), (), {}, None)
+        write_with_views(opened, "/camera", made)
     with log.read(path) as opened:
         (added,) = (FrameTransform.FromString(m.payload) for m in opened.messages("/camera/view/tf"))
         assert added.child_frame_id == "camera/ground"

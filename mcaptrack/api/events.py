@@ -89,4 +89,4 @@ def events(
         return []
 
     watch = Watch(EventOptions(similarity, gate_m, min_iou), topics=names_of(topic), again=True)
-    return work(Where(log, camera, None, output, sidecar, force), plan, watch, progress, None)
+    return work(Where(log, camera, None, output, sidecar, force), plan, progress, finishing=(watch,), views=True)

@@ -17,6 +17,7 @@ from mcaptrack.api.options import (
     Output,
     Reports,
     Sidecar,
+    Views,
     chooser,
     no_progress,
 )
@@ -58,6 +59,7 @@ def fuse(
     to: Annotated[str, Option(FILES)] = "world",
     output: Output = None,
     sidecar: Sidecar = None,
+    views: Views = False,
     force: Force = False,
     progress: Reports = no_progress,
 ) -> mcaptrack.RunResult:
@@ -113,6 +115,6 @@ def fuse(
         raise McaptrackError(f"`to={to!r}` is no name of a scene; give one such as world")
 
     def act(opened: logs.Log, target: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
-        return pipeline.fuse_cameras(opened, names, to.strip("/"), chosen, offsets, target, progress)
+        return pipeline.fuse_cameras(opened, names, to.strip("/"), chosen, offsets, target, progress, views=views)
 
     return change(Where(log, None, None, output, sidecar, force), act, progress, None)

@@ -200,14 +200,14 @@ def show_log(
     progress: Progress,
 ) -> Player:
     """Return a player, or a still of a time, of an open log. See ``Recording.show``."""
-    with warnings_about(opened.path) as warnings:
-        source = PictureSource(opened, pipeline.find_camera(opened, camera), topics)
+    with warnings_about(opened.path) as warnings, pipeline.with_views(opened) as (complete, _):
+        source = PictureSource(complete, pipeline.find_camera(opened, camera), topics)
         if at_s is None:
-            shown = _player(opened, source, choice, max_mb, progress)
+            shown = _player(complete, source, choice, max_mb, progress)
         else:
             unused = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
             warn_unused("a still is one picture", **unused)
-            shown = _still(opened, source, source.number_at(at_s), choice.width_px)
+            shown = _still(complete, source, source.number_at(at_s), choice.width_px)
     return replace(shown, warnings=tuple(dict.fromkeys(warnings)))
 
 

@@ -44,6 +44,10 @@ Sidecar = Annotated[
         "that ROS tools read, otherwise into the log.",
     ),
 ]
+Views = Annotated[
+    bool,
+    Option(FILES, help="Draw the results for viewers, too; `mcaptrack run` does so at its end."),
+]
 Force = Annotated[bool, Option(FILES, help="Overwrite the output file if it exists.")]
 Reports = Annotated[Progress, PythonOnly("Called as ``progress(stage, done, total)``.")]
 GroundPlane = Annotated[

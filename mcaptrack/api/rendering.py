@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -161,7 +162,10 @@ def render(
     options = rendering.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
     views: Sequence[str] = ()
     blurred: Sequence[str] = ()
-    with warnings_about(path) as warnings, logs.read(path) as opened:
+    with warnings_about(path) as warnings, ExitStack() as stack:
+        opened = stack.enter_context(logs.read(path))
+        if not is_log:
+            opened, _ = stack.enter_context(pipeline.with_views(opened))
         warn_unused("the name of the output says what is written", gif=gif and output is not None)
         if is_log:
             period = {"start_s": bool(start_s), "end_s": end_s is not None}

@@ -205,7 +205,11 @@ def run(
     counted = ZoneWatch(given_zones, options=ZoneOptions() if given_zones else None, force=force)
     where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
     earlier = _log_before(as_location(log), follows)
-    return work(where, plan, watch, progress, tables, plane, counted, fuses=Fusing(names, fuse, joins), follows=earlier)
+    finishing = (watch, counted) if watch else (counted,)
+    fuses = Fusing(names, fuse, joins)
+    return work(
+        where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier
+    )
 
 
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:

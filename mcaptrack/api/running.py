@@ -140,6 +140,21 @@ class Where:
     sidecar: bool | None
     force: bool
 
+    def places(self) -> tuple[Location, Path | None]:
+        """Return the log, and the copy to write instead, if any. Raises McaptrackError for places that don't fit."""
+        path = as_location(self.log)
+        output = None if self.output is None else log_output(self.output, path)
+        if output is None:
+            return path, None
+        if self.sidecar is not None:
+            raise McaptrackError(
+                f"`sidecar={self.sidecar}` and `output=` are two places for the same results; give one"
+            )
+        if is_same_file(output, path):
+            raise McaptrackError(f"{path} is both input and output; leave `output=` out to add to it in place")
+        refuse_overwrite(output, self.force)
+        return path, output
+
 
 class Fusing(NamedTuple):
     """The cameras to run, all without names; whether they are fused to a scene; and by which fuser, if it is named."""
@@ -152,33 +167,34 @@ class Fusing(NamedTuple):
 def work(
     where: Where,
     plan: Plan,
-    watch: Watch | None,
     progress: Progress,
-    tables: bool | None,
+    tables: bool | None = None,
+    *,
+    finishing: Sequence[Watch | ZoneWatch] = (),
+    views: bool = False,
     plane: PlaneChoice = AS_BEFORE,
-    zones: ZoneWatch | None = None,
     fuses: Fusing | None = None,
     follows: Location | None = None,
 ) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises.
 
-    With ``fuses`` all cameras are run, if none is named, and a scene of several is made again if it is out of date. Ids
-    go on from those of the log that this one ``follows``.
+    ``finishing`` is done at the end, and with ``views`` channels are drawn. With ``fuses`` all cameras are run, if none
+    is named, and a scene of several is made again if it is out of date. Ids go on from those of the log that this one
+    ``follows``.
     """
-    force = where.force
     continued: list[pipeline.Continued] = []
+    topics = next((step.topics for step in finishing if step.topics), ())
 
     def run_at(prefix: str, progress: Progress) -> Act:
         """Run a camera; without a prefix the only one."""
 
         def act(opened: logs.Log, output: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
-            topics = watch.topics if watch else zones.topics if zones else ()
             at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
             fused = {}
             if fuses is not None:
-                fused = pipeline.fuse_again(opened, at, force, say, progress, not fuses.names, fuses.fuser)
-            run = partial(pipeline.run, opened, at, output=output, progress=progress, watch=watch, plane=plane)
-            run = partial(run, boxes=boxes, zones=zones, fused=fused)
+                fused = pipeline.fuse_again(opened, at, where.force, say, progress, not fuses.names, fuses.fuser)
+            run = partial(pipeline.run, opened, at, output=output, progress=progress, plane=plane, boxes=boxes)
+            run = partial(run, finishing=finishing, views=views, fused=fused)
             if follows is None:
                 return at, run(plan(opened, at, say, fused, ()))
             with logs.read(follows) as earlier:
@@ -214,65 +230,43 @@ def change(
 ) -> RunResult:
     """Change one log; ``tables`` as for ``work``. With ``each`` all its cameras are run, if it has several."""
     began = monotonic()
-    path = as_location(where.log)
-    output = None if where.output is None else log_output(where.output, path)
+    path, output = where.places()
     target: Location = output or path
-    notes = Notes()
-    if output is not None and where.sidecar is not None:
-        raise McaptrackError(f"`sidecar={where.sidecar}` and `output=` are two places for the same results; give one")
-    boxes = BoxesRead()
+    notes, boxes, place = Notes(), BoxesRead(), SidecarChoice(where.sidecar)
     with warnings_about(target) as warnings:
-        if output is not None:
-            if is_same_file(output, path):
-                raise McaptrackError(f"{path} is both input and output; leave `output=` out to add to it in place")
-            refuse_overwrite(output, where.force)
-        place = SidecarChoice(where.sidecar)
         with logs.read(path, sidecar=None if output else place) as opened:
             if output is None:
                 opened.lock()  # a second process is refused before it computes anything
             if tables and not where.force:
                 refuse_foreign_products(opened, target)
-            has_several = each is not None and each.chooses(opened, notes.say)
-            done = [] if has_several else [Done("", *act(opened, output, notes.say, boxes))]
+            several = each if each is not None and each.chooses(opened, notes.say) else None
+            done = [] if several else [Done("", *act(opened, output, notes.say, boxes))]
             written_to = output or opened.parts[-1].path
             report = together([camera.report for camera in done])
-            named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
-        if each is not None and has_several:
-            done = each.run(path, output, place, notes.say, progress)
+            cameras = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
+        if several:
+            done = several.run(path, output, place, notes.say, progress)
             report = together([camera.report for camera in done])
             with logs.read(target) as opened:
                 report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
-                named = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
+                cameras = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
         for topic in report.stale:
-            warn_stale(topic, target, named)
+            warn_stale(topic, target, cameras)
         with report.watch.part("tables") if tables else nullcontext():
             products = write_products(
-                target,
-                is_new=report.is_written,
-                tables=bool(tables),
-                force=where.force,
-                progress=progress,
-                boxes=boxes,
+                target, is_new=report.is_written, tables=bool(tables), force=where.force, progress=progress, boxes=boxes
             )
         if tables and not isinstance(target, Path):
             notes.say(
                 f"no tables are written, because {target} is in a store; {call('export', target)} writes them here"
             )
         refuse_failed(target, done)
-        counted = {}
-        if report.has_zones:
-            with logs.read(target) as opened:
-                zones_counted = [
-                    counted_zone for camera in done for counted_zone in pipeline.counted_zones(opened, camera.prefix)
-                ]
-                counted = {channel.topic: channel.totals for channel in zones_counted}
+        zones = _zones_counted(target, done) if "zones" in report.finished else {}
         summaries: dict[str, Summary] = {}
         if tables is not None:
-            with report.watch.part("summary"), logs.read(target) as opened:
-                for camera in done:
-                    with notices.naming(camera.name) if has_several else nullcontext():
-                        summaries[camera.name] = pipeline.summarise(opened, camera.prefix, boxes)
-    scene = next((camera.name for camera in reversed(done) if camera.is_scene), None) if has_several else ""
+            with report.watch.part("summary"):
+                summaries = _summaries(target, done, boxes)
+    scene = next((camera.name for camera in reversed(done) if camera.is_scene), None) if several else ""
     return RunResult(
         log=target,
         stages=tuple(report.stages),
@@ -280,7 +274,7 @@ def change(
         rows=report.rows,
         tracks=report.tracks,
         events=report.events,
-        zones=counted,
+        zones=zones,
         stale=tuple(report.stale),
         layouts=tuple(products.layouts),
         tables=products.rows,
@@ -291,14 +285,29 @@ def change(
         notes=tuple(notes),
         seconds=round(monotonic() - began, 3),
         seconds_by_part={name: round(seconds, 3) for name, seconds in report.watch.seconds.items()},
-        cameras={camera.name: CameraResult.of(camera, summaries[camera.name]) for camera in done}
-        if has_several
-        else {},
-        left_out=dict(each.left_out) if each is not None else {},
+        cameras={camera.name: CameraResult.of(camera, summaries[camera.name]) for camera in done} if several else {},
+        left_out=dict(several.left_out if several else {}),
         not_fused=each.not_fused if each is not None else "",
         files=tuple(products.owed),
         written_tables=tuple(products.tables),
     )
+
+
+def _zones_counted(target: Location, done: Sequence[Done]) -> dict[str, list[ZoneTotals]]:
+    """Return the totals of zones in a log by the topic of the tracks."""
+    with logs.read(target) as opened:
+        counted = (channel for camera in done for channel in pipeline.counted_zones(opened, camera.prefix))
+        return {channel.topic: channel.totals for channel in counted}
+
+
+def _summaries(target: Location, done: Sequence[Done], boxes: BoxesRead) -> dict[str, Summary]:
+    """Return what a log holds now, by the name of each camera, "" for the only one."""
+    summaries: dict[str, Summary] = {}
+    with logs.read(target) as opened:
+        for camera in done:
+            with notices.naming(camera.name) if camera.name else nullcontext():
+                summaries[camera.name] = pipeline.summarise(opened, camera.prefix, boxes)
+    return summaries
 
 
 def warn_stale(topic: str, log: Location, cameras: Mapping[str, str] = {}) -> None:
@@ -363,6 +372,7 @@ def run_stage(
     mode: Mode | None = None,
     frame: str | None = None,
     make: Callable[[str], Transform] | None = None,
+    views: bool = False,
 ) -> RunResult:
     """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform.
 
@@ -376,4 +386,4 @@ def run_stage(
         return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
     where = Where(log, camera, topic, output, sidecar, force)
-    return work(where, plan, None, progress, None, PlaneChoice(frame=frame))
+    return work(where, plan, progress, views=views, plane=PlaneChoice(frame=frame))

@@ -19,6 +19,7 @@ from mcaptrack.api.options import (
     To,
     Topic,
     Value,
+    Views,
     chooser,
     no_progress,
 )
@@ -46,6 +47,7 @@ def detect(
     camera: Camera = None,
     output: Output = None,
     sidecar: Sidecar = None,
+    views: Views = False,
     force: Force = False,
     stages: Stages = None,
     progress: Reports = no_progress,
@@ -84,7 +86,7 @@ def detect(
     from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("detect", detector, options)
-    return run_stage("detect", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
+    return run_stage("detect", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
 
 
 @declared(most_used=("output", "topic", "to", "camera", "force"))
@@ -153,6 +155,7 @@ def track(
     frame: Frame = None,
     output: Output = None,
     sidecar: Sidecar = None,
+    views: Views = False,
     force: Force = False,
     stages: Stages = None,
     progress: Reports = no_progress,
@@ -196,7 +199,20 @@ def track(
     chosen = None if tracker is None else transform_of("track", tracker, options)
     make = partial(transform_of, "track", options=options)
     return run_stage(
-        "track", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, frame=frame, make=make
+        "track",
+        chosen,
+        log,
+        topic,
+        to,
+        camera,
+        output,
+        sidecar,
+        force,
+        stages,
+        progress,
+        frame=frame,
+        make=make,
+        views=views,
     )
 
 
@@ -210,6 +226,7 @@ def sample(
     camera: Camera = None,
     output: Output = None,
     sidecar: Sidecar = None,
+    views: Views = False,
     force: Force = False,
     stages: Stages = None,
     progress: Reports = no_progress,
@@ -251,7 +268,7 @@ def sample(
     from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("sample", transform, options)
-    return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
+    return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
 
 
 @declared(most_used=("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"))
@@ -264,6 +281,7 @@ def predict(
     camera: Camera = None,
     output: Output = None,
     sidecar: Sidecar = None,
+    views: Views = False,
     force: Force = False,
     stages: Stages = None,
     progress: Reports = no_progress,
@@ -306,7 +324,7 @@ def predict(
     from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("predict", predictor, options)
-    return run_stage("predict", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
+    return run_stage("predict", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
 
 
 @declared(most_used=("profile", "mode", "retracker", "predictor", "max_age_s", "output", "topic", "to", "force"))
@@ -321,6 +339,7 @@ def retrack(
     camera: Camera = None,
     output: Output = None,
     sidecar: Sidecar = None,
+    views: Views = False,
     force: Force = False,
     stages: Stages = None,
     progress: Reports = no_progress,
@@ -373,4 +392,6 @@ def retrack(
     if retracker is None:
         retracker = PROFILES[profile or "default"]
     chosen = transform_of("retrack", retracker, options)
-    return run_stage("retrack", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, mode=mode)
+    return run_stage(
+        "retrack", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, mode=mode, views=views
+    )

@@ -6,6 +6,7 @@ import json
 import threading
 import webbrowser
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.location import sibling
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path
+from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
 from mcaptrack.viewing import links
 from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, is_about, viewer_links, with_links
 from mcaptrack.viewing.serving import Server
@@ -81,10 +82,17 @@ class LogServer:
     """
 
     def __init__(
-        self, contents: _Contents, port: int, lichtblick: str, notes: tuple[str, ...], warnings: tuple[Notice, ...]
+        self,
+        contents: _Contents,
+        port: int,
+        lichtblick: str,
+        notes: tuple[str, ...],
+        warnings: tuple[Notice, ...],
+        views: ExitStack | None = None,
     ) -> None:
         self._server = Server(dict(contents.files) | dict(contents.layouts.values()), port)
         self._thread: threading.Thread | None = None
+        self._views = views  # a temporary file with views that the log lacks
         self.logs = tuple(self._server.address(name) for name in contents.files)
         self.layouts = {name: self._server.address(file) for name, (file, _) in contents.layouts.items()}
         first = next(iter(self.layouts.values()), None)
@@ -146,6 +154,8 @@ class LogServer:
             self._thread.join()
             self._thread = None
         self._server.server_close()
+        if self._views is not None:
+            self._views.close()
 
 
 @declared()
@@ -215,21 +225,26 @@ def view(
     if at_s is not None and event is not None:
         raise McaptrackError("`at_s=` and `event=` both say where viewers open; leave one out")
     path, notes = log_file(log), Notes()
-    with collected() as warnings, logs.read(path) as opened:
+    with ExitStack() as stack, collected() as warnings:
+        opened = stack.enter_context(logs.read(path))
         if not opened.is_on_disk:
             raise McaptrackError(
                 f"viewers can't open {path}: a change of it goes on or was interrupted. The next command that writes "
                 f"to it mends it; {call('recover', path)} saves it to another file"
             )
-        files = {part.path.name: Path(part.real_path) for part in opened.parts}
-        layouts = _chosen_layouts(path, opened, layout, notes)
+        shown, made_layouts = stack.enter_context(with_views(opened))
+        files = {part.path.name: Path(part.real_path) for part in shown.parts}
+        if shown is not opened:
+            notes.say(f"views that the log lacks are drawn in {[*files][-1]} for now; {call('run', path)} keeps them")
+        layouts = _chosen_layouts(path, opened, layout, made_layouts, notes)
         events = links.find_moments(opened)
         at_ns, why = _opening(opened, events, at_s, event)
         if opened.start_ns or opened.end_ns:
             notes.say(f"viewers open at {links.seconds_of(opened, at_ns):.1f} s, {why}")
         _say_trouble(opened, notes)
         contents = _Contents(files, layouts, events, _report(path, opened, notes), opened.start_ns, at_ns)
-    server = LogServer(contents, port, lichtblick, tuple(notes), tuple(dict.fromkeys(warnings)))
+        said = tuple(notes), tuple(dict.fromkeys(warnings))
+        server = LogServer(contents, port, lichtblick, *said, stack.pop_all() if shown is not opened else None)
     if browser:
         webbrowser.open(server.links["Lichtblick"])
     return server
@@ -285,7 +300,7 @@ def _say_trouble(opened: logs.Log, notes: Notes) -> None:
 
 
 def _chosen_layouts(
-    path: Path, opened: logs.Log, chosen: PathLike | None, notes: Notes
+    path: Path, opened: logs.Log, chosen: PathLike | None, made_layouts: Mapping[str, bytes], notes: Notes
 ) -> dict[str, tuple[str, Path | bytes]]:
     """Return the layouts to serve by name: the name of each file, and its content or path."""
     if chosen is not None and str(chosen) not in LAYOUTS and _is_file_name(chosen):
@@ -297,7 +312,7 @@ def _chosen_layouts(
         except (ValueError, RecursionError):
             raise McaptrackError(f"{file} is no layout: it is not JSON") from None
         return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}
-    layouts = _layouts(path, opened, notes)
+    layouts = _layouts(path, opened, made_layouts, notes)
     if chosen is not None and str(chosen) not in layouts:
         text = ", ".join(layouts) or "none"
         raise McaptrackError(f"{path} has no layout {chosen}; it has {text}. A file of a layout ends with .json")
@@ -313,8 +328,11 @@ def _is_file_name(chosen: PathLike) -> bool:
     return Path(chosen).suffix.lower() == ".json" or len(Path(chosen).parts) > 1 or Path(chosen).is_file()
 
 
-def _layouts(path: Path, opened: logs.Log, notes: Notes) -> dict[str, Path | bytes]:
-    """Return the layouts of a log: files beside it, otherwise what it keeps. Notes tell of files that were edited."""
+def _layouts(path: Path, opened: logs.Log, made_layouts: Mapping[str, bytes], notes: Notes) -> dict[str, Path | bytes]:
+    """Return the layouts of a log: files beside it, otherwise those made now, or those that it keeps.
+
+    Notes tell of files that were edited.
+    """
     layouts: dict[str, Path | bytes] = {}
     for name in LAYOUTS:
         kept, file = opened.attachment(attachment_of(name)), layout_path(path, name)
@@ -328,8 +346,8 @@ def _layouts(path: Path, opened: logs.Log, notes: Notes) -> dict[str, Path | byt
             warn(f"{file} can't be served ({why}); the log's own layout is used", "left-out")
         if content is not None:
             layouts[name] = file
-        elif kept is not None:
-            layouts[name] = kept
+        elif kept is not None or name in made_layouts:
+            layouts[name] = made_layouts.get(name, kept or b"")
         if content is not None and kept is not None and content != kept:
             notes.say(f"{file} differs from the layout in the log; the file is served")
     return layouts

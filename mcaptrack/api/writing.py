@@ -17,10 +17,10 @@ from mcaptrack.api.running import warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.location import Location
+from mcaptrack.pipeline.views import make_views
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, Provenance
-from mcaptrack.sources.camera_motion import path_of, tracks_topic
 from mcaptrack.sources.cameras import USUAL
 from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.sources.own_rows import UNNUMBERED, checked_names
@@ -62,8 +62,8 @@ def write_rows(
         own_frame = frame_id or (_FRAME if schema is DETECTIONS and _in_space(frames) else "")
         how = Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names, frame_id=own_frame)
         channel = Made.of(schema, frames, how)
-        path_of_camera, _ = path_of(opened, prefix, tracks_topic(prefix))
-        write(RunState(opened, prefix, {name: channel}), planes, {}, None, path_of_camera)
+        state = RunState(opened, prefix, {name: channel})
+        write(state, None, make_views(state, planes))
         stale = pipeline.outdated_by(opened, {name: channel.provenance.digest})
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path, {topic_of_stage: pipeline.camera_to_name(opened, topic_of_stage)})

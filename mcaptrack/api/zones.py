@@ -131,7 +131,7 @@ def zones(
         return []
 
     watch = pipeline.ZoneWatch(wanted, names_of(topic), options, force)
-    return work(Where(log, camera, None, output, sidecar, force), plan, None, progress, None, zones=watch)
+    return work(Where(log, camera, None, output, sidecar, force), plan, progress, finishing=(watch,), views=True)
 
 
 @declared()

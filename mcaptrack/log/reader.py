@@ -271,9 +271,12 @@ class Log:
             self.channels[topic] = first._replace(messages=sum(channel.messages for channel in those))
 
     def attach_results(self, results: Log, is_new: bool) -> None:
-        """Add the channels of a sidecar, which takes new channels from now on."""
+        """Add the channels of a sidecar, which takes new channels from now on; beside one that is there already."""
         results.is_new = is_new
-        self.results = results
+        if self.results is None:
+            self.results = results
+        else:
+            self.results.attach_results(results, is_new)
         self.channels |= results.channels
 
     def __enter__(self) -> Self:
@@ -337,7 +340,7 @@ class Log:
     @property
     def parts(self) -> tuple[Log, ...]:
         """The log itself, and its sidecar if it has one."""
-        return (self,) if self.results is None else (self, self.results)
+        return (self,) if self.results is None else (self, *self.results.parts)
 
     @property
     def size(self) -> int:
@@ -351,7 +354,7 @@ class Log:
 
     def part(self, topic: str) -> Log:
         """The part (log or sidecar) that holds a topic."""
-        return self.results if self.results is not None and topic in self.results.channels else self
+        return self.results.part(topic) if self.results is not None and topic in self.results.channels else self
 
     @property
     def start_ns(self) -> int:

@@ -46,7 +46,7 @@ class Job(NamedTuple):
         """Return the topics that are written to the log."""
         suffixes = [suffix for suffix in self.transform.writes if not self.keep or suffix in self.keep]
         kept = {f"{self.target}/{suffix}".rstrip("/") for suffix in suffixes}
-        return kept | {self.target + FULL} if STAGES[self.stage].at_video_rate and self.target in kept else kept
+        return kept | {self.target + FULL} if "video-rate" in STAGES[self.stage].after and self.target in kept else kept
 
 
 def superseded(opened: log.Log, job: Job) -> list[str]:

@@ -20,6 +20,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.transform_tree import TransformTree
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.scene_views import SceneOnPictures
+from mcaptrack.pipeline.write import View
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import frame_times, has_any
 from mcaptrack.schema.provenance import VIEW, Provenance
@@ -31,8 +32,8 @@ from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
 from mcaptrack.sources.foreign.flatten import message_decoder, message_type_of
 from mcaptrack.transforms import FULL, STAGES
 
-#: Endings of channels without a view: another channel shows the same tracks at more times.
-_NOT_SHOWN: Final = ("/samples", "/online")
+#: Endings of the topics of channels without a view: another channel shows the same tracks at more times.
+NOT_SHOWN: Final = ("/samples", "/online")
 
 
 # Which views of a log a video shows: on its pictures, on those of calibrated cameras, or from above.
@@ -193,16 +194,6 @@ def has_bodies(schema: Schema, frames: Sequence[Frame]) -> bool:
     return has_any(schema, frames, lambda rows: np.isfinite(rows["z_m"]))
 
 
-class View(NamedTuple):
-    """A channel that draws another; ``messages`` are time in ns, sequence number and payload."""
-
-    topic: str
-    schema_name: str
-    provenance: Provenance
-    group: str
-    messages: Iterator[tuple[int, int, bytes]]
-
-
 @dataclass
 class ViewFactory:
     """Draws the channels of a camera: in its pictures, and in the frame of their metres.
@@ -224,44 +215,48 @@ class ViewFactory:
     def views(self, shown: Mapping[str, ChannelToDraw], start_ns: int) -> Iterator[View]:
         """Yield the views of these channels, and, once, the transforms to the frames that no other names."""
         for topic, channel in shown.items():
-            made_from = Provenance(VIEW, {}, topic, channel.digest)
-            group = channel.made_by
-            frame_id = frame_of(self.prefix, channel)
             if topic == f"{self.prefix}/ground_plane":
-                outline = views.ground.outlines(self.planes, start_ns, frame_id)
-                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, outline)
-            if channel.schema not in views.DRAWN or topic.endswith(_NOT_SHOWN) or topic + FULL in shown:
-                continue  # another channel shows the same tracks at more times
-            is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
-            frames, names = channel.frames, channel.classes
-            drawing = views.Drawing(topic, channel.schema, frames, self.planes, is_retracked, names, self.path)
-            is_solid = channel.is_solid()
-            if len(self.picture_ns) and not is_solid:
-                drawn = drawing.on_pictures(self.picture_ns, self.stamp_ns)
-                yield View(topic + views.SUFFIX, foxglove.ANNOTATIONS, made_from, group, drawn)
-            for pictures, camera in self.cameras.items() if is_solid and channel.schema is not DETECTIONS else ():
-                seen = drawing.on_camera(camera, channel.bodies)
-                yield View(topic + views.SUFFIX + pictures, foxglove.ANNOTATIONS, made_from, group, seen)
-            for member in self.scene.cameras if channel.schema is not DETECTIONS else ():
-                rows, planes = self.scene.on_camera(member, channel.schema, frames, is_true=not channel.made_by)
-                on_picture = views.Drawing(topic, channel.schema, rows, planes, is_retracked, names)
-                seen = on_picture.on_pictures(member.clock.t_ns, member.clock.stamp_ns)
-                yield View(topic + views.SUFFIX + member.pictures, foxglove.ANNOTATIONS, made_from, group, seen)
-            if channel.is_on_ground():
-                own_ns = frame_times(channel.frames)
-                t_ns = self.picture_ns if len(self.picture_ns) and not is_solid else own_ns
-                scene = drawing.on_ground(t_ns, frame_id, channel.bodies)
-                yield View(topic + views.SCENE_SUFFIX, foxglove.SCENE, made_from, group, scene)
-        on_ground = {topic: channel for topic, channel in shown.items() if channel.is_on_ground()}
+                outline = views.ground.outlines(self.planes, start_ns, frame_of(self.prefix, channel))
+                yield self._view(topic, channel, views.SCENE_SUFFIX, foxglove.SCENE, outline)
+            # Where another channel shows the same tracks at more times, that is drawn.
+            if channel.schema in views.DRAWN and not topic.endswith(NOT_SHOWN) and topic + FULL not in shown:
+                yield from self._drawn(topic, channel)
+        on_ground = next(((topic, channel) for topic, channel in shown.items() if channel.is_on_ground()), None)
         if on_ground and self.frames:
             transforms = [
                 (start_ns, number, foxglove.pack_transform(start_ns, views.ground.world_of(self.prefix), frame_id))
                 for number, frame_id in enumerate(self.frames)
             ]
             self.frames = ()
-            topic, channel = next(iter(on_ground.items()))
-            made_from = Provenance(VIEW, {}, topic, channel.digest)
+            made_from = Provenance(VIEW, {}, on_ground[0], on_ground[1].digest)
             yield View(frame_topic(self.prefix), foxglove.TRANSFORM, made_from, "", iter(transforms))
+
+    def _view(self, topic: str, channel: ChannelToDraw, suffix: str, schema_name: str, messages: Iterator[Any]) -> View:
+        made_from = Provenance(VIEW, {}, topic, channel.digest)
+        return View(topic + suffix, schema_name, made_from, channel.made_by, messages)
+
+    def _drawn(self, topic: str, channel: ChannelToDraw) -> Iterator[View]:
+        """Yield the views of one channel."""
+        schema, frames, names, is_solid = channel.schema, channel.frames, channel.classes, channel.is_solid()
+        is_retracked = channel.made_by in STAGES and STAGES[channel.made_by].repairs_tracks
+        drawing = views.Drawing(topic, schema, frames, self.planes, is_retracked, names, self.path)
+        on_pictures = len(self.picture_ns) > 0 and not is_solid
+        if on_pictures:
+            messages = drawing.on_pictures(self.picture_ns, self.stamp_ns)
+            yield self._view(topic, channel, views.SUFFIX, foxglove.ANNOTATIONS, messages)
+        if schema is not DETECTIONS:
+            for pictures, camera in self.cameras.items() if is_solid else ():
+                messages = drawing.on_camera(camera, channel.bodies)
+                yield self._view(topic, channel, views.SUFFIX + pictures, foxglove.ANNOTATIONS, messages)
+            for member in self.scene.cameras:
+                rows, planes = self.scene.on_camera(member, schema, frames, is_true=not channel.made_by)
+                on_picture = views.Drawing(topic, schema, rows, planes, is_retracked, names)
+                messages = on_picture.on_pictures(member.clock.t_ns, member.clock.stamp_ns)
+                yield self._view(topic, channel, views.SUFFIX + member.pictures, foxglove.ANNOTATIONS, messages)
+        if channel.is_on_ground():
+            t_ns = self.picture_ns if on_pictures else frame_times(frames)
+            scene = drawing.on_ground(t_ns, frame_of(self.prefix, channel), channel.bodies)
+            yield self._view(topic, channel, views.SCENE_SUFFIX, foxglove.SCENE, scene)
 
 
 def frame_topic(prefix: str) -> str:

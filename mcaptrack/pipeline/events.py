@@ -9,12 +9,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final, NamedTuple, get_args
-
-import numpy as np
+from typing import Any, ClassVar, Final, NamedTuple, get_args
 
 from mcaptrack import foxglove, log
 from mcaptrack.choices import Similarity
@@ -22,15 +20,14 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import SUFFIX, log_messages, nouns_of
 from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
+from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import conflict_of, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with
-from mcaptrack.pipeline.plan import is_outdated
-from mcaptrack.pipeline.staleness import digest_of
+from mcaptrack.pipeline.staleness import digest_of, is_outdated
 from mcaptrack.pipeline.write import Made, RunState
-from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema import COUNTS, EVENTS, FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
-from mcaptrack.schema.framing import join_frames
 from mcaptrack.schema.provenance import VIEW, Provenance
 from mcaptrack.sources.cameras import camera_at, provenance_of, repaired_tracks
 
@@ -56,6 +53,11 @@ class Watch:
     topics: tuple[str, ...] = ()
     again: bool = False
     force: bool = False
+    name: ClassVar[str] = STAGE
+
+    def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
+        """Find them (see ``make_events``)."""
+        return make_events(state, self)
 
 
 def outputs(topic: str) -> tuple[str, ...]:
@@ -136,17 +138,6 @@ def _forecast_errors(state: RunState, name: str, again: bool, truth: Callable[[]
         topics[0]: Made.of(FORECAST_ERRORS, forecast_errors.errors, provenance),
         topics[1]: Made.of(FORECAST_SCORES, forecast_errors.scores, provenance),
     }
-
-
-def tally(results: Mapping[str, Made]) -> dict[str, dict[str, int]]:
-    """Count the events of each kind for each channel of tracks: count by name of the kind, by topic of the tracks."""
-    out = {}
-    for topic, channel in results.items():
-        if channel.schema is EVENTS and not channel.drawn:
-            kinds = join_frames(EVENTS, channel.frames).rows["kind"]
-            counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
-            out[topic.removesuffix(_EVENTS)] = {name: counts[kind] for kind, name in EVENT_KINDS.items()}
-    return out
 
 
 class _GroundTruth(NamedTuple):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, takewhile
 from typing import Any, Final
@@ -31,7 +31,7 @@ from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
 from mcaptrack.sources.cameras import camera_at, cameras, provenance_of
 from mcaptrack.sources.pictures import picture_size
-from mcaptrack.transforms import STAGES, Transform
+from mcaptrack.transforms import STAGES
 
 #: How much of the log before they begin with, and the longest gap over which people can be the same.
 LEAD_S, BRIDGED_S = 30.0, 10.0
@@ -112,7 +112,8 @@ class Before:
                 f"{BRIDGED_S:g} s are bridged)",
                 "clock",
             )
-        self._lead_ns = self._first_of_lead()
+        #: The time in ns at which the lead begins.
+        self.lead_ns = self._first_of_lead()
 
     def _check_camera(self, opened: log.Log) -> None:
         before, prefix = self._log, self._prefix
@@ -182,7 +183,7 @@ class Before:
         if not _is_led(job) or not self.is_bridged or source not in self._log.channels:
             return []
         input_frames = read_named_frames(self._log, source, job.transform.reads, job.frame_id).frames
-        low = int(np.searchsorted(frame_times(input_frames), self._lead_ns))
+        low = int(np.searchsorted(frame_times(input_frames), self.lead_ns))
         frames = input_frames[low:]
         if job.transform.reads is TRACKS and _differ(read_planes(self._log, self._prefix), planes):
             frames = [frame._replace(rows=_in_planes(frame, planes)) for frame in frames]
@@ -190,11 +191,6 @@ class Before:
         first = int(numbers[0]) if len(numbers) else 0
         shift = first - max(missing, 1) - (frames[-1].index if frames else 0)
         return [frame._replace(index=frame.index + shift) for frame in frames]
-
-    def in_context(self, transform: Transform) -> Transform:
-        """The transform with the clock of the log before, if it samples."""
-        is_clocked = self.is_bridged and "start_ns" in {field.name for field in fields(transform)}
-        return replace(transform, start_ns=self._lead_ns) if is_clocked else transform
 
     def own(self, job: Job, outputs: Sequence[Sequence[Frame]]) -> tuple[list[Sequence[Frame]], dict[str, str]]:
         """Return the outputs of a job without the lead, with continued ids, and facts about that for the provenance."""
@@ -239,7 +235,7 @@ class Before:
         if not self.is_bridged or not self._has(topic, TRACKS):
             return {}
         before = self._log.frame_columns(topic, TRACKS)
-        low = int(np.searchsorted(frame_times(before), self._lead_ns))
+        low = int(np.searchsorted(frame_times(before), self.lead_ns))
         rows_at = {frame.t_ns: frame.rows for frame in before[low:]}
         end_ns = self.start_ns + round(_AT_CUT_S * NS_PER_S)
         near = list(takewhile(lambda frame: frame.t_ns < end_ns, frames))

@@ -47,6 +47,7 @@ def fuse_cameras(
     output: Path | None,
     progress: Callable[[str, int, int], None],
     is_asked: bool = True,
+    views: bool = False,
 ) -> tuple[str, Report]:
     """Fuse the detections of cameras, and write them below the name of the scene.
 
@@ -67,6 +68,8 @@ def fuse_cameras(
         Called as ``progress(stage, done, total)``.
     is_asked : bool
         Whether the user asked for it: otherwise cameras that don't see the same people are refused.
+    views : bool
+        Whether the scene is drawn for viewers.
 
     Returns
     -------
@@ -88,7 +91,13 @@ def fuse_cameras(
             )
     with collected() as warnings:
         out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress, bool(names) and is_asked, is_asked)
-    write(RunState(opened, prefix, out), (), {}, output)
+    state = RunState(opened, prefix, out)
+    drawn = None
+    if views:
+        from mcaptrack.pipeline.views import make_views
+
+        drawn = make_views(state, ())
+    write(state, output, drawn)
     report = Report(stages=[FUSE], is_written=True, warnings=list(warnings))
     for topic, channel in out.items():
         report.count(topic, channel)

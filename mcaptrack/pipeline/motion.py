@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
@@ -25,11 +24,11 @@ from mcaptrack.transforms.protocol import traits_of
 STAGE: Final = "motion"
 
 
-class SideInputs(NamedTuple):
-    """Inputs of a job beside its main one: values of its transform by name, and the digests of the topics."""
+class SideInput(NamedTuple):
+    """An input of a job beside its main one: the value of a field of its transform, and the digests of its topics."""
 
-    values: Mapping[str, Any]
-    references: Mapping[str, str]
+    value: Any
+    references: Mapping[str, str] = {}
 
 
 def uses_motion(transform: Transform | None) -> bool:
@@ -64,29 +63,20 @@ def detects_motion(provenance: Provenance | None) -> bool:
     return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
 
 
-def side_inputs(state: RunState, job: Job) -> SideInputs:
-    """Return the inputs of a job beside its main one."""
-    names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
-    if "camera_path" in names and uses_motion(job.transform):
-        return _path(state, job)
-    if "known_boxes" in names and getattr(job.transform, "mask_boxes", False):
-        return _boxes(state)
-    return SideInputs({}, {})
-
-
-def _path(state: RunState, job: Job) -> SideInputs:
-    """Return the path of the camera, if its motion is known."""
+def motion_input(state: RunState, transform: Transform) -> SideInput | None:
+    """Return the path of the camera for a transform that compensates for it, if its motion is known."""
+    if not uses_motion(transform):
+        return None
     topic = motion_topic(state.prefix)
     if not state.holds(topic, CAMERA_MOTION):
-        if getattr(job.transform, "camera_motion", "") == "on":
+        if getattr(transform, "camera_motion", "") == "on":
             warn(f"the motion of the camera is not known: {topic} needs pictures of it in the log", "option-not-used")
-        return SideInputs({}, {})
-    frames = state.frames(topic, CAMERA_MOTION)
+        return None
     try:
-        path = frames_to_path(frames)
+        path = frames_to_path(state.frames(topic, CAMERA_MOTION))
     except McaptrackError as error:
         raise McaptrackError(f"{state.opened.path}: {topic}: {error}") from None
-    return SideInputs({"camera_path": path}, {topic: state.digest(topic)})
+    return SideInput(path, {topic: state.digest(topic)})
 
 
 def path_with(state: RunState, topic: str) -> tuple[CameraPath | None, Mapping[str, str]]:
@@ -114,19 +104,18 @@ def moves(state: RunState) -> bool:
         return False
 
 
-def _boxes(state: RunState) -> SideInputs:
-    """The boxes of people, by the time of their picture."""
+def boxes_input(state: RunState, transform: Transform) -> SideInput | None:
+    """Return the boxes of people by the time of their picture, for a transform that leaves them out."""
+    if not getattr(transform, "mask_boxes", False):
+        return None
     opened = state.opened
     usual = f"{state.prefix}/{next(s.output_topic for s in STAGES.values() if s.writes[''] is DETECTIONS)}"
     is_usual = usual in state.results or usual in opened.channels
     topic = usual if is_usual else camera_at(opened, state.prefix).boxes
     if topic is None or _needs_still_camera(opened, topic, ()):
-        return SideInputs({}, {})
-    if topic in state.results:
-        frames = state.frames(topic, DETECTIONS)
-    elif fits(opened.channels[topic], DETECTIONS)[1]:
-        frames = read_frames(opened, topic, DETECTIONS)
-    else:
-        return SideInputs({}, {})
+        return None
+    if topic not in state.results and not fits(opened.channels[topic], DETECTIONS)[1]:
+        return None
+    frames = state.frames(topic, DETECTIONS) if topic in state.results else read_frames(opened, topic, DETECTIONS)
     boxes = {frame.t_ns: columns_to_boxes(frame.rows) for frame in frames if len(frame.rows)}
-    return SideInputs({"known_boxes": boxes}, {topic: state.digest(topic)})
+    return SideInput(boxes, {topic: state.digest(topic)})

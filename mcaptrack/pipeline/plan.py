@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -20,15 +20,13 @@ from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
-from mcaptrack.pipeline.staleness import CORRECTED_IN, is_of_corrections, is_stale, read_planes
-from mcaptrack.pipeline.write import RunState
-from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame
+from mcaptrack.pipeline.staleness import is_of_corrections, is_stale, read_planes
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
 from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, is_made_by_stage, provenance_of
-from mcaptrack.sources.corrections import corrections_of, fixed_ids, with_corrections, without_filled
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import FUSION, STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import Space, traits_of
@@ -161,37 +159,23 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
             )
 
 
-# Corrections by people in the pipeline: samples are of corrected tracks, and re-tracking keeps these as they are.
+class _Result(NamedTuple):
+    """A channel that a stage made from ``had``, and makes from ``source`` now; ``main`` is its main output.
 
+    ``before`` is the transform that made it, None if it can't be used again, and ``wanted`` that of now: another one
+    where ``is_replaced``. ``is_projected`` says that the ground plane is made otherwise now.
+    """
 
-def corrected_tracks(opened: log.Log, prefix: str, source: str, tracks: Sequence[Frame]) -> Sequence[Frame]:
-    """The tracks at ``source`` with corrections, if they have any."""
-    topic = corrections_of(opened, prefix, source)
-    return tracks if topic is None else with_corrections(tracks, opened.frame_columns(topic, TRACKS))
-
-
-def without_filled_in(opened: log.Log, prefix: str, source: str, frames: Sequence[Frame]) -> Sequence[Frame]:
-    """Leave out boxes that re-tracking filled in where corrections of the tracks at ``source`` have none."""
-    topic = corrections_of(opened, prefix, source)
-    return frames if topic is None else without_filled(frames, opened.frame_columns(topic, TRACKS))
-
-
-def fixed_in(state: RunState, source: str) -> tuple[int, ...]:
-    """The ids of corrected tracks in the samples at ``source``; () if they were made without corrections."""
-    how = state.provenance(source)
-    topic = corrections_of(state.opened, state.prefix, how.input) if how and how.transform == CORRECTED_IN else None
-    if how is None or topic is None or topic not in how.references:
-        return ()
-    return fixed_ids(state.frames(how.input), state.opened.frame_columns(topic, TRACKS))
-
-
-def is_outdated(state: RunState, topics: Sequence[str]) -> bool:
-    """Return whether one of these topics is missing, or an input of the first one has changed since, also in a run."""
-    if not all(topic in state.opened.channels for topic in topics) or is_stale(state.opened, topics[0]):
-        return True
-    provenance = provenance_of(state.opened, topics[0])
-    then = provenance.made_from() if provenance else {}
-    return not then or any(name in state.results and state.digest(name) != digest for name, digest in then.items())
+    stage: Stage
+    topic: str
+    main: str
+    provenance: Provenance
+    had: str
+    source: str
+    before: Transform | None
+    wanted: Transform | None
+    is_replaced: bool = False
+    is_projected: bool = False
 
 
 @dataclass
@@ -356,75 +340,97 @@ class _Planner:
 
     def _make_again(self, provenance: Provenance, stage: str, topic: str) -> bool:
         """Plan the stage of a channel again if the channel is missing, out of date, or gets another input now."""
-        is_missing = topic not in self.opened.channels
         had = provenance.input or self.source_of(stage)
         source = self.sources.get(stage, had)
-        is_changed = [self.ensure(used) for used in (source, *provenance.references)]
-        is_due = any(is_changed) or is_missing or is_stale(self.opened, topic) or source != had
-        is_due = is_due or topic in self.renewed
+        changed = [self.ensure(used) for used in (source, *provenance.references)]
         before, why_not = self._before(stage, provenance)
         if isinstance(why_not, OlderVersionError):
             return self._replace_older(provenance, stage, topic)
         main = main_topic(self.opened, stage, topic)
-        # A result at another topic keeps the parameters that it was requested with.
-        is_usual = main == f"{self.prefix}/{STAGES[stage].output_topic}"
-        is_open = is_usual and stage not in self.defaults and self._is_made_by_another(source)
-        suited = self._suited(stage, source) if is_open else None
-        wanted = self._with_choice(self.defaults.get(stage, suited or before)) if is_usual else before
-        is_replaced = is_usual and (self._is_replaced(STAGES[stage], before, wanted) or suited is not None)
-        is_replaced = is_replaced or self.frame_id not in ("", provenance.frame_id or self.frame_id)
-        is_projected = is_usual and STAGES[stage].needs_scale
-        is_projected = is_projected and is_plane_due(self.opened, self.prefix, source, self.plane)
-        is_due = is_due or is_projected
-        if wanted and not is_replaced and not self.force:
-            self._warn_settings(main, differing(before, wanted) if before else str(why_not))
-        if not is_due and not self.force and not is_replaced:
+        result = self._with_choices(_Result(STAGES[stage], topic, main, provenance, had, source, before, before))
+        is_missing = topic not in self.opened.channels
+        is_due = any(changed) or is_missing or is_stale(self.opened, topic) or source != had
+        is_due = is_due or topic in self.renewed or result.is_projected
+        if result.wanted and not result.is_replaced and not self.force:
+            self._warn_settings(main, differing(before, result.wanted) if before else str(why_not))
+        if not (is_due or self.force or result.is_replaced):
             return False
-        transform = wanted if self.force or is_replaced else before
+        transform = result.wanted if self.force or result.is_replaced else before
         if transform and is_missing and topic not in Job(stage, transform, source, main).kept():
             return False  # a class of another package doesn't make all outputs of the built-in ones
         if source in self._gone or (source not in self.opened.channels and not self.changes[source]):
             warn(f"{topic} stays as it is: {source}, which it was made from, is gone", "out-of-date")
             return False
         if transform is None:
-            if isinstance(why_not, MissingPluginError) and why_not.options:
-                self._unnamed[topic] = why_not
-                return True
-            if is_missing or source != had or isinstance(why_not, MissingPluginError):
-                raise McaptrackError(f"{self.opened.path}: {topic} can't be made from {source}: {why_not}")
-            why = "is out of date and" if is_due else "is not made again, it"
-            warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
-            return False
+            return self._not_made_again(result, why_not, is_due)
         self.ensure_motion(transform, source)
-        if is_missing:
-            self._notes.append(f"{topic} is missing: running {stage}, as for what it made beside it")
-        elif source != had:
-            self._notes.append(f"{topic} was made from {had}: running {stage} again, from {source}")
-        elif is_replaced:
-            is_other = before is None or STAGES[stage].choice(before) != STAGES[stage].choice(transform)
-            others = " or ".join(f"`{name}=`" for name in (*self.shared, "frame"))
-            by = f"by another {STAGES[stage].option}" if is_other else f"with another {others}"
-            self._notes.append(f"{topic} was made {by}: running {stage} again")
-        elif is_projected:
-            self._notes.append(f"{topic} was made with another ground plane: running {stage} again, as before")
-        elif topic in self.renewed:
-            self._notes.append(f"{topic} goes on from another log: running {stage} again")
-        elif is_due and not self.force:
-            is_corrected = is_of_corrections(self.opened, self.prefix, provenance)
-            why = f"{topic} was made from an earlier {source}"
-            why = f"corrections of {source} have changed" if is_corrected else why
-            self._notes.append(f"{why}: running {stage} again, as before")
-        all_outputs = [f"{main}/{suffix}".rstrip("/") for suffix in transform.writes]
-        kept = [output == topic or output in self.opened.channels for output in all_outputs]
-        beside = STAGES[stage].beside if topic == main or main in self.opened.channels else ()
-        possible = before.writes if before else (*transform.writes,)[:1]  # what the former class didn't make is new
-        kept = [
-            is_kept or suffix in beside or suffix not in possible
-            for suffix, is_kept in zip(transform.writes, kept, strict=True)
-        ]
-        keep = tuple(suffix for suffix, is_kept in zip(transform.writes, kept, strict=True) if is_kept)
-        self.add(Job(stage, transform, source, main, None if all(kept) else keep, frame_id=self.frame_id))
+        self._notes += filter(None, [self._reason(result, transform, is_due)])
+        self.add(Job(stage, transform, source, main, self._kept(result, transform), frame_id=self.frame_id))
         return True
+
+    def _with_choices(self, result: _Result) -> _Result:
+        """Return a result with the transform of now; one at another topic than the usual one keeps its parameters."""
+        stage, before, frame_id = result.stage, result.before, result.provenance.frame_id
+        is_moved = self.frame_id not in ("", frame_id or self.frame_id)
+        if result.main != f"{self.prefix}/{stage.output_topic}":
+            return result._replace(is_replaced=is_moved)
+        is_open = stage.name not in self.defaults and self._is_made_by_another(result.source)
+        suited = self._suited(stage.name, result.source) if is_open else None
+        wanted = self._with_choice(self.defaults.get(stage.name, suited or before))
+        is_replaced = is_moved or suited is not None or self._is_replaced(stage, before, wanted)
+        is_projected = "scale" in stage.before and is_plane_due(self.opened, self.prefix, result.source, self.plane)
+        return result._replace(wanted=wanted, is_replaced=is_replaced, is_projected=is_projected)
+
+    def _reason(self, result: _Result, transform: Transform, is_due: bool) -> str:
+        """Return why a channel is made again; "" if it is only because all are."""
+        stage, topic, source = result.stage, result.topic, result.source
+        again = f"running {stage.name} again"
+        if topic not in self.opened.channels:
+            return f"{topic} is missing: running {stage.name}, as for what it made beside it"
+        if source != result.had:
+            return f"{topic} was made from {result.had}: {again}, from {source}"
+        if result.is_replaced:
+            is_other = result.before is None or stage.choice(result.before) != stage.choice(transform)
+            others = " or ".join(f"`{name}=`" for name in (*self.shared, "frame"))
+            return f"{topic} was made {f'by another {stage.option}' if is_other else f'with another {others}'}: {again}"
+        if result.is_projected:
+            return f"{topic} was made with another ground plane: {again}, as before"
+        if topic in self.renewed:
+            return f"{topic} goes on from another log: {again}"
+        if not is_due or self.force:
+            return ""
+        if is_of_corrections(self.opened, self.prefix, result.provenance):
+            return f"corrections of {source} have changed: {again}, as before"
+        return f"{topic} was made from an earlier {source}: {again}, as before"
+
+    def _kept(self, result: _Result, transform: Transform) -> tuple[str, ...] | None:
+        """Return the outputs that are written: those that the log has, and those that belong beside them."""
+        topic, main, channels = result.topic, result.main, self.opened.channels
+        beside = result.stage.beside if topic == main or main in channels else ()
+        possible = result.before.writes if result.before else (*transform.writes,)[:1]
+        keep = tuple(
+            suffix
+            for suffix in transform.writes
+            if f"{main}/{suffix}".rstrip("/") in {topic, *channels}
+            or suffix in beside
+            or suffix not in possible  # what the former class didn't make is new
+        )
+        return None if len(keep) == len(transform.writes) else keep
+
+    def _not_made_again(self, result: _Result, why_not: McaptrackError | None, is_due: bool) -> bool:
+        """Say that a channel stays as it is, because what made it can't be used. Raises McaptrackError if it has to be.
+
+        Returns whether the channel will change nevertheless, which ``checked`` refuses.
+        """
+        topic, is_missing = result.topic, result.topic not in self.opened.channels
+        if isinstance(why_not, MissingPluginError) and why_not.options:
+            self._unnamed[topic] = why_not
+            return True
+        if is_missing or result.source != result.had or isinstance(why_not, MissingPluginError):
+            raise McaptrackError(f"{self.opened.path}: {topic} can't be made from {result.source}: {why_not}")
+        why = "is out of date and" if is_due else "is not made again, it"
+        warn(f"{topic} {why} stays as it is: {why_not}", "out-of-date" if is_due else "left-out")
+        return False
 
     def _is_replaced(self, stage: Stage, before: Transform | None, wanted: Transform | None) -> bool:
         """Return whether the user chose another class for a stage than the one that made its channel."""

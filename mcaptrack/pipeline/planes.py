@@ -226,7 +226,7 @@ def planes_for(
         planes = calibrated or planes
     is_usual = job.target == f"{prefix}/{stage.output_topic}"
     is_new = job.transform.reads is DETECTIONS or is_plane_due(opened, prefix, job.source, choice)
-    if (is_assumed(planes) and is_usual and is_new) or (planes is None and stage.needs_scale):
+    if (is_assumed(planes) and is_usual and is_new) or (planes is None and "scale" in stage.before):
         planes, channel = make_plane(state, frames, source, choice, uncalibrated)
     if channel:
         results[topic] = channel

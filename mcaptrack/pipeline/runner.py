@@ -9,60 +9,35 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 import numpy as np
 
 from mcaptrack import log
 from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.geometry.camera_path import CameraPath
-from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
-from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated, scene_planes
+from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated
 from mcaptrack.notices import Notice, collected, known_code, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, may_replace, read_named_frames, superseded
-from mcaptrack.pipeline.events import STAGE as EVENTS_STAGE
-from mcaptrack.pipeline.events import Watch, make_events, tally
-from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
-from mcaptrack.pipeline.motion import path_with, side_inputs
-from mcaptrack.pipeline.pictures import pictures_of, with_descriptors
-from mcaptrack.pipeline.plan import corrected_tracks, fixed_in, without_filled_in
-from mcaptrack.pipeline.planes import (
-    AS_BEFORE,
-    Channels,
-    PlaneChoice,
-    is_poor,
-    plane_in_words,
-    planes_for,
-    recorded_planes,
-    without_unseen,
-)
+from mcaptrack.pipeline.following import Before
+from mcaptrack.pipeline.pictures import pictures_of
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, plane_in_words, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
-from mcaptrack.pipeline.staleness import CORRECTED_IN, digest_of, read_planes, warn_clock_jumps
+from mcaptrack.pipeline.staleness import digest_of, read_planes, warn_clock_jumps
+from mcaptrack.pipeline.steps import Input, Progress, Work
 from mcaptrack.pipeline.write import Made, RunState, write
-from mcaptrack.pipeline.zones import STAGE as ZONES_STAGE
-from mcaptrack.pipeline.zones import ZoneWatch, make_zones
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame, Schema
-from mcaptrack.schema.camera_motion import to_pictures, to_scene
+from mcaptrack.schema import EVENT_KINDS, EVENTS, TRACKS, VIDEO, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameCollector
-from mcaptrack.schema.framing import frame_times, row_ends, unique_values
-from mcaptrack.schema.provenance import CLOCK, FUSE, VIEW, Provenance
-from mcaptrack.sources.camera_motion import tracks_topic
+from mcaptrack.schema.framing import join_frames, row_ends, unique_values
+from mcaptrack.schema.provenance import FUSE, VIEW, Provenance
 from mcaptrack.sources.cameras import camera_at
-from mcaptrack.sources.corrections import corrections_of, with_corrections
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.sources.pictures import picture_size
-from mcaptrack.transforms import FULL, STAGES, Sample, Transform
+from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.guarded import guarded
-from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits
 from mcaptrack.transforms.protocol import ModelCard, traits_of
-from mcaptrack.transforms.retrack.offline import settle_classes
-from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
-
-Progress = Callable[[str, int, int], None]
-
+from mcaptrack.transforms.stages import FINISHING
 
 # Measure the time that each part of a run takes.
 
@@ -123,7 +98,7 @@ class Report:
 
     ``stale`` are the channels that are out of date, because this run replaced their input. ``events`` are the numbers
     of events of each kind by channel of tracks. ``warnings`` report what was assumed, left out or looks unusual.
-    ``has_zones`` says whether zones were counted, or are up to date. ``watch`` has the seconds of each stage, and of
+    ``finished`` names what was done at the end, or was up to date. ``watch`` has the seconds of each stage, and of
     reading, waiting for pictures ("decode") and writing.
     """
 
@@ -135,7 +110,7 @@ class Report:
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
     warnings: list[Notice] = field(default_factory=list)
-    has_zones: bool = False
+    finished: set[str] = field(default_factory=set)
     watch: Stopwatch = field(default_factory=Stopwatch)
 
     def count(self, topic: str, channel: Made) -> None:
@@ -144,10 +119,23 @@ class Report:
         if channel.schema is TRACKS:
             self.tracks[topic] = len(unique_values(TRACKS, channel.frames, "track_id"))
 
-    def add(self, stage: str, made: Mapping[str, Made]) -> None:
-        """Count the messages of the channels of a stage, if it made any."""
+    def add(self, name: str, made: Mapping[str, Made]) -> None:
+        """Count the messages of the channels that were made at the end, if any, and the events in them."""
         self.frames |= {topic: channel.size() for topic, channel in made.items()}
-        self.stages += [stage] if made else []
+        self.stages += [name] if made else []
+        self.events |= tally(made)
+        self.finished.add(name)
+
+
+def tally(results: Mapping[str, Made]) -> dict[str, dict[str, int]]:
+    """Count the events of each kind for each channel of tracks: count by name of the kind, by topic of the tracks."""
+    out = {}
+    for topic, channel in results.items():
+        if channel.schema is EVENTS and not channel.drawn:
+            kinds = join_frames(EVENTS, channel.frames).rows["kind"]
+            counts = np.bincount(kinds, minlength=max(EVENT_KINDS) + 1).tolist()
+            out[topic.rpartition("/")[0]] = {name: counts[kind] for kind, name in EVENT_KINDS.items()}
+    return out
 
 
 # Warn about results that are empty or unreliable, and about memory that runs out.
@@ -155,9 +143,6 @@ class Report:
 
 #: The stages with results in metres: all except those that read pictures.
 _IN_METRES: Final = {name for name, stage in STAGES.items() if stage.reads is not VIDEO}
-#: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
-#: has all samples in memory).
-_BASE, _A_PERSON_SECOND = 400_000_000, 3_000
 
 
 def warn_no_rows(
@@ -174,32 +159,6 @@ def warn_no_rows(
         return
     reason = transform.why_empty(read, made_rows) if hasattr(transform, "why_empty") else "the transform gave none"
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
-
-
-def warn_memory(frames: Sequence[Frame]) -> None:
-    """Warn if the stages that follow need more memory for these boxes than is free."""
-    boxes, steps = int(row_ends(frames)[-1]), np.diff(frame_times(frames))
-    seen_s = boxes * (float(np.median(steps)) / NS_PER_S if len(steps) else 0.0)
-    needed, free = _BASE + seen_s * _A_PERSON_SECOND, free_memory()
-    if free is not None and needed > free:
-        warn(
-            f"{boxes:,} boxes, of people who are seen for {seen_s / 3600:,.0f} hours together, take about "
-            f"{needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free: re-tracking has all samples in memory",
-            "memory",
-        )
-
-
-def free_memory() -> int | None:
-    """Return the free memory for this process in bytes, as Linux reports it; None if it isn't known."""
-    limits = []
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-        most, now = (Path(f"/sys/fs/cgroup/memory.{name}").read_text().strip() for name in ("max", "current"))
-        limits += [int(most) - int(now)] if most != "max" else []
-    except (OSError, ValueError):
-        pass  # not Linux, or no memory limit for this process's control group
-    return min(limits, default=None)
 
 
 def warn_findings(
@@ -238,31 +197,40 @@ def warn_findings(
         )
 
 
+class Finish(Protocol):
+    """A step at the end of a run with what it made, such as finding events; ``name`` stands in reports."""
+
+    name: ClassVar[str]
+
+    def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
+        """Return new channels by topic; ``stamps`` are the capture times in ns of pictures, by topic."""
+        ...
+
+
 def run(
     opened: log.Log,
     prefix: str,
     jobs: Sequence[Job],
     output: Path | None = None,
     progress: Progress = lambda *_: None,
-    watch: Watch | None = None,
+    *,
+    finishing: Sequence[Finish] = (),
+    views: bool = False,
     plane: PlaneChoice = AS_BEFORE,
     boxes: BoxesRead | None = None,
-    zones: ZoneWatch | None = None,
     fused: Mapping[str, Made] = {},
     before: Before | None = None,
 ) -> Report:
-    """Run the jobs, and write their channels and views into the log, or into a copy of it at ``output``.
+    """Run the jobs, and write their channels into the log, or into a copy of it at ``output``.
 
-    With ``watch`` the last stage finds events of tracks, if they are missing or out of date. ``plane`` says how to make
-    a ground plane where none is given. ``boxes`` keeps boxes of other software that are read. With ``zones`` these are
-    counted, or those that were counted before. ``fused`` are channels that were made again from those of several
-    cameras, to begin with. Ids go on from the log ``before``.
+    ``finishing`` is done after the last job; with ``views`` channels are drawn for viewers. ``plane`` says how to make
+    a ground plane where none is given. ``boxes`` keeps boxes of other software that are read. ``fused`` are channels
+    that were made again from those of several cameras, to begin with. Ids go on from the log ``before``.
 
     The log is replaced as a whole, after everything was computed.
     """
     boxes, results = boxes or BoxesRead(), dict(fused)
-    state = RunState(opened, prefix, results)
-    stamps: dict[str, list[int]] = {}
+    state, stamps = RunState(opened, prefix, results), dict[str, list[int]]()
     report = Report(stages=[FUSE] if fused else [])
     for topic, channel in fused.items():
         report.count(topic, channel)
@@ -273,46 +241,41 @@ def run(
         planes = read_planes(opened, prefix)
         for job in jobs:
             with part("read"):
-                job_input = _input(state, job, stamps, progress, boxes, report.watch)
-                source = (job.source, job_input.digest())
-            with part(job.stage):
-                planes, frame_id = planes_for(state, job, job_input.frames, source, planes, plane)
-            job_input = job_input._replace(frame_id=job_input.frame_id or frame_id)
-            if job.transform.reads is DETECTIONS:
-                warn_memory(job_input.frames)
+                source = _input(state, job, stamps, progress, boxes, report.watch)
+            work = Work(state, job, source, planes, plane, before, progress)
             try:
                 with part(job.stage):
-                    results |= _run_job(state, job, job_input, planes or (), before, progress)
+                    results |= _done(work)
             except McaptrackError as error:
                 if not job.is_optional:
                     raise
                 warn(f"{job.target} is left out: {error}", "left-out")
                 continue
+            planes = work.own_planes
             for topic in (topic for topic in job.outputs() if topic in results):
                 report.count(topic, results[topic])
             report.stages.append(job.stage)
-            del job_input
+            del source, work
             release_memory()
-        if watch is not None:
-            with part(EVENTS_STAGE):
-                events = make_events(state, watch)
-            report.add(EVENTS_STAGE, events)
-            report.events = tally(events)
-            results |= events
-        if zones is not None:
-            with part(ZONES_STAGE):
-                counted = make_zones(state, planes or (), zones, stamps)
-            report.add(ZONES_STAGE, counted)
-            report.has_zones = True
-            results |= counted
+        for step in finishing:
+            with part(step.name):
+                made = step.make(state, planes or (), stamps)
+            report.add(step.name, made)
+            results |= made
         gone = _gone(opened, jobs, results)
-        if results or output is not None:
+        drawn = None
+        if views:
+            from mcaptrack.pipeline.views import STAGE, make_views
+
+            with part(STAGE):
+                drawn = make_views(state, planes or (), stamps, boxes.in_space(), gone, is_written=output is not None)
+            report.stages += [STAGE] if drawn and drawn.topics else []
+        if results or output is not None or (drawn and drawn.topics):
             with part("write"):
-                path, _ = path_with(state, tracks_topic(prefix))
-                write(state, planes or (), stamps, output, path, boxes.in_space(), gone)
+                write(state, output, drawn, gone)
                 report.is_written = True
         provenances = {topic: channel.provenance for topic, channel in results.items()}
-        warn_findings(opened, prefix, provenances, planes or (), is_all=watch is not None or not jobs)
+        warn_findings(opened, prefix, provenances, planes or (), is_all=bool(finishing) or not jobs)
     late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
     report.stale = [topic for topic in late if topic not in gone]
     report.warnings = list(dict.fromkeys(warnings))
@@ -324,15 +287,14 @@ def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> 
     gone: set[str] = set()
     for job in jobs:
         if job.kept() & {*results}:
-            empty = [
+            empty = (
                 topic for topic in job.kept() if topic in opened.channels
-            ]  # no rows, no tracks at the video's rate
-            gone.update(superseded(opened, job))
-            gone.update(topic for topic in empty if may_replace(opened, topic, job.stage))
+            )  # no rows, no tracks at the video's rate
+            gone |= {*superseded(opened, job), *(topic for topic in empty if may_replace(opened, topic, job.stage))}
     gone -= {*results}
     for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
         provenance = Provenance.from_metadata(opened.channels[topic].metadata)
-        if provenance and provenance.transform in (EVENTS_STAGE, ZONES_STAGE, VIEW) and provenance.input in gone:
+        if provenance and provenance.transform in (*FINISHING, VIEW) and provenance.input in gone:
             gone.add(topic)
     return gone - {*results}
 
@@ -342,14 +304,17 @@ def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     outdated = []
     for topic, channel in sorted(opened.channels.items()):
         provenance = Provenance.from_metadata(channel.metadata)
-        if topic not in digests and provenance and provenance.transform in {*STAGES, EVENTS_STAGE, ZONES_STAGE, FUSE}:
+        if topic not in digests and provenance and provenance.transform in {*STAGES, *FINISHING, FUSE}:
             is_late = any(digests.get(name, then) != then for name, then in provenance.made_from().items())
             outdated += [topic] if is_late else []
     return outdated
 
 
-class _Repeatable:
-    """Frames that can be read more than once, each time from the beginning."""
+# Run one job.
+
+
+class _Repeatable(Iterable[Frame]):
+    """Frames that a transform can go through several times, each time from the beginning."""
 
     def __init__(self, begin: Callable[[], Iterator[Frame]]) -> None:
         self._begin = begin
@@ -358,236 +323,81 @@ class _Repeatable:
         return self._begin()
 
 
-class _Input(NamedTuple):
-    """The input of a job: a stream of frames, all frames if they are rows (else empty), and, after the stream was read,
-    the digest and the number of its messages; the names of its classes, the frame of its metres, the numbers of
-    damaged pictures, and the errors of images that are left out.
-    """
-
-    stream: Iterable[Frame]
-    frames: Sequence[Frame]
-    digest: Callable[[], str]
-    messages: Callable[[], int]
-    classes: Mapping[str, str] = {}
-    frame_id: str = ""
-    damaged: Sequence[int] = ()
-    unreadable: Sequence[McaptrackError] = ()
-
-    def corrected(self, opened: log.Log, prefix: str, job: Job) -> tuple[_Input, Mapping[str, str]]:
-        """Return tracks with the corrections of people, and the digests of these by topic."""
-        topic = corrections_of(opened, prefix, job.source) if job.stage == CORRECTED_IN else None
-        if topic is None:
-            return self, {}
-        frames = with_corrections(self.frames, opened.frame_columns(topic, TRACKS))
-        return self._replace(stream=frames, frames=frames), {topic: digest_of(opened, topic)}
-
-    def in_scene(self, path: CameraPath) -> _Input:
-        """Return the same tracks with boxes in pixels of the reference picture."""
-        moved = to_scene(self.frames, path)
-        return self._replace(stream=moved, frames=moved)
-
-
-# Re-tracked tracks at the rate of the tracks that were sampled.
-
-
-def at_video_rate(
-    state: RunState,
-    job: Job,
-    retracked: Sequence[Frame],
-    planes: Planes,
-    path: CameraPath | None,
-    carry: Callable[[Sequence[Frame], Sequence[Frame], Planes], Sequence[Frame]],
-) -> Sequence[Frame]:
-    """Return re-tracked tracks at the rate of the tracks that were sampled; no frames if there are no such tracks.
-
-    ``carry`` gives these tracks the re-tracked ids. Where the camera moves by ``path``, ``planes`` and the boxes of
-    ``retracked`` are those of reference pictures.
-    """
-    opened, prefix, _ = state
-    samples = state.provenance(job.source)
-    source = samples.input if samples else ""
-    tracks = state.frames(source)
-    tracks = corrected_tracks(opened, prefix, source, tracks) if len(tracks) else tracks
-    carried = without_filled_in(opened, prefix, source, carry(to_scene(tracks, path), retracked, planes))
-    return to_pictures(carried, path)
-
-
-# Context: the parameters of transforms that follow from the log, and not from the user.
-
-
-def in_context(
-    opened: log.Log,
-    prefix: str,
-    job: Job,
-    frames: Sequence[Frame],
-    planes: Planes,
-    classes: Mapping[str, str],
-) -> Transform:
-    """Return the transform with its context fields filled in.
-
-    They are the ground planes, the start of the clock in ns, the rate in Hz, and the names of classes by number.
-    """
-    names = {f.name for f in fields(job.transform) if f.metadata.get("context")}
-    context: dict[str, Any] = {}
-    if "ground_planes" in names:
-        context["ground_planes"] = tuple(planes)
-    if "class_names" in names:
-        context["class_names"] = tuple((int(number), name) for number, name in classes.items())
-        _warn_of_limits(str(getattr(job.transform, "class_limits", "")), context["class_names"])
-    if "start_ns" in names:
-        context["start_ns"] = _clock_start(opened, prefix)
-    if "rate_hz" in names:
-        steps = np.diff(frame_times(frames))
-        if (steps > 0).any():  # frames may share a time
-            context["rate_hz"] = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
-            usual = f"{prefix}/{STAGES[job.stage].input_topic}"
-            if job.source != usual and context["rate_hz"] > 2 * Sample().rate_hz:
-                warn(
-                    f"{job.source} has {context['rate_hz']:g} frames a second, and {job.stage} takes steps at that "
-                    f"rate; {usual} has {Sample().rate_hz:g} unless it was made otherwise",
-                    "clock",
-                )
-    if "poor_scale" in names and is_assumed(planes):
-        context["poor_scale"] = is_poor(frames)
-    return replace(job.transform, **context)
-
-
-def _warn_of_limits(class_limits: str, names: ClassNames) -> None:
-    """Warn of limits for classes that don't exist."""
-    if unknown := unknown_limits(class_limits, names):
-        classes = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
-        text = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
-        warn(f"{text} (classes of these are: {classes})", "option-not-used")
-
-
-def _clock_start(opened: log.Log, prefix: str) -> int | None:
-    """Return the start of the prediction clock in ns: from the log's metadata, or the time of the first picture."""
-    clock = opened.metadata(CLOCK)
-    if clock and (start := parse_ns(clock.get("start_ns", ""))) is not None:
-        return start
-    pictures = camera_at(opened, prefix).pictures
-    return min(opened.times(pictures).tolist(), default=None) if pictures else None
-
-
-def _run_job(
-    state: RunState, job: Job, job_input: _Input, planes: Planes, before: Before | None, progress: Progress
-) -> dict[str, Made]:
-    """Run a job, and return its channels by topic."""
-    opened, prefix, _ = state
-    side = side_inputs(state, job)
-    job_input, corrections = job_input.corrected(opened, prefix, job)
-    shown = job_input.frames
-    path, motion = path_with(state, job.source) if job.transform.reads is TRACKS else (None, {})
-    if path is not None:  # boxes of pictures that the camera moved between can't be joined as they are
-        job_input, planes = job_input.in_scene(path), scene_planes(planes, path)
-    if before is None:
-        warn_unfollowed(opened, job)
-    lead = before.lead(job, numbers_of(job_input.frames), planes) if before and path is None else ()
-    if lead:
-        frames = led(lead, job_input.frames, job.transform.reads)
-        job_input = job_input._replace(stream=frames, frames=frames)
-    context = in_context(opened, prefix, job, job_input.frames, planes, job_input.classes)
-    fixed = fixed_in(state, job.source) if hasattr(context, "fixed_ids") else ()
-    transform = replace(context, **side.values, **({"fixed_ids": fixed} if fixed else {}))
-    transform = before.in_context(transform) if before and lead else transform
-    transform = with_descriptors(transform, opened, prefix, shown, progress, job.keep)
-    collectors = [FrameCollector(schema) for schema in transform.writes.values()]
-    taken = [0]
+def _done(work: Work) -> dict[str, Made]:
+    """Do the work of a job, and return its channels by topic."""
+    job, stage, opened = work.job, work.stage, work.state.opened
+    work.prepare()
+    counts = [0]
     try:
         with collected() as warnings:
-            entry = STAGES[job.stage].entry(type(transform))
-            is_own = STAGES[job.stage].is_built_in(type(transform))
-            stream = _Repeatable(lambda: _counting(job_input.stream, taken))
-            batches = transform(stream) if is_own else guarded(entry, transform, stream)
-            for result in batches:
-                for frame, collector in zip(result, collectors, strict=True):
-                    collector.append(frame)
-            outputs: list[Sequence[Frame]] = [collector.done() for collector in collectors]
-            if job.transform.reads is DETECTIONS and job.transform.writes[""] is TRACKS:
-                outputs[0] = settle_classes(outputs[0])
-            outputs, continued = before.own(job, outputs) if before else (outputs, {})
+            _transform(work, counts)
+            work.finish()
             if not warnings:  # otherwise a warning has given the reason
-                warn_no_rows(job.stage, job.source, transform, job_input.frames, outputs[0])
+                warn_no_rows(job.stage, job.source, work.transform, work.source.frames, work.main())
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
-    left_out = job_input.messages() - max(taken) - len(job_input.unreadable)
-    if transform.reads is VIDEO and left_out > 0:
-        warn(
-            f"{job.source}: {left_out} of {job_input.messages()} messages were left out: a video has to begin with a "
-            "key picture that has its parameter sets",
-            "left-out",
-        )
-    if job_input.unreadable:
-        warn(
-            f"{job.source}: {len(job_input.unreadable)} of {job_input.messages()} pictures can't be decoded and are "
-            f"left out, the first: {job_input.unreadable[0]}",
-            "lost",
-        )
-    if job_input.damaged:
-        warn(
-            f"{job.source}: {len(job_input.damaged)} of {job_input.messages()} pictures are damaged, number "
-            f"{job_input.damaged[0]} first; what can't be decoded there is taken from others, so that detections may "
-            "be wrong up to the next key picture",
-            "lost",
-        )
-    provenance = _provenance_of(job, transform, job_input, warnings, {**side.references, **motion, **corrections})
-    provenance = replace(provenance, continued=continued)
-    channels: dict[str, tuple[Schema, Sequence[Frame]]] = {
-        topic: (schema, to_pictures(channel, path) if schema is TRACKS else channel)
-        for (topic, schema), channel in zip(job.outputs().items(), outputs, strict=True)
-    }
-    if job.target + FULL in job.kept():
-        carry = linked_tracks if traits_of(transform).leaves_unchanged else to_video_rate
-        frames = at_video_rate(state, job, outputs[0], planes, path, carry)
-        channels |= {job.target + FULL: (TRACKS, frames)} if frames else {}
-    seen: Channels = channels
-    if not traits_of(transform).keeps_unseen:
-        seen = without_unseen(channels, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
-    usual = STAGES[job.stage].outputs(job.target)
+    work.source.warn_lost(job.source, work.transform.reads, max(counts))
+    provenance, usual = _provenance_of(work, warnings), stage.outputs(job.target)
     return {
         topic: Made.of(
             schema, frames, replace(provenance, output="" if topic in usual else topic.removeprefix(job.target + "/"))
         )
-        for topic, (schema, frames) in seen.items()
+        for topic, (schema, frames) in work.outputs.items()
         if topic in job.kept()
     }
 
 
-def _provenance_of(
-    job: Job, transform: Transform, job_input: _Input, warnings: Sequence[Notice], references: Mapping[str, str]
-) -> Provenance:
+def _transform(work: Work, counts: list[int]) -> None:
+    """Call the transform of a job, and collect its outputs; ``counts`` gets the frames that it read, each time."""
+    transform, stage = work.transform, work.stage
+    collectors = [FrameCollector(schema) for schema in transform.writes.values()]
+    stream = _Repeatable(lambda: _counting(work.source.stream, counts))
+    is_own, entry = stage.is_built_in(type(transform)), stage.entry(type(transform))
+    for result in transform(stream) if is_own else guarded(entry, transform, stream):
+        for frame, collector in zip(result, collectors, strict=True):
+            collector.append(frame)
+    for (topic, schema), collector in zip(work.job.outputs().items(), collectors, strict=True):
+        work.outputs[topic] = schema, collector.done()
+
+
+def _provenance_of(work: Work, warnings: Sequence[Notice]) -> Provenance:
     """Return the provenance of a job's channels. Classes are named by the transform, or else by its input.
 
     Raises McaptrackError for parameters that a log can't hold.
     """
-    stage = STAGES[job.stage]
-    entry = stage.entry(type(transform))
-    choice = {stage.kind: entry.name} if stage.kind else {}
-    large = [f for f in fields(transform) if not f.metadata.get("is_recorded", True)]
-    unrecorded: dict[str, Any] = {f.name: f.default_factory() for f in large if callable(f.default_factory)}
-    recorded = replace(transform, **unrecorded) if unrecorded else transform
-    try:
-        parameters = {name: value for name, value in asdict(recorded).items() if name not in unrecorded}
-        parameters |= recorded_planes(transform)
-        parameters = json.loads(json.dumps(parameters | choice))
-    except TypeError as error:
-        raise McaptrackError(f"the parameters of {entry} can't be kept in a log: {error}") from None
+    stage, transform, source = work.stage, work.transform, work.source
     predictor = getattr(transform, "predictor", None)
     card = transform.model_card() if hasattr(transform, "model_card") else ModelCard()
     return Provenance(
-        job.stage,
-        parameters,
-        job.source,
-        job_input.digest(),
+        work.job.stage,
+        _recorded(stage, transform),
+        work.job.source,
+        source.digest(),
         weights_sha256=weights_sha256(predictor) if isinstance(predictor, str) else card.weights_sha256,
-        references=references,
+        references=work.references,
         plugins=plugins_of(stage, transform),
-        classes={str(number): name for number, name in card.classes.items()} or job_input.classes,
-        frame_id=job_input.frame_id,
+        classes={str(number): name for number, name in card.classes.items()} or source.classes,
+        frame_id=source.frame_id,
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
+        continued=work.continued,
     )
+
+
+def _recorded(stage: Stage, transform: Transform) -> dict[str, Any]:
+    """Return the parameters of a transform as the provenance holds them. Raises McaptrackError if a log can't."""
+    entry = stage.entry(type(transform))
+    large = [f for f in fields(transform) if not f.metadata.get("is_recorded", True)]
+    unrecorded: dict[str, Any] = {f.name: f.default_factory() for f in large if callable(f.default_factory)}
+    recorded = replace(transform, **unrecorded) if unrecorded else transform
+    parameters = {name: value for name, value in asdict(recorded).items() if name not in unrecorded}
+    parameters |= recorded_planes(transform) | ({stage.kind: entry.name} if stage.kind else {})
+    try:
+        out: dict[str, Any] = json.loads(json.dumps(parameters))
+    except TypeError as error:
+        raise McaptrackError(f"the parameters of {entry} can't be kept in a log: {error}") from None
+    return out
 
 
 def _input(
@@ -597,7 +407,7 @@ def _input(
     progress: Progress,
     boxes: BoxesRead,
     watch: Stopwatch,
-) -> _Input:
+) -> Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     opened, results = state.opened, state.results
     if job.source not in results and job.transform.reads is VIDEO:
@@ -607,7 +417,7 @@ def _input(
         steps = opened.channel(job.source).messages * traits_of(job.transform).passes
         numbers = count(1)
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
-        return _Input(each, [], digest, lambda: len(seen), damaged=damaged, unreadable=unreadable)
+        return Input(each, [], digest, lambda: len(seen), damaged=damaged, unreadable=unreadable)
     if job.source in results:
         frames, how = results[job.source].frames, results[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
@@ -616,7 +426,7 @@ def _input(
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
     stream = _Repeatable(lambda: _counted(frames, count(1), len(frames), job.stage, progress))
-    return _Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id)
+    return Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id)
 
 
 def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:
@@ -648,8 +458,8 @@ def input_of(
     check_inputs(opened, prefix, [job])
     frames, names, _ = read_named_frames(opened, topic, transform.reads)
     classes = {str(number): name for number, name in names.items()}
-    filled = in_context(opened, prefix, job, frames, read_planes(opened, prefix) or (), classes)
-    filled = with_descriptors(
-        replace(filled, **side_inputs(RunState(opened, prefix, {}), job).values), opened, prefix, frames
-    )
+    source_of_job = Input(frames, frames, lambda: "", lambda: len(frames), classes)
+    work = Work(RunState(opened, prefix, {}), job, source_of_job, read_planes(opened, prefix))
+    work.take_context()
+    filled = work.transform
     return frames, {f.name: getattr(filled, f.name) for f in fields(filled) if f.metadata.get("context")}

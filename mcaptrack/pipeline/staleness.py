@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakKeyDictionary
 
 from mcaptrack import log
@@ -17,12 +18,13 @@ from mcaptrack.sources.cameras import camera_at, chain_of, is_plane, name_above,
 from mcaptrack.sources.corrections import CORRECTED, corrections_of
 from mcaptrack.transforms import STAGES
 
+if TYPE_CHECKING:
+    from mcaptrack.pipeline.write import RunState
+
 #: The value of ``camera_motion`` that takes no motion into account.
 OFF: Final = "off"
 #: Of more ground planes than this, a channel holds the digest.
 _MOST_RECORDED: Final = 100
-#: The stage that takes corrections over.
-CORRECTED_IN: Final = "sample"
 _READ: Final[WeakKeyDictionary[log.Log, dict[str, Planes | None]]] = WeakKeyDictionary()
 
 
@@ -47,9 +49,14 @@ def is_stale(opened: log.Log, topic: str) -> bool:
     return any(how.digest != provenance.made_from()[name] for name, how in now.items())
 
 
+def takes_corrections(stage: str) -> bool:
+    """Return whether a stage takes the corrections that people made of its input."""
+    return stage in STAGES and "corrections" in STAGES[stage].before
+
+
 def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
-    if provenance.transform != CORRECTED_IN:
+    if not takes_corrections(provenance.transform):
         return False
     ending = f"/{CORRECTED}"
     then = {topic: digest for topic, digest in provenance.references.items() if topic.endswith(ending)}
@@ -102,3 +109,12 @@ def warn_clock_jumps(opened: log.Log) -> None:
             f"{opened.path}: {jumps}: the clock jumps, or the recording paused; tracks and forecasts end there",
             "clock-jump",
         )
+
+
+def is_outdated(state: RunState, topics: Sequence[str]) -> bool:
+    """Return whether one of these topics is missing, or an input of the first one has changed since, also in a run."""
+    if not all(topic in state.opened.channels for topic in topics) or is_stale(state.opened, topics[0]):
+        return True
+    provenance = provenance_of(state.opened, topics[0])
+    then = provenance.made_from() if provenance else {}
+    return not then or any(name in state.results and state.digest(name) != digest for name, digest in then.items())

@@ -15,7 +15,6 @@ from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M, are_3d
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.plan import corrected_tracks
 from mcaptrack.pipeline.planes import fit_of
 from mcaptrack.pipeline.staleness import read_planes
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
@@ -26,7 +25,7 @@ from mcaptrack.schema.framing import has_any, joined_parts, row_ends, unique_val
 from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
-from mcaptrack.sources.corrections import corrections_of
+from mcaptrack.sources.corrections import corrected_tracks, corrections_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes
 from mcaptrack.transforms import STAGES
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
@@ -38,9 +38,8 @@ from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import conflict_of
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
-from mcaptrack.pipeline.plan import is_outdated
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock
-from mcaptrack.pipeline.staleness import planes_to_json
+from mcaptrack.pipeline.staleness import is_outdated, planes_to_json
 from mcaptrack.pipeline.write import DrawnMessages, Made, RunState
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
@@ -71,6 +70,11 @@ class ZoneWatch:
     topics: tuple[str, ...] = ()
     options: ZoneOptions | None = None
     force: bool = False
+    name: ClassVar[str] = STAGE
+
+    def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
+        """Count them (see ``make_zones``)."""
+        return make_zones(state, planes, self, stamps)
 
 
 class CountedZones(NamedTuple):

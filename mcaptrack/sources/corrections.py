@@ -49,6 +49,12 @@ def fixed_ids(tracks: Sequence[Frame], corrected: Sequence[Frame]) -> tuple[int,
     return tuple(range(first, first + len(ids)))
 
 
+def corrected_tracks(opened: log.Log, prefix: str, topic: str, tracks: Sequence[Frame]) -> Sequence[Frame]:
+    """Return the tracks of a channel with corrections, if it has any."""
+    corrections = corrections_of(opened, prefix, topic)
+    return tracks if corrections is None else with_corrections(tracks, opened.frame_columns(corrections, TRACKS))
+
+
 def with_corrections(tracks: Sequence[Frame], corrected: Sequence[Frame]) -> FrameColumns:
     """Frames of tracks with those of corrections in their place.
 

@@ -31,10 +31,15 @@ from mcaptrack.schema import (
 )
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
 
-#: Suffix of the topic of tracks at the video's rate (``Stage.at_video_rate``).
+#: Steps before and after a transform (``mcaptrack.pipeline.steps``).
+StepBefore = Literal["memory", "planes", "scale", "corrections", "scene", "log-before"]
+StepAfter = Literal["one-class", "log-before", "video-rate", "pictures", "seen"]
+#: Suffix of the topic of tracks at the video's rate (the step "video-rate").
 FULL: Final = "/full"
 #: Last parts of topics that outputs can't have: these are made of the results of stages.
 RESERVED: Final = frozenset({"full", "view", "events", "counts", "errors", "scores", "zones"})
+#: What a run makes of the results of its stages, in the provenance.
+FINISHING: Final = ("events", "zones")
 #: The field for the file that a name may end with, as in ``onnx:FILE``.
 _FILE: Final = "file"
 
@@ -68,12 +73,15 @@ class Stage:
         names; "" without one.
     on_demand : bool
         Whether it runs only if another stage is better with its output.
-    needs_scale : bool
-        Whether it converts boxes to metres, so that a scale is estimated if no ground plane is given.
+    before, after : tuple of str
+        Steps that are done with its input before its transform, and with its outputs after it, in order: names of
+        ``mcaptrack.pipeline.steps``. "scale" converts boxes to metres, so that a scale is estimated if no ground plane
+        is given; "video-rate" also writes tracks at the video's rate, below ``FULL``.
+    also_reads : Mapping[str, tuple[str, Schema]]
+        Channels that its transform takes beside its input where the log has them: topic below the name of a camera, and
+        schema, by the name of the field, which is made with ``context(tuple, is_recorded=False)`` and gets frames.
     repairs_tracks : bool
         Whether its tracks are repaired ones, which are scored and drawn as such.
-    at_video_rate : bool
-        Whether its tracks are also written at the video's rate, below ``FULL``.
     profiles_place : str
         Module and name of a mapping of transforms by the name of the profile that they are; "" without profiles.
     modes : Mapping[str, tuple[str, ...]]
@@ -93,9 +101,10 @@ class Stage:
     parameter: Kind | Literal[""] = ""
     variant_place: str = ""
     on_demand: bool = False
-    needs_scale: bool = False
+    before: tuple[StepBefore, ...] = ()
+    after: tuple[StepAfter, ...] = ()
+    also_reads: Mapping[str, tuple[str, Schema]] = field(default_factory=dict)
     repairs_tracks: bool = False
-    at_video_rate: bool = False
     profiles_place: str = ""
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     beside: tuple[str, ...] = ()
@@ -115,7 +124,7 @@ class Stage:
     def outputs(self, target: str) -> tuple[str, ...]:
         """The topics that the stage writes if its main output is ``target``."""
         topics = tuple(f"{target}/{suffix}".rstrip("/") for suffix in self.writes)
-        return (*topics, target + FULL) if self.at_video_rate else topics
+        return (*topics, target + FULL) if "video-rate" in self.after else topics
 
     def built_in(self) -> dict[str, type[Transform]]:
         """Its built-in transforms by name, the default first."""
@@ -304,7 +313,8 @@ _STAGES: Final = (
         input_topic="detections",
         output_topic="tracks",
         rows="tracks",
-        needs_scale=True,
+        before=("scale", "memory", "log-before"),
+        after=("one-class", "log-before", "seen"),
     ),
     Stage(
         name="sample",
@@ -314,7 +324,8 @@ _STAGES: Final = (
         input_topic="tracks",
         output_topic="samples",
         rows="samples",
-        needs_scale=True,
+        before=("scale", "corrections", "scene", "log-before"),
+        after=("log-before", "pictures", "seen"),
     ),
     Stage(
         name="predict",
@@ -326,6 +337,8 @@ _STAGES: Final = (
         rows="forecasts",
         parameter="predictor",
         variant_place="mcaptrack.transforms.predict:predict_with",
+        before=("scene", "log-before"),
+        after=("log-before",),
     ),
     Stage(
         name="retrack",
@@ -342,8 +355,9 @@ _STAGES: Final = (
         input_topic="samples",
         output_topic="retracks",
         rows="re-tracked tracks",
+        before=("planes", "scene", "log-before"),
+        after=("log-before", "video-rate", "pictures", "seen"),
         repairs_tracks=True,
-        at_video_rate=True,
         profiles_place="mcaptrack.transforms.retrack:PROFILES",
         modes=MappingProxyType(
             {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}

@@ -34,7 +34,8 @@ def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
     return common(
         base, topic="--topic /other/detections" if command == "track" else "--topic /none", to="--to /camera/others",
         camera="--camera other", output="-o b.mcap", sidecar="--sidecar", force=(f"{base} -o fresh.mcap", "--force"),
-        **({"frame": "--frame map"} if command == "track" else {}), **others,
+        **({"frame": "--frame map"} if command == "track" else {}),
+        **({} if command == "motion" else {"views": "--views"}), **others,
     )  # fmt: skip
 
 
@@ -127,6 +128,7 @@ CASES: dict[str, dict[str, Case]] = {
         fuser="--fuser grid",
         output="-o b.mcap",
         sidecar="--sidecar",
+        views="--views",
         force=("fuse two.mcap -o fresh.mcap", "--force"),
     ),
     "calibrate": common(

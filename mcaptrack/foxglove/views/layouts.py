@@ -9,16 +9,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.choices import LAYOUTS
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Planes, plane_at
 
-#: The names of the layouts, and the suffix of each file.
-TRACKING, COMPARING, PREDICTIONS = "tracking", "comparing", "predictions"
-FILES: Final[Mapping[str, str]] = {
-    TRACKING: ".layout.json",
-    COMPARING: ".comparing.layout.json",
-    PREDICTIONS: ".predictions.layout.json",
-}
+#: The names of the layouts.
+TRACKING, COMPARING, PREDICTIONS = LAYOUTS
 #: The channels that a layout switches on, below the prefix: the first that exists.
 _BEST: Final = ("retracks/full", "retracks", "tracks", "detections")
 #: The kinds of tracks that are compared: title, and channels of which the first that exists is shown.

@@ -1,0 +1,376 @@
+"""Steps before and after a transform, and its inputs beside the main one.
+
+A stage declares its steps (``Stage.before``, ``Stage.after``) and channels that it reads beside its main one
+(``Stage.also_reads``); a transform declares what else it takes from the log, as fields made with ``context()``. The
+tables ``BEFORE``, ``CONTEXT`` and ``AFTER`` say what each name stands for. The runner loops over these declarations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
+from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
+from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import Job
+from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
+from mcaptrack.pipeline.motion import SideInput, boxes_input, motion_input, path_with
+from mcaptrack.pipeline.pictures import with_descriptors
+from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_for, without_unseen
+from mcaptrack.pipeline.staleness import digest_of, takes_corrections
+from mcaptrack.pipeline.write import RunState
+from mcaptrack.schema import TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema.camera_motion import to_pictures, to_scene
+from mcaptrack.schema.framing import frame_times, row_ends
+from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.corrections import corrections_of, fixed_ids, with_corrections, without_filled
+from mcaptrack.sources.pictures import picture_size
+from mcaptrack.transforms import FULL, STAGES, Sample, Stage
+from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits
+from mcaptrack.transforms.protocol import traits_of
+from mcaptrack.transforms.retrack.offline import settle_classes
+from mcaptrack.transforms.stages import StepAfter, StepBefore
+from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
+
+#: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
+#: has all samples in memory).
+_BASE, _A_PERSON_SECOND = 400_000_000, 3_000
+#: Called with the name of a stage, the steps that are done, and their total.
+Progress = Callable[[str, int, int], None]
+
+
+class Input(NamedTuple):
+    """The input of a job.
+
+    A stream of frames, all frames if they are rows (else empty), and, after the stream was read, the digest and the
+    number of its messages; the names of its classes, the frame of its metres, the numbers of damaged pictures, and the
+    errors of images that are left out.
+    """
+
+    stream: Iterable[Frame]
+    frames: Sequence[Frame]
+    digest: Callable[[], str]
+    messages: Callable[[], int]
+    classes: Mapping[str, str] = {}
+    frame_id: str = ""
+    damaged: Sequence[int] = ()
+    unreadable: Sequence[McaptrackError] = ()
+
+    def with_frames(self, frames: Sequence[Frame]) -> Input:
+        """Return the same input with other rows."""
+        return self._replace(stream=frames, frames=frames)
+
+    def warn_lost(self, topic: str, reads: Schema, count_read: int) -> None:
+        """Warn of messages that were left out of the ``count_read`` that a transform got, and of damaged ones."""
+        messages = self.messages()
+        left_out = messages - count_read - len(self.unreadable)
+        if reads is VIDEO and left_out > 0:
+            warn(
+                f"{topic}: {left_out} of {messages} messages were left out: a video has to begin with a key picture "
+                "that has its parameter sets",
+                "left-out",
+            )
+        if self.unreadable:
+            warn(
+                f"{topic}: {len(self.unreadable)} of {messages} pictures can't be decoded and are left out, the first: "
+                f"{self.unreadable[0]}",
+                "lost",
+            )
+        if self.damaged:
+            warn(
+                f"{topic}: {len(self.damaged)} of {messages} pictures are damaged, number {self.damaged[0]} first; "
+                "what can't be decoded there is taken from others, so that detections may be wrong up to the next key "
+                "picture",
+                "lost",
+            )
+
+
+@dataclass
+class Work:
+    """A job while it is done: what it reads, its transform, and what it has made.
+
+    ``planes`` are the ground planes of the camera, and ``plane_choice`` how one is made where none is given.
+    ``seen`` are the frames of its input with boxes in the pictures that they were seen in, also where the camera moves
+    by ``path``. ``references`` are the digests of channels beside the main input, by topic. ``outputs`` are schema and
+    frames by topic; ``continued`` says how their ids go on from the log before.
+    """
+
+    state: RunState
+    job: Job
+    source: Input
+    planes: Planes | None
+    plane_choice: PlaneChoice = AS_BEFORE
+    log_before: Before | None = None
+    progress: Progress = lambda *_: None
+    path: CameraPath | None = None
+    is_led: bool = False
+    references: dict[str, str] = field(default_factory=dict)
+    outputs: dict[str, tuple[Schema, Sequence[Frame]]] = field(default_factory=dict)
+    continued: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.transform, self.seen, self.own_planes = self.job.transform, self.source.frames, self.planes
+
+    @property
+    def stage(self) -> Stage:
+        """Its stage."""
+        return STAGES[self.job.stage]
+
+    def main(self) -> Sequence[Frame]:
+        """Return the frames of the main output."""
+        return self.outputs[self.job.target][1]
+
+    def prepare(self) -> None:
+        """Do the steps before the transform, and give it what it takes from the log."""
+        for step in self.stage.before:
+            BEFORE[step](self)
+        self.take_context()
+
+    def take_context(self) -> None:
+        """Give the transform the values of its fields that follow from the log."""
+        taken = {f.name for f in fields(self.transform) if f.metadata.get("context")}
+        values: dict[str, Any] = {}
+        for name, (topic, schema) in self.stage.also_reads.items():
+            values |= self._taken(name, self._channel(f"{self.state.prefix}/{topic}", schema))
+        for name, input_of in CONTEXT.items():
+            if name in taken:
+                values |= self._taken(name, input_of(self))
+        self.transform = replace(self.transform, **values)
+        opened, prefix, _ = self.state
+        self.transform = with_descriptors(self.transform, opened, prefix, self.seen, self.progress, self.job.keep)
+
+    def finish(self) -> None:
+        """Do the steps after the transform."""
+        for step in self.stage.after:
+            AFTER[step](self)
+
+    def _taken(self, name: str, side: SideInput | None) -> dict[str, Any]:
+        if side is None:
+            return {}
+        self.references |= side.references
+        return {name: side.value}
+
+    def _channel(self, topic: str, schema: Schema) -> SideInput | None:
+        is_there = self.state.holds(topic, schema)
+        return SideInput(self.state.frames(topic, schema), {topic: self.state.digest(topic)}) if is_there else None
+
+
+# Steps before a transform.
+
+
+def warn_memory(frames: Sequence[Frame]) -> None:
+    """Warn if the stages that follow need more memory for these boxes than is free."""
+    boxes, steps = int(row_ends(frames)[-1]), np.diff(frame_times(frames))
+    seen_s = boxes * (float(np.median(steps)) / NS_PER_S if len(steps) else 0.0)
+    needed, free = _BASE + seen_s * _A_PERSON_SECOND, free_memory()
+    if free is not None and needed > free:
+        warn(
+            f"{boxes:,} boxes, of people who are seen for {seen_s / 3600:,.0f} hours together, take about "
+            f"{needed / 1e9:.1f} GB of memory, and {free / 1e9:.1f} GB are free: re-tracking has all samples in memory",
+            "memory",
+        )
+
+
+def free_memory() -> int | None:
+    """Return the free memory for this process in bytes, as Linux reports it; None if it isn't known."""
+    limits = []
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        limits += [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+        most, now = (Path(f"/sys/fs/cgroup/memory.{name}").read_text().strip() for name in ("max", "current"))
+        limits += [int(most) - int(now)] if most != "max" else []
+    except (OSError, ValueError):
+        pass  # not Linux, or no memory limit for this process's control group
+    return min(limits, default=None)
+
+
+def _with_corrections(work: Work) -> None:
+    """Take tracks as people have corrected them."""
+    state, source = work.state, work.job.source
+    topic = corrections_of(state.opened, state.prefix, source)
+    if topic is not None:
+        frames = with_corrections(work.source.frames, state.opened.frame_columns(topic, TRACKS))
+        work.source, work.seen = work.source.with_frames(frames), frames
+        work.references[topic] = digest_of(state.opened, topic)
+
+
+def _with_planes(work: Work) -> None:
+    """Take the ground planes of the camera, and make one where none is given and the stage needs it."""
+    source = (work.job.source, work.source.digest())
+    planes, frame_id = planes_for(work.state, work.job, work.source.frames, source, work.planes, work.plane_choice)
+    work.planes = work.own_planes = planes
+    work.source = work.source._replace(frame_id=work.source.frame_id or frame_id)
+
+
+def _in_scene(work: Work) -> None:
+    """Move boxes to the reference picture: those of pictures that the camera moved between can't be joined."""
+    work.path, motion = path_with(work.state, work.job.source)
+    work.references |= motion
+    if work.path is not None:
+        work.source = work.source.with_frames(to_scene(work.source.frames, work.path))
+        work.planes = scene_planes(work.planes or (), work.path)
+
+
+def _after_log_before(work: Work) -> None:
+    """Begin with the last seconds of the log before."""
+    before, frames = work.log_before, work.source.frames
+    if before is None:
+        warn_unfollowed(work.state.opened, work.job)
+        return
+    lead = before.lead(work.job, numbers_of(frames), work.planes or ()) if work.path is None else ()
+    if lead:
+        work.is_led = True
+        work.source = work.source.with_frames(led(lead, frames, work.transform.reads))
+
+
+BEFORE: Final[Mapping[StepBefore, Callable[[Work], None]]] = MappingProxyType(
+    {
+        "memory": lambda work: warn_memory(work.source.frames),
+        "planes": _with_planes,
+        "scale": _with_planes,
+        "corrections": _with_corrections,
+        "scene": _in_scene,
+        "log-before": _after_log_before,
+    }
+)
+
+
+# Inputs beside the main one: fields of transforms by name, None where the log has nothing to give.
+
+
+def _class_names(work: Work) -> SideInput:
+    names = tuple((int(number), name) for number, name in work.source.classes.items())
+    _warn_of_limits(str(getattr(work.transform, "class_limits", "")), names)
+    return SideInput(names)
+
+
+def _warn_of_limits(class_limits: str, names: ClassNames) -> None:
+    """Warn of limits for classes that don't exist."""
+    if unknown := unknown_limits(class_limits, names):
+        classes = ", ".join(sorted({name for _, name in names if name})) or "none with a name"
+        text = f"`class_limits=` names {', '.join(unknown)}: no such class is in the table of limits or in the boxes"
+        warn(f"{text} (classes of these are: {classes})", "option-not-used")
+
+
+def _clock_start(work: Work) -> SideInput:
+    """Take the start of the prediction clock in ns: from the log's metadata, or the time of the first picture."""
+    opened = work.state.opened
+    if work.is_led and work.log_before and work.log_before.is_bridged:
+        return SideInput(work.log_before.lead_ns)
+    clock = opened.metadata(CLOCK)
+    if clock and (start := parse_ns(clock.get("start_ns", ""))) is not None:
+        return SideInput(start)
+    pictures = camera_at(opened, work.state.prefix).pictures
+    return SideInput(min(opened.times(pictures).tolist(), default=None) if pictures else None)
+
+
+def _rate_hz(work: Work) -> SideInput | None:
+    steps = np.diff(frame_times(work.source.frames))
+    if not (steps > 0).any():  # frames may share a time
+        return None
+    rate_hz = round(NS_PER_S / float(np.median(steps[steps > 0])), 6)
+    usual, usual_hz = f"{work.state.prefix}/{work.stage.input_topic}", Sample().rate_hz
+    if work.job.source != usual and rate_hz > 2 * usual_hz:
+        warn(
+            f"{work.job.source} has {rate_hz:g} frames a second, and {work.job.stage} takes steps at that rate; "
+            f"{usual} has {usual_hz:g} unless it was made otherwise",
+            "clock",
+        )
+    return SideInput(rate_hz)
+
+
+def _fixed_ids(work: Work) -> SideInput | None:
+    """Take the ids of corrected tracks in the input; none if it was made without corrections."""
+    state, how = work.state, work.state.provenance(work.job.source)
+    is_corrected = how is not None and takes_corrections(how.transform)
+    topic = corrections_of(state.opened, state.prefix, how.input) if how and is_corrected else None
+    if how is None or topic is None or topic not in how.references:
+        return None
+    return SideInput(fixed_ids(state.frames(how.input), state.opened.frame_columns(topic, TRACKS)))
+
+
+CONTEXT: Final[Mapping[str, Callable[[Work], SideInput | None]]] = MappingProxyType(
+    {
+        "camera_path": lambda work: motion_input(work.state, work.transform),
+        "known_boxes": lambda work: boxes_input(work.state, work.transform),
+        "ground_planes": lambda work: SideInput(tuple(work.planes or ())),
+        "class_names": _class_names,
+        "start_ns": _clock_start,
+        "rate_hz": _rate_hz,
+        "poor_scale": lambda work: SideInput(is_poor(work.source.frames)) if is_assumed(work.planes) else None,
+        "fixed_ids": _fixed_ids,
+    }
+)
+
+
+# Steps after a transform.
+
+
+def _with_one_class(work: Work) -> None:
+    """Give each track of detections one class."""
+    schema, frames = work.outputs[work.job.target]
+    if schema is TRACKS:
+        work.outputs[work.job.target] = schema, settle_classes(frames)
+
+
+def _without_lead(work: Work) -> None:
+    """Leave out the seconds of the log before, and go on with its ids."""
+    if work.log_before is None:
+        return
+    frames, work.continued = work.log_before.own(work.job, [frames for _, frames in work.outputs.values()])
+    for topic, own in zip([*work.outputs], frames, strict=True):
+        work.outputs[topic] = work.outputs[topic][0], own
+
+
+def _at_video_rate(work: Work) -> None:
+    """Add the tracks at the rate of those that were sampled, if there are any."""
+    state, job = work.state, work.job
+    if job.target + FULL not in job.kept():
+        return
+    samples = state.provenance(job.source)
+    source = samples.input if samples else ""
+    tracks = state.frames(source)
+    topic = corrections_of(state.opened, state.prefix, source)
+    corrections = state.opened.frame_columns(topic, TRACKS) if topic is not None else None
+    if len(tracks) and corrections is not None:
+        tracks = with_corrections(tracks, corrections)
+    carry = linked_tracks if traits_of(work.transform).leaves_unchanged else to_video_rate
+    carried: Sequence[Frame] = carry(to_scene(tracks, work.path), work.main(), work.planes or ())
+    if corrections is not None:
+        carried = without_filled(carried, corrections)
+    if carried:
+        work.outputs[job.target + FULL] = TRACKS, carried
+
+
+def _on_pictures(work: Work) -> None:
+    """Move boxes of tracks back to the pictures that they were seen in."""
+    for topic, (schema, frames) in work.outputs.items():
+        if schema is TRACKS:
+            work.outputs[topic] = schema, to_pictures(frames, work.path)
+
+
+def _without_unseen(work: Work) -> None:
+    """Leave out rows outside of the picture without a detection."""
+    opened, prefix, _ = work.state
+    if not traits_of(work.transform).keeps_unseen:
+        work.outputs |= without_unseen(work.outputs, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
+
+
+AFTER: Final[Mapping[StepAfter, Callable[[Work], None]]] = MappingProxyType(
+    {
+        "one-class": _with_one_class,
+        "log-before": _without_lead,
+        "video-rate": _at_video_rate,
+        "pictures": _on_pictures,
+        "seen": _without_unseen,
+    }
+)

@@ -1,0 +1,356 @@
+"""Draw the channels of a camera for viewers, and make layouts of them: the last stage of a run.
+
+A view is a channel that draws another; its provenance names that channel and its digest. A view is due if it is missing
+or shows earlier rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack import log
+from mcaptrack.foxglove import views
+from mcaptrack.foxglove.views import layouts
+from mcaptrack.foxglove.views.layouts import ERRORS, PEOPLE, SPREAD
+from mcaptrack.geometry.plane import Planes, moved_planes
+from mcaptrack.notices import warn
+from mcaptrack.pipeline.checks import describe_origin, may_replace
+from mcaptrack.pipeline.drawing import (
+    NOT_SHOWN,
+    ChannelToDraw,
+    ViewFactory,
+    calibrated_cameras,
+    frame_topic,
+    has_bodies,
+    is_drawn_by_viewers,
+    new_frames,
+    recorded_drawings,
+    recorded_sources,
+    robot_frame,
+)
+from mcaptrack.pipeline.motion import path_with
+from mcaptrack.pipeline.scene_views import PictureClock, picture_clock, scene_on_pictures
+from mcaptrack.pipeline.staleness import digest_of, read_planes
+from mcaptrack.pipeline.write import RunState, Views, add_views, write_by_time
+from mcaptrack.schema import (
+    COUNTS,
+    DETECTIONS,
+    EVENTS,
+    FORECAST_SCORES,
+    GROUND_PLANE,
+    PREDICTIONS,
+    SCHEMAS,
+    TRACKS,
+    Frame,
+    Schema,
+)
+from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.encodings import PROTOBUF
+from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned, unique_values
+from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
+from mcaptrack.sources import foreign
+from mcaptrack.sources.camera_motion import tracks_topic
+from mcaptrack.sources.cameras import Camera, camera_at, cameras
+from mcaptrack.sources.fixed_frame import transforms_of
+from mcaptrack.transforms import FULL, STAGES
+
+#: The name of the stage, in reports.
+STAGE: Final = "views"
+#: Endings of the topics of forecasts, and of the online tracks that they belong to.
+_PREDICTED, _ONLINE = "/predictions", "/online"
+#: Where views look from follows from about so many rows at most.
+_MOST_ROWS: Final = 200_000
+#: The channels of each plot below the prefix of a camera, and the columns of each that it may show. Of forecasts, one
+#: channel is shown: the first with such values.
+_PLOTS: Final[Mapping[str, tuple[Schema, tuple[str, ...], tuple[str, ...]]]] = {
+    PEOPLE: (COUNTS, ("tracks/counts", "retracks/counts", "retracks/full/counts"), ("tracked", "people")),
+    ERRORS: (
+        FORECAST_SCORES,
+        ("predictions/scores", "retracks/predictions/scores"),
+        ("ade_m", "fde_m", "later_ade_m", "later_fde_m"),
+    ),
+    SPREAD: (FORECAST_SCORES, ("retracks/predictions/scores", "predictions/scores"), ("spread_mean_m", "spread_90_m")),
+}
+
+
+def make_views(
+    state: RunState,
+    planes: Planes,
+    stamps: Mapping[str, Sequence[int]] = {},
+    boxes: Mapping[str, foreign.NamedFrames] = {},
+    gone: Collection[str] = (),
+    is_written: bool = False,
+) -> Views | None:
+    """Draw the channels of a camera with a view that is due, and make its layouts.
+
+    Parameters
+    ----------
+    state : RunState
+        The log, the camera, and the channels that this run has made.
+    planes : Planes
+        The ground planes of the camera.
+    stamps : mapping of str to sequence of int
+        Capture times in ns of pictures that stages have read, by topic.
+    boxes : mapping of str to NamedFrames
+        Recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
+    gone : collection of str
+        Channels that this run drops.
+
+    is_written : bool
+        Whether the log is written in any case.
+
+    Returns
+    -------
+    Views or None
+        None if the log stays as it is: nothing new is in it, and no view is due. A topic that others recorded gets no
+        view, with a warning.
+    """
+    opened, prefix, results = state
+    camera, clock = camera_at(opened, prefix), picture_clock(opened, prefix, stamps)
+    shown = channels_to_draw(state, camera)
+    if not (shown or results or is_written):
+        return None
+    shown |= _boxes_to_draw(opened, boxes)
+    current = _Current(state, shown | {topic: _nothing(opened, topic) for topic in gone})
+    path, _ = path_with(state, tracks_topic(prefix))
+    planes, frame_id = moved_planes(planes, path), _Current(state, shown).frame_id()
+    is_framed = bool(frame_id) or any(channel.frame_id for channel in shown.values())
+    tree = transforms_of(opened) if is_framed else None
+    solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
+    calibrated = calibrated_cameras(opened, solid_in) if solid_in and tree else {}
+    scene, frames = scene_on_pictures(state), new_frames(prefix, shown, tree.frames() if tree else ())
+    seen_on = (*calibrated, *(seen.pictures for seen in scene.cameras))
+    outdated: set[str] = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
+    outdated |= {view for view in opened.channels for topic in shown if view.startswith(f"{topic}{views.SUFFIX}/")}
+    outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in seen_on}
+    outdated |= {frame_topic(prefix)} if frames else set()
+    recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
+    for topic in sorted(recorded):
+        warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
+    # Read everything before anything is written, because the log is changed in place.
+    factory = ViewFactory(prefix, clock.t_ns, clock.stamp_ns, planes, path, frames, calibrated, scene)
+    start_ns = _start_ns(opened, camera, shown, clock)
+    # Views of unchanged channels come first, so that channels made again keep their place and the log its bytes.
+    first, last = (
+        [
+            view
+            for view in factory.views({t: c for t, c in shown.items() if (t in results) is is_new}, start_ns)
+            if view.topic not in recorded
+        ]
+        for is_new in (False, True)
+    )
+    outdated -= recorded
+    drawn = Views(first, last, outdated)
+    topics = {*opened.channels} - outdated - {*gone} | {*results} | drawn.topics
+    names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
+    sources = recorded_sources(opened, [*camera.topics, *(channel.provenance.input for channel in results.values())])
+    by_viewers = recorded_drawings(opened, sources) if frame_id else {}
+    by_viewers |= {source + views.SCENE_SUFFIX: True for source in sources if source + views.SCENE_SUFFIX in topics}
+    eye = layouts.eye_on(current.positions(), planes, start_ns)
+    channels = layouts.CameraChannels(
+        prefix,
+        names,
+        clock.topic,
+        frame_id or views.ground.frame_of(prefix),
+        eye._replace(z_m=current.floor_m() if frame_id else 0.0),
+        current.last_step(),
+        current.is_truth_known(),
+        robot_frame(opened, sources, tree, frame_id) if tree and frame_id else "",
+        by_viewers,
+        seen_on,
+        highest_values(prefix, current.frames),
+    )
+    return drawn._replace(layouts=layouts.make(channels))
+
+
+# Channels with views that are due.
+
+
+def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw]:
+    """Return the channels that get views, by topic: those of this run, and others with a view that is due."""
+    opened, _, results = state
+    shown = {
+        topic: ChannelToDraw(
+            channel.schema, channel.frames, how.digest, how.transform, class_names(how.to_metadata()), how.frame_id
+        )
+        for topic, channel in results.items()
+        for how in (channel.provenance,)
+    }
+    inputs = {topic: channel.provenance.input for topic, channel in results.items()}
+    for topic in sorted(camera.topics - shown.keys()):
+        how = Provenance.from_metadata(opened.channels[topic].metadata)
+        schema = SCHEMAS.get(opened.channels[topic].schema_name)
+        if how is None or schema is None or not _is_due(state, camera, topic, schema, how):
+            continue
+        names, made_by = class_names(opened.channels[topic].metadata), how.transform if how.transform in STAGES else ""
+        drawing = ChannelToDraw(schema, opened.frame_columns(topic, schema), how.digest, made_by, names, how.frame_id)
+        if camera.pictures or drawing.is_on_ground():
+            shown[topic], inputs[topic] = drawing, how.input
+    for topic, drawing in shown.items():
+        if drawing.schema is PREDICTIONS:
+            shown[topic] = drawing._replace(bodies=_bodies(_Current(state, shown), topic, inputs[topic]))
+    return shown
+
+
+def _is_due(state: RunState, camera: Camera, topic: str, schema: Schema, how: Provenance) -> bool:
+    """Return whether a channel of the log is drawn, and its view is missing or shows earlier rows."""
+    opened, full = state.opened, topic + FULL
+    if topic.endswith(NOT_SHOWN) or full in opened.channels or full in state.results or not how.digest:
+        return False
+    if schema not in views.DRAWN and (schema is not GROUND_PLANE or topic != f"{camera.prefix}/ground_plane"):
+        return False
+    names = [topic + suffix for suffix in views.SUFFIXES]
+    names += [view for view in opened.channels if view.startswith(f"{topic}{views.SUFFIX}/")]
+    drawn = [Provenance.from_metadata(opened.channels[name].metadata) for name in names if name in opened.channels]
+    return not any(view is not None and view.input_digest == how.digest for view in drawn)
+
+
+def _nothing(opened: log.Log, topic: str) -> ChannelToDraw:
+    """Return a channel that this run drops, as one without frames."""
+    return ChannelToDraw(SCHEMAS.get(opened.channel(topic).schema_name, EVENTS), (), "", "", {}, "")
+
+
+def _boxes_to_draw(opened: log.Log, boxes: Mapping[str, foreign.NamedFrames]) -> dict[str, ChannelToDraw]:
+    """Return the recorded boxes that viewers can't draw, by topic."""
+    return {
+        topic: ChannelToDraw(DETECTIONS, box.frames, digest_of(opened, topic), "", box.classes, box.frame_id)
+        for topic, box in boxes.items()
+        if not is_drawn_by_viewers(opened.channel(topic)) and has_bodies(DETECTIONS, box.frames)
+    }
+
+
+def _bodies(current: _Current, topic: str, source: str) -> Sequence[Frame]:
+    """Return the tracks that forecasts belong to, if they have 3D boxes: those beside them, or those predicted from."""
+    beside = topic.removesuffix(_PREDICTED)
+    for name in (beside + _ONLINE, beside, source):
+        frames = current.frames(name, TRACKS)
+        if len(frames):
+            return frames if has_bodies(TRACKS, frames) else ()
+    return ()
+
+
+def _start_ns(opened: log.Log, camera: Camera, shown: Mapping[str, ChannelToDraw], clock: PictureClock) -> int:
+    """Return the time of a camera's first picture or row in ns; 0 if there is none."""
+    row_topics = [channel.topic for channel in opened.channels.values() if channel.schema_name in SCHEMAS]
+    times = [clock.t_ns, *(opened.times(topic) for topic in row_topics if topic in camera.topics)]
+    times += [np.array([channel.frames[0].t_ns], np.int64) for channel in shown.values() if len(channel.frames)]
+    return min((int(some[0]) for some in times if len(some)), default=0)
+
+
+# What layouts need to know of the channels of a camera.
+
+
+@dataclass(frozen=True)
+class _Current:
+    """The channels of a camera as they are after a run: those that it draws, or else those of the log."""
+
+    state: RunState
+    shown: Mapping[str, ChannelToDraw]
+
+    def frames(self, topic: str, schema: Schema) -> Sequence[Frame]:
+        """Return the frames of a channel; empty if there is none with such rows."""
+        if topic in self.shown:
+            return self.shown[topic].frames if self.shown[topic].schema is schema else ()
+        channel = self.state.opened.channels.get(topic)
+        of_log = channel and channel.schema_name == schema.name
+        return self.state.opened.frame_columns(topic, schema) if of_log else ()
+
+    def _each(self, schema: Schema, *names: str) -> Iterator[Sequence[Frame]]:
+        """Yield the frames of channels, by the ends of their topics."""
+        return (self.frames(f"{self.state.prefix}/{name}", schema) for name in names)
+
+    def last_step(self) -> int:
+        """Return the horizon of forecasts as a number of steps; 0 if there are no forecasts."""
+        for frames in self._each(PREDICTIONS, "retracks/predictions", "predictions"):
+            steps = unique_values(PREDICTIONS, frames, "step")
+            if len(steps):
+                return int(steps[-1])
+        return 0
+
+    def is_truth_known(self) -> bool:
+        """Return whether any forecast is compared with the ground truth."""
+        scores = self._each(FORECAST_SCORES, "retracks/predictions/scores", "predictions/scores")
+        return any(has_any(FORECAST_SCORES, frames, lambda rows: np.isfinite(rows["ade_m"])) for frames in scores)
+
+    def positions(self) -> NDArray[np.float64]:
+        """Return positions of people, (N, 2) in m, from the first channel of tracks that has any."""
+        for frames in self._each(TRACKS, "retracks", "tracks", "truth", "samples"):
+            rows = join_frames(TRACKS, thinned(frames, _MOST_ROWS)).rows
+            xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+            if np.isfinite(xy_m).all(axis=1).any():
+                return xy_m
+        return np.empty((0, 2))
+
+    def frame_id(self) -> str:
+        """Return the frame of the metres of a camera's tracks; "" for that of its ground plane."""
+        for name in ("retracks/full", "retracks", "tracks", "truth", "samples"):
+            topic = f"{self.state.prefix}/{name}"
+            if topic in self.shown:
+                return self.shown[topic].frame_id
+            if topic in self.state.opened.channels:
+                return frame_id_of(self.state.opened.channels[topic].metadata)
+        return ""
+
+    def floor_m(self) -> float:
+        """Return the usual height of the bottoms of 3D boxes; 0 if there are none."""
+        for frames in self._each(TRACKS, "retracks", "tracks", "truth", "samples"):
+            rows = join_frames(TRACKS, thinned(frames, _MOST_ROWS)).rows
+            base_m = rows["z_m"] - rows["height_m"] / 2
+            if np.isfinite(base_m).any():
+                return round(float(np.nanmedian(base_m)), 1)
+        return 0.0
+
+
+def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Frame]]) -> dict[str, float]:
+    """Return the largest value of each plot, as far as it is known: axes have room for all of them.
+
+    ``frames_of`` returns the frames of a topic with rows of a schema; empty if there are none.
+    """
+    out: dict[str, float] = {}
+    for plot, (schema, names, columns) in _PLOTS.items():
+        for name in names:
+            if plot == SPREAD and plot in out:
+                break
+            for _, _, joined in joined_parts(schema, frames_of(f"{prefix}/{name}", schema)):
+                for column in columns:
+                    values = np.asarray(joined.rows[column], np.float64)
+                    finite = values[np.isfinite(values)]
+                    if len(finite):
+                        out[plot] = max(out.get(plot, 0.0), float(finite.max()))
+    return out
+
+
+# Views that a log lacks, for commands that show it and leave it as it is.
+
+
+@contextmanager
+def with_views(opened: log.Log) -> Iterator[tuple[log.Log, dict[str, bytes]]]:
+    """Yield a log with the views that are due, which are in a temporary file, and the layouts for all of it, by name.
+
+    It yields the log itself, and no layouts, if no view is due. The log on the disk stays as it is.
+    """
+    due = [camera for camera in cameras(opened) if channels_to_draw(RunState(opened, camera.prefix, {}), camera)]
+    if not due:
+        yield opened, {}
+        return
+    made_layouts: dict[str, bytes] = {}
+    with TemporaryDirectory(prefix="mcaptrack-views-") as folder:
+        path = Path(folder, f"{opened.path.name.removesuffix('.mcap')}.views.mcap")
+        with log.create(path) as writer:
+            streams = []
+            for camera in due:
+                if drawn := make_views(RunState(opened, camera.prefix, {}), read_planes(opened, camera.prefix) or ()):
+                    made_layouts |= drawn.layouts
+                    streams += add_views(writer, (*drawn.first, *drawn.last), PROTOBUF)
+            write_by_time(writer, streams)
+        with log.read(opened.path) as complete:
+            complete.attach_results(log.read(path), is_new=False)
+            yield complete, made_layouts
