@@ -16,7 +16,7 @@ from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
 from mcaptrack.api.options import PathLike, Progress, Value, no_progress
-from mcaptrack.api.products import refuse_foreign_products, write_products
+from mcaptrack.api.products import Products, refuse_foreign_products, write_products
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call, did_you_mean
 from mcaptrack.evaluation.zones import ZoneTotals
@@ -229,46 +229,22 @@ def change(
     where: Where, act: Act, progress: Progress, tables: bool | None, each: EveryCamera | None = None
 ) -> RunResult:
     """Change one log; ``tables`` as for ``work``. With ``each`` all its cameras are run, if it has several."""
-    began = monotonic()
-    path, output = where.places()
-    target: Location = output or path
-    notes, boxes, place = Notes(), BoxesRead(), SidecarChoice(where.sidecar)
-    with warnings_about(target) as warnings:
-        with logs.read(path, sidecar=None if output else place) as opened:
-            if output is None:
-                opened.lock()  # a second process is refused before it computes anything
-            if tables and not where.force:
-                refuse_foreign_products(opened, target)
-            several = each if each is not None and each.chooses(opened, notes.say) else None
-            done = [] if several else [Done("", *act(opened, output, notes.say, boxes))]
-            written_to = output or opened.parts[-1].path
-            report = together([camera.report for camera in done])
-            cameras = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
-        if several:
-            done = several.run(path, output, place, notes.say, progress)
-            report = together([camera.report for camera in done])
-            with logs.read(target) as opened:
-                report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
-                cameras = {topic: pipeline.camera_to_name(opened, topic) for topic in report.stale}
-        for topic in report.stale:
-            warn_stale(topic, target, cameras)
+    began, work = monotonic(), _Change(where, *where.places())
+    with warnings_about(work.target) as warnings:
+        done, several = work.act(act, progress, each, bool(tables))
+        report = together([camera.report for camera in done])
+        _say_stale(work.target, report, is_open=several is not None)
         with report.watch.part("tables") if tables else nullcontext():
-            products = write_products(
-                target, is_new=report.is_written, tables=bool(tables), force=where.force, progress=progress, boxes=boxes
-            )
-        if tables and not isinstance(target, Path):
-            notes.say(
-                f"no tables are written, because {target} is in a store; {call('export', target)} writes them here"
-            )
-        refuse_failed(target, done)
-        zones = _zones_counted(target, done) if "zones" in report.finished else {}
+            products = work.products(report, bool(tables), progress)
+        refuse_failed(work.target, done)
+        zones = _zones_counted(work.target, done) if "zones" in report.finished else {}
         summaries: dict[str, Summary] = {}
         if tables is not None:
             with report.watch.part("summary"):
-                summaries = _summaries(target, done, boxes)
-    scene = next((camera.name for camera in reversed(done) if camera.is_scene), None) if several else ""
+                summaries = _summaries(work.target, done, work.boxes)
+    scenes = [camera.name for camera in done if camera.is_scene]
     return RunResult(
-        log=target,
+        log=work.target,
         stages=tuple(report.stages),
         frames=report.frames,
         rows=report.rows,
@@ -278,19 +254,69 @@ def change(
         stale=tuple(report.stale),
         layouts=tuple(products.layouts),
         tables=products.rows,
-        summary=None if scene is None else summaries.get(scene),
-        written_to=written_to if report.stages else None,
-        written_because=place.why,
+        summary=summaries.get("", summaries.get(scenes[-1]) if scenes else None),
+        written_to=work.written_to if report.stages else None,
+        written_because=work.place.why,
         warnings=tuple(dict.fromkeys(warnings)),
-        notes=tuple(notes),
+        notes=tuple(work.notes),
         seconds=round(monotonic() - began, 3),
         seconds_by_part={name: round(seconds, 3) for name, seconds in report.watch.seconds.items()},
-        cameras={camera.name: CameraResult.of(camera, summaries[camera.name]) for camera in done} if several else {},
+        cameras={camera.name: CameraResult.of(camera, summaries[camera.name]) for camera in done if several},
         left_out=dict(several.left_out if several else {}),
         not_fused=each.not_fused if each is not None else "",
         files=tuple(products.owed),
         written_tables=tuple(products.tables),
     )
+
+
+class _Change:
+    """A change of the log at ``path``, or of a copy at ``output``: what is said about it, and where it was written."""
+
+    def __init__(self, where: Where, path: Location, output: Path | None) -> None:
+        self.force, self.path, self.output = where.force, path, output
+        self.target: Location = output or path
+        self.written_to = self.target
+        self.notes, self.boxes, self.place = Notes(), BoxesRead(), SidecarChoice(where.sidecar)
+
+    def act(
+        self, act: Act, progress: Progress, each: EveryCamera | None, has_tables: bool
+    ) -> tuple[list[Done], EveryCamera | None]:
+        """Change the log, or each of its cameras; return what was done, and ``each`` if it has several."""
+        with logs.read(self.path, sidecar=None if self.output else self.place) as opened:
+            if self.output is None:
+                opened.lock()  # a second process is refused before it computes anything
+            if has_tables and not self.force:
+                refuse_foreign_products(opened, self.target)
+            self.written_to = self.output or opened.parts[-1].path
+            if each is None or not each.chooses(opened, self.notes.say):
+                return [Done("", *act(opened, self.output, self.notes.say, self.boxes))], None
+        return each.run(self.path, self.output, self.place, self.notes.say, progress), each
+
+    def products(self, report: pipeline.Report, has_tables: bool, progress: Progress) -> Products:
+        """Bring the files beside the log up to date."""
+        products = write_products(
+            self.target,
+            is_new=report.is_written,
+            tables=has_tables,
+            force=self.force,
+            progress=progress,
+            boxes=self.boxes,
+        )
+        if has_tables and not isinstance(self.target, Path):
+            export = call("export", self.target)
+            self.notes.say(f"no tables are written, because {self.target} is in a store; {export} writes them here")
+        return products
+
+
+def _say_stale(target: Location, report: pipeline.Report, is_open: bool) -> None:
+    """Warn of channels that are out of date now; with ``is_open`` later steps of the run may have made them again."""
+    if not report.stale:
+        return
+    with logs.read(target) as opened:
+        if is_open:
+            report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
+        for topic in report.stale:
+            warn_stale(topic, target, {topic: pipeline.camera_to_name(opened, topic)})
 
 
 def _zones_counted(target: Location, done: Sequence[Done]) -> dict[str, list[ZoneTotals]]:

@@ -348,14 +348,20 @@ class _Planner:
             return self._replace_older(provenance, stage, topic)
         main = main_topic(self.opened, stage, topic)
         result = self._with_choices(_Result(STAGES[stage], topic, main, provenance, had, source, before, before))
-        is_missing = topic not in self.opened.channels
-        is_due = any(changed) or is_missing or is_stale(self.opened, topic) or source != had
-        is_due = is_due or topic in self.renewed or result.is_projected
-        if result.wanted and not result.is_replaced and not self.force:
+        is_due = any(changed) or source != had or topic in self.renewed or result.is_projected
+        is_due = is_due or topic not in self.opened.channels or is_stale(self.opened, topic)
+        if result.is_replaced or self.force:
+            return self._run_again(result, result.wanted, why_not, is_due)
+        if result.wanted:
             self._warn_settings(main, differing(before, result.wanted) if before else str(why_not))
-        if not (is_due or self.force or result.is_replaced):
-            return False
-        transform = result.wanted if self.force or result.is_replaced else before
+        return is_due and self._run_again(result, before, why_not, is_due)
+
+    def _run_again(
+        self, result: _Result, transform: Transform | None, why_not: McaptrackError | None, is_due: bool
+    ) -> bool:
+        """Plan the stage of a channel with a transform, None if it can't be used; return if the channel will change."""
+        stage, topic, source, main = result.stage.name, result.topic, result.source, result.main
+        is_missing = topic not in self.opened.channels
         if transform and is_missing and topic not in Job(stage, transform, source, main).kept():
             return False  # a class of another package doesn't make all outputs of the built-in ones
         if source in self._gone or (source not in self.opened.channels and not self.changes[source]):

@@ -24,7 +24,7 @@ from mcaptrack.geometry.plane import (
     ground_depth,
     is_assumed,
 )
-from mcaptrack.geometry.plane_from_boxes import plane_from_boxes
+from mcaptrack.geometry.plane_from_boxes import PlaneFit, plane_from_boxes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job
@@ -171,13 +171,13 @@ def make_plane(
     chain = _chain(state, source[0])
     names = next((how.classes for _, how in chain if how and how.classes), {})
     frames = thinned(frames, _MOST_BOXES)
-    boxes, number, score, are_people = _boxes(frames, names)
-    if not len(boxes):
+    seen = _Boxes(*_boxes(frames, names))
+    if not len(seen.xywh):
         return None, None  # without boxes in pixels there is nothing to convert to metres
     camera = camera_at(state.opened, state.prefix)
     estimate, person_m = choice.settled(provenance_of(state.opened, camera.ground_plane))
     parameters: dict[str, Any] = {} if person_m == PERSON_HEIGHT_M else {"person_height_m": person_m}
-    width, height = (int((boxes[:, at] + boxes[:, at + 2]).max().round()) for at in (0, 1))
+    width, height = (int((seen.xywh[:, at] + seen.xywh[:, at + 2]).max().round()) for at in (0, 1))
     plane: GroundPlane | None = None
     if not estimate:
         parameters["fit_plane"] = False
@@ -185,23 +185,45 @@ def make_plane(
         if why_not != _BY_MOTION or choice.estimate:
             parameters["refused"] = why_not
     else:
-        channel = state.opened.channels.get(chain[-1][0])  # the pictures that boxes were found in
-        pictures = channel.topic if channel and foreign.holds_pictures(channel) else camera.pictures
-        size = picture_size(state.opened, pictures) or (width, height)
         try:
-            if not are_people.any():
-                raise McaptrackError("none of them is of a person")
-            some = are_people & (number % -(-len(frames) // _MOST_FRAMES) == 0)
-            fit = plane_from_boxes(boxes[some], number[some], score[some], *size, person_m)
+            size = _size_of_pictures(state, chain[-1][0]) or (width, height)
+            fit = seen.fit(len(frames), size, person_m)
             plane, parameters = fit.plane, {"person_height_m": person_m, "fit": fit.to_json()}
         except McaptrackError as error:
             parameters["refused"] = str(error)
     parameters |= {_UNCALIBRATED: uncalibrated} if uncalibrated else {}
     transform = _ASSUME if plane is None else _ESTIMATE
-    plane = plane or assumed_plane(boxes[are_people if are_people.any() else slice(None), 3], width, height, person_m)
+    plane = plane or assumed_plane(seen.heights(), width, height, person_m)
     start = frames[0].t_ns
     made = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], Provenance(transform, parameters, *source))
     return [(start, plane)], made
+
+
+def _size_of_pictures(state: RunState, topic: str) -> PictureSize:
+    """Return the size of the pictures that boxes were found in, or of those of the camera; None if it isn't known."""
+    channel = state.opened.channels.get(topic)
+    is_of_pictures = channel is not None and foreign.holds_pictures(channel)
+    return picture_size(state.opened, topic if is_of_pictures else camera_at(state.opened, state.prefix).pictures)
+
+
+class _Boxes(NamedTuple):
+    """Boxes (N, 4) in pixels, the number of the frame of each, its score, and whether it is of a person."""
+
+    xywh: Floats
+    number: Ints
+    score: Floats
+    are_people: Bools
+
+    def fit(self, frames: int, size: tuple[int, int], person_m: float) -> PlaneFit:
+        """Estimate a plane from people in some of the frames. Raises McaptrackError if they don't give one."""
+        if not self.are_people.any():
+            raise McaptrackError("none of them is of a person")
+        some = self.are_people & (self.number % -(-frames // _MOST_FRAMES) == 0)
+        return plane_from_boxes(self.xywh[some], self.number[some], self.score[some], *size, person_m)
+
+    def heights(self) -> Floats:
+        """Return the heights of people, or of all boxes if none is of a person."""
+        return self.xywh[self.are_people if self.are_people.any() else slice(None), 3]
 
 
 def planes_for(

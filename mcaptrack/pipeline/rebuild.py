@@ -64,13 +64,7 @@ def rebuild(stage: Stage, provenance: Provenance, named_by_user: Mapping[str, Tr
         raise OlderVersionError(f"it was made by an older version ({provenance.version}); `force=True` makes it again")
     parameters = dict(provenance.parameters)
     cls = _class_of(stage, provenance, parameters, named_by_user)
-    plugin, name = provenance.plugins.get("predictor"), parameters.get("predictor")
-    if plugin is None and isinstance(name, str) and _is_of_a_module(name):
-        plugin = Plugin(name, name, "", "")
-    if plugin:
-        named = {name for other in named_by_user.values() if isinstance(name := getattr(other, "predictor", None), str)}
-        if plugin.name not in named:
-            _installed("predictor", plugin, find)
+    _check_predictor(provenance, parameters.get("predictor"), named_by_user)
     cls = stage.with_part(cls, parameters.get(stage.parameter))
     types = {f.name: f for f in fields(cls)}
     unknown = sorted(set(parameters) - set(types))
@@ -84,13 +78,27 @@ def rebuild(stage: Stage, provenance: Provenance, named_by_user: Mapping[str, Tr
         if not types[name].metadata.get("context")
     }
     transform: Transform = cls(**values)
-    predictor = getattr(transform, "predictor", "")
-    if provenance.weights_sha256 and ":" in predictor and weights_sha256(predictor) != provenance.weights_sha256:
-        raise McaptrackError(f"{predictor} holds other weights than those it was made with")
-    own = transform.weights_sha256() if provenance.weights_sha256 and hasattr(transform, "weights_sha256") else None
-    if own not in (None, provenance.weights_sha256):
-        raise McaptrackError(f"{stage.choice(transform)} holds other weights than those it was made with")
+    if provenance.weights_sha256:
+        _check_weights(stage, transform, provenance.weights_sha256)
     return transform
+
+
+def _check_predictor(provenance: Provenance, name: object, named_by_user: Mapping[str, Transform]) -> None:
+    """Raise MissingPluginError if the predictor of a transform is of another package and may not be imported."""
+    plugin = provenance.plugins.get("predictor")
+    if plugin is None and isinstance(name, str) and _is_of_a_module(name):
+        plugin = Plugin(name, name, "", "")
+    if plugin and plugin.name not in {getattr(other, "predictor", None) for other in named_by_user.values()}:
+        _installed("predictor", plugin, find)
+
+
+def _check_weights(stage: Stage, transform: Transform, sha256: str) -> None:
+    """Raise McaptrackError if a transform, or its predictor, has other weights than those with this digest."""
+    predictor = getattr(transform, "predictor", "")
+    if ":" in predictor and weights_sha256(predictor) != sha256:
+        raise McaptrackError(f"{predictor} holds other weights than those it was made with")
+    if hasattr(transform, "weights_sha256") and transform.weights_sha256() not in (None, sha256):
+        raise McaptrackError(f"{stage.choice(transform)} holds other weights than those it was made with")
 
 
 def fuser_of(

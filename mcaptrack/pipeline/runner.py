@@ -17,7 +17,7 @@ from mcaptrack import log
 from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated
-from mcaptrack.notices import Notice, collected, known_code, warn
+from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, may_replace, read_named_frames, superseded
 from mcaptrack.pipeline.following import Before
 from mcaptrack.pipeline.pictures import pictures_of
@@ -32,7 +32,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import join_frames, row_ends, unique_values
 from mcaptrack.schema.provenance import FUSE, VIEW, Provenance
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.guarded import guarded
@@ -113,6 +113,14 @@ class Report:
     finished: set[str] = field(default_factory=set)
     watch: Stopwatch = field(default_factory=Stopwatch)
 
+    @classmethod
+    def begun_with(cls, fused: Mapping[str, Made]) -> Report:
+        """Return a report that begins with channels that were made of those of several cameras, if any."""
+        report = cls(stages=[FUSE] if fused else [])
+        for topic, channel in fused.items():
+            report.count(topic, channel)
+        return report
+
     def count(self, topic: str, channel: Made) -> None:
         """Count the frames, rows and tracks of a new channel."""
         self.frames[topic], self.rows[topic] = len(channel.frames), int(row_ends(channel.frames)[-1])
@@ -168,33 +176,35 @@ def warn_findings(
 
     This covers ``results`` and the channels that they were made from; with ``is_all`` all channels of the camera.
     """
-    provenances = dict(results)
-    for topic in sorted(camera_at(opened, prefix).topics):
-        provenance = Provenance.from_metadata(opened.channels[topic].metadata)
-        if provenance is not None:
-            provenances.setdefault(topic, provenance)
+    camera = camera_at(opened, prefix)
+    of_log = {topic: provenance_of(opened, topic) for topic in sorted(camera.topics - results.keys())}
+    provenances = {**results, **{topic: how for topic, how in of_log.items() if how is not None}}
     topics = list(provenances) if is_all else list(results)
     for topic in topics:
         if provenances[topic].input in provenances and provenances[topic].input not in topics:
             topics.append(provenances[topic].input)
-    stages = {provenances[topic].transform for topic in topics}
-    for topic in topics:
-        for code, message in provenances[topic].warnings:
-            warn(message, known_code(code))
-    if is_assumed(planes) and stages & _IN_METRES:
-        plane = plane_in_words(planes, provenances.get(camera_at(opened, prefix).ground_plane))
+    covered = [provenances[topic] for topic in topics]
+    for how in covered:
+        how.warn_again()
+    if is_assumed(planes) and {how.transform for how in covered} & _IN_METRES:
+        plane = plane_in_words(planes, provenances.get(camera.ground_plane))
         warn(plane, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
-    parameters = [provenances[topic].parameters for topic in topics]
+    _warn_held_back(opened, [how.parameters for how in covered])
+
+
+def _warn_held_back(opened: log.Log, parameters: Sequence[Mapping[str, Any]]) -> None:
+    """Warn of tracks that were not re-tracked, because the camera looks along the ground; by parameters of stages."""
     held_back = [values for values in parameters if values.get("poor_scale") and not values.get("side_view")]
-    if held_back:
-        by_likelihood = [values for values in held_back if values.get("retracker", "likelihood") == "likelihood"]
-        is_linked = any(values.get("link_s") != 0 for values in by_likelihood)
-        done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
-        warn(
-            f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
-            f"looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
-            "held-back",
-        )
+    if not held_back:
+        return
+    by_likelihood = [values for values in held_back if values.get("retracker", "likelihood") == "likelihood"]
+    is_linked = any(values.get("link_s") != 0 for values in by_likelihood)
+    done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
+    warn(
+        f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
+        f"looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
+        "held-back",
+    )
 
 
 class Finish(Protocol):
@@ -230,10 +240,7 @@ def run(
     The log is replaced as a whole, after everything was computed.
     """
     boxes, results = boxes or BoxesRead(), dict(fused)
-    state, stamps = RunState(opened, prefix, results), dict[str, list[int]]()
-    report = Report(stages=[FUSE] if fused else [])
-    for topic, channel in fused.items():
-        report.count(topic, channel)
+    state, stamps, report = RunState(opened, prefix, results), dict[str, list[int]](), Report.begun_with(fused)
     part = report.watch.part
     with collected() as warnings:
         if jobs:
@@ -242,20 +249,8 @@ def run(
         for job in jobs:
             with part("read"):
                 source = _input(state, job, stamps, progress, boxes, report.watch)
-            work = Work(state, job, source, planes, plane, before, progress)
-            try:
-                with part(job.stage):
-                    results |= _done(work)
-            except McaptrackError as error:
-                if not job.is_optional:
-                    raise
-                warn(f"{job.target} is left out: {error}", "left-out")
-                continue
-            planes = work.own_planes
-            for topic in (topic for topic in job.outputs() if topic in results):
-                report.count(topic, results[topic])
-            report.stages.append(job.stage)
-            del source, work
+            planes = _add_results(Work(state, job, source, planes, plane, before, progress), report)
+            del source
             release_memory()
         for step in finishing:
             with part(step.name):
@@ -270,16 +265,34 @@ def run(
             with part(STAGE):
                 drawn = make_views(state, planes or (), stamps, boxes.in_space(), gone, is_written=output is not None)
             report.stages += [STAGE] if drawn and drawn.topics else []
-        if results or output is not None or (drawn and drawn.topics):
-            with part("write"):
-                write(state, output, drawn, gone)
-                report.is_written = True
+        with part("write"):
+            report.is_written = write(state, output, drawn, gone)
         provenances = {topic: channel.provenance for topic, channel in results.items()}
         warn_findings(opened, prefix, provenances, planes or (), is_all=bool(finishing) or not jobs)
     late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
     report.stale = [topic for topic in late if topic not in gone]
     report.warnings = list(dict.fromkeys(warnings))
     return report
+
+
+def _add_results(work: Work, report: Report) -> Planes | None:
+    """Do the work of a job, and add its channels to those of the run; return the ground planes from now on.
+
+    A job that is optional may fail, with a warning.
+    """
+    job, results = work.job, work.state.results
+    try:
+        with report.watch.part(job.stage):
+            results |= _done(work)
+    except McaptrackError as error:
+        if not job.is_optional:
+            raise
+        warn(f"{job.target} is left out: {error}", "left-out")
+        return work.own_planes
+    for topic in (topic for topic in job.outputs() if topic in results):
+        report.count(topic, results[topic])
+    report.stages.append(job.stage)
+    return work.own_planes
 
 
 def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> set[str]:

@@ -34,19 +34,23 @@ def is_stale(opened: log.Log, topic: str) -> bool:
     if provenance is None:
         return False
     prefix = name_above(chain_of(opened, topic)[-1])
-    if "ground_planes" in provenance.parameters:
-        planes = read_planes(opened, prefix)
-        if planes_to_json(planes or ()) != provenance.parameters["ground_planes"]:
-            return True
+    if _is_plane_new(opened, prefix, provenance):
+        return True
     if is_motion_new(opened, prefix, provenance) or is_of_corrections(opened, prefix, provenance):
         return True
-    planes_used = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
-    if any(camera_at(opened, name_above(name)).ground_plane != name for name in planes_used):
-        return True  # a plane was corrected, or its correction is gone
     if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
         return True
     now = {name: how for name in provenance.made_from() if (how := provenance_of(opened, name)) and how.digest}
     return any(how.digest != provenance.made_from()[name] for name, how in now.items())
+
+
+def _is_plane_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
+    """Whether the ground plane was changed or corrected, or a correction is gone."""
+    then = provenance.parameters.get("ground_planes")
+    if then is not None and planes_to_json(read_planes(opened, prefix) or ()) != then:
+        return True
+    planes_used = [name for name in provenance.references if provenance.transform == FUSE and is_plane(name)]
+    return any(camera_at(opened, name_above(name)).ground_plane != name for name in planes_used)
 
 
 def takes_corrections(stage: str) -> bool:

@@ -39,7 +39,7 @@ from mcaptrack.pipeline.drawing import (
 from mcaptrack.pipeline.motion import path_with
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock, scene_on_pictures
 from mcaptrack.pipeline.staleness import digest_of, read_planes
-from mcaptrack.pipeline.write import RunState, Views, add_views, write_by_time
+from mcaptrack.pipeline.write import RunState, View, Views, add_views, write_by_time
 from mcaptrack.schema import (
     COUNTS,
     DETECTIONS,
@@ -113,62 +113,94 @@ def make_views(
         None if the log stays as it is: nothing new is in it, and no view is due. A topic that others recorded gets no
         view, with a warning.
     """
-    opened, prefix, results = state
-    camera, clock = camera_at(opened, prefix), picture_clock(opened, prefix, stamps)
+    camera = camera_at(state.opened, state.prefix)
     shown = channels_to_draw(state, camera)
-    if not (shown or results or is_written):
+    if not (shown or state.results or is_written):
         return None
-    shown |= _boxes_to_draw(opened, boxes)
-    current = _Current(state, shown | {topic: _nothing(opened, topic) for topic in gone})
-    path, _ = path_with(state, tracks_topic(prefix))
-    planes, frame_id = moved_planes(planes, path), _Current(state, shown).frame_id()
-    is_framed = bool(frame_id) or any(channel.frame_id for channel in shown.values())
-    tree = transforms_of(opened) if is_framed else None
-    solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
-    calibrated = calibrated_cameras(opened, solid_in) if solid_in and tree else {}
-    scene, frames = scene_on_pictures(state), new_frames(prefix, shown, tree.frames() if tree else ())
-    seen_on = (*calibrated, *(seen.pictures for seen in scene.cameras))
-    outdated: set[str] = {topic + suffix for topic in shown for suffix in views.SUFFIXES}
-    outdated |= {view for view in opened.channels for topic in shown if view.startswith(f"{topic}{views.SUFFIX}/")}
-    outdated |= {topic + views.SUFFIX + pictures for topic in shown for pictures in seen_on}
-    outdated |= {frame_topic(prefix)} if frames else set()
-    recorded = {topic for topic in outdated if not may_replace(opened, topic, VIEW)}
-    for topic in sorted(recorded):
-        warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
-    # Read everything before anything is written, because the log is changed in place.
-    factory = ViewFactory(prefix, clock.t_ns, clock.stamp_ns, planes, path, frames, calibrated, scene)
-    start_ns = _start_ns(opened, camera, shown, clock)
-    # Views of unchanged channels come first, so that channels made again keep their place and the log its bytes.
-    first, last = (
-        [
-            view
-            for view in factory.views({t: c for t, c in shown.items() if (t in results) is is_new}, start_ns)
-            if view.topic not in recorded
-        ]
-        for is_new in (False, True)
-    )
-    outdated -= recorded
-    drawn = Views(first, last, outdated)
-    topics = {*opened.channels} - outdated - {*gone} | {*results} | drawn.topics
-    names = frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/"))
-    sources = recorded_sources(opened, [*camera.topics, *(channel.provenance.input for channel in results.values())])
-    by_viewers = recorded_drawings(opened, sources) if frame_id else {}
-    by_viewers |= {source + views.SCENE_SUFFIX: True for source in sources if source + views.SCENE_SUFFIX in topics}
-    eye = layouts.eye_on(current.positions(), planes, start_ns)
-    channels = layouts.CameraChannels(
-        prefix,
-        names,
-        clock.topic,
-        frame_id or views.ground.frame_of(prefix),
-        eye._replace(z_m=current.floor_m() if frame_id else 0.0),
-        current.last_step(),
-        current.is_truth_known(),
-        robot_frame(opened, sources, tree, frame_id) if tree and frame_id else "",
-        by_viewers,
-        seen_on,
-        highest_values(prefix, current.frames),
-    )
-    return drawn._replace(layouts=layouts.make(channels))
+    work = _Work(state, camera, planes, stamps, shown | _boxes_to_draw(state.opened, boxes))
+    drawn = Views(*work.views(), work.outdated)
+    return drawn._replace(layouts=layouts.make(work.contents(drawn, gone)))
+
+
+class _Work:
+    """The work of drawing channels of a camera, ``shown``: where, when and in which frames they are drawn."""
+
+    def __init__(
+        self,
+        state: RunState,
+        camera: Camera,
+        planes: Planes,
+        stamps: Mapping[str, Sequence[int]],
+        shown: Mapping[str, ChannelToDraw],
+    ) -> None:
+        opened, prefix = state.opened, state.prefix
+        self.state, self.camera, self.shown = state, camera, shown
+        self.clock = picture_clock(opened, prefix, stamps)
+        self.path, _ = path_with(state, tracks_topic(prefix))
+        self.planes = moved_planes(planes, self.path)
+        self.frame_id = _Current(state, shown).frame_id()
+        is_framed = bool(self.frame_id) or any(channel.frame_id for channel in shown.values())
+        self.tree = transforms_of(opened) if is_framed else None
+        solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
+        self.calibrated = calibrated_cameras(opened, solid_in) if solid_in and self.tree else {}
+        self.scene = scene_on_pictures(state)
+        self.frames = new_frames(prefix, shown, self.tree.frames() if self.tree else ())
+        self.seen_on = (*self.calibrated, *(seen.pictures for seen in self.scene.cameras))
+        self.start_ns = _start_ns(opened, camera, shown, self.clock)
+        of_shown = self._outdated()
+        self._recorded = {topic for topic in of_shown if not may_replace(opened, topic, VIEW)}
+        self.outdated = of_shown - self._recorded
+        for topic in sorted(self._recorded):
+            warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
+
+    def _outdated(self) -> set[str]:
+        """Return the topics of all views of these channels."""
+        topics = {topic + suffix for topic in self.shown for suffix in views.SUFFIXES}
+        topics |= {topic + views.SUFFIX + pictures for topic in self.shown for pictures in self.seen_on}
+        on_others = tuple(f"{topic}{views.SUFFIX}/" for topic in self.shown)
+        topics |= {view for view in self.state.opened.channels if view.startswith(on_others)}
+        return topics | ({frame_topic(self.state.prefix)} if self.frames else set())
+
+    def views(self) -> tuple[list[View], list[View]]:
+        """Return the views of channels that stay as they are, and of those of this run.
+
+        The former come first, so that channels that are made again keep their place, and the log its bytes.
+        """
+        factory = ViewFactory(
+            self.state.prefix, self.clock.t_ns, self.clock.stamp_ns, self.planes, self.path, self.frames,
+            self.calibrated, self.scene,
+        )  # fmt: skip
+        first, last = (
+            {topic: channel for topic, channel in self.shown.items() if (topic in self.state.results) is is_new}
+            for is_new in (False, True)
+        )
+        drawn = [[*factory.views(channels, self.start_ns)] for channels in (first, last)]
+        kept = [[view for view in some if view.topic not in self._recorded] for some in drawn]
+        return kept[0], kept[1]
+
+    def contents(self, drawn: Views, gone: Collection[str]) -> layouts.CameraChannels:
+        """Return what layouts have to know of the camera."""
+        opened, prefix, results = self.state
+        current = _Current(self.state, {**self.shown, **{topic: _nothing(opened, topic) for topic in gone}})
+        topics = {*opened.channels} - self.outdated - {*gone} | {*results} | drawn.topics
+        inputs = [channel.provenance.input for channel in results.values()]
+        sources = recorded_sources(opened, [*self.camera.topics, *inputs])
+        by_viewers = recorded_drawings(opened, sources) if self.frame_id else {}
+        by_viewers |= {name: True for source in sources if (name := source + views.SCENE_SUFFIX) in topics}
+        eye = layouts.eye_on(current.positions(), self.planes, self.start_ns)
+        return layouts.CameraChannels(
+            prefix,
+            frozenset(topic.removeprefix(prefix + "/") for topic in topics if topic.startswith(prefix + "/")),
+            self.clock.topic,
+            self.frame_id or views.ground.frame_of(prefix),
+            eye._replace(z_m=current.floor_m() if self.frame_id else 0.0),
+            current.last_step(),
+            current.is_truth_known(),
+            robot_frame(opened, sources, self.tree, self.frame_id) if self.tree and self.frame_id else "",
+            by_viewers,
+            self.seen_on,
+            highest_values(prefix, current.frames),
+        )
 
 
 # Channels with views that are due.
@@ -203,9 +235,8 @@ def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw
 def _is_due(state: RunState, camera: Camera, topic: str, schema: Schema, how: Provenance) -> bool:
     """Return whether a channel of the log is drawn, and its view is missing or shows earlier rows."""
     opened, full = state.opened, topic + FULL
-    if topic.endswith(NOT_SHOWN) or full in opened.channels or full in state.results or not how.digest:
-        return False
-    if schema not in views.DRAWN and (schema is not GROUND_PLANE or topic != f"{camera.prefix}/ground_plane"):
+    is_drawn = schema in views.DRAWN or (schema is GROUND_PLANE and topic == f"{camera.prefix}/ground_plane")
+    if not is_drawn or topic.endswith(NOT_SHOWN) or full in {*opened.channels, *state.results}:
         return False
     names = [topic + suffix for suffix in views.SUFFIXES]
     names += [view for view in opened.channels if view.startswith(f"{topic}{views.SUFFIX}/")]

@@ -154,21 +154,24 @@ class Views(NamedTuple):
         return {view.topic for view in (*self.first, *self.last)}
 
 
-def write(state: RunState, output: Path | None, views: Views | None = None, gone: Collection[str] = ()) -> None:
+def write(state: RunState, output: Path | None, views: Views | None = None, gone: Collection[str] = ()) -> bool:
     """Write the channels of a run into the log, or into a copy at ``output``, with their views and layouts.
 
-    Channels at the topics ``gone`` are dropped. Without ``views`` so are those of earlier rows.
+    Channels at the topics ``gone`` are dropped. Without ``views`` so are those of earlier rows. Returns whether there
+    was anything to write.
     """
     opened, _, results = state
+    if not results and output is None and not (views and views.topics):
+        return False
     replaced = {*gone} | ({*views.outdated} if views else _outdated_views(state))
     drawn = views or Views()
     topics, encoding = {*results, *drawn.topics}, encoding_for(opened)
     log.refuse_to_replace_recorded(opened, topics | replaced, "write to another channel")
     check_topics(topics, encoding)
-    new = {attachment_of(name): content for name, content in drawn.layouts.items()}
-    unchanged = {name for name, content in new.items() if opened.attachment(name) == content}
-    dropped = [name for name in ATTACHMENTS if views and name not in unchanged]
-    with log.extend(opened, output, drop={*results, *replaced}, drop_attachments=dropped) as writer:
+    made = {attachment_of(name): content for name, content in drawn.layouts.items()}
+    layouts = {name: content for name, content in made.items() if opened.attachment(name) != content}
+    dropped = {*ATTACHMENTS} - (made.keys() - layouts.keys()) if views else ()
+    with log.extend(opened, output, drop={*results, *replaced}, drop_attachments=sorted(dropped)) as writer:
         streams = add_views(writer, drawn.first, encoding)
         for topic, channel in results.items():
             made_by = channel.provenance.transform  # outputs of a stage are dropped together: they share chunks
@@ -176,9 +179,9 @@ def write(state: RunState, output: Path | None, views: Views | None = None, gone
             number = writer.add_channel(topic, record, encoding, metadata, group=made_by)
             streams.append(_with_number(number, channel.messages_in(encoding)))
         write_by_time(writer, [*streams, *add_views(writer, drawn.last, encoding)])
-        for name, content in new.items():
-            if name not in unchanged:
-                writer.add_attachment(name, "application/json", content)
+        for name, content in layouts.items():
+            writer.add_attachment(name, "application/json", content)
+    return True
 
 
 def _outdated_views(state: RunState) -> set[str]:

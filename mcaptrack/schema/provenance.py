@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, Self, TypeVar
 
 from mcaptrack import __version__
+from mcaptrack.notices import known_code, warn
 
 T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
@@ -70,6 +71,11 @@ class Provenance:
     def is_of_older_version(self) -> bool:
         """Whether it was made by a version with other parameters than this one."""
         return self.version.startswith(_OLDER)
+
+    def warn_again(self) -> None:
+        """Repeat the warnings when it was made."""
+        for code, message in self.warnings:
+            warn(message, known_code(code))
 
     def made_from(self) -> dict[str, str]:
         """The topics that it was made from and compared with, and their digests."""
