@@ -74,10 +74,12 @@ def test_a_person_is_a_handful_of_colours():
     assert abs(inside[0, 0] - mean).max() <= 17
 
 
-def walk_log(path: Path, watched: int = 50) -> dict[int, tuple[float, float, float, float]]:
+def walk_log(
+    path: Path, watched: int = 50, damaged: tuple[int, ...] = ()
+) -> dict[int, tuple[float, float, float, float]]:
     """A log of 5 s: somebody tracked with a hole of 2.7 s, found 1 s late and lost 1 s early, a car and a detection.
 
-    Only the first pictures, ``watched``, have frames of tracks and detections.
+    Only the first pictures, ``watched``, have frames of tracks and detections. Of ``damaged`` ones the end is missing.
 
     Returns the true box of the person in each picture.
     """
@@ -90,7 +92,12 @@ def walk_log(path: Path, watched: int = 50) -> dict[int, tuple[float, float, flo
         depth = writer.add_channel("/lidar/points", ("foxglove.PointCloud", "", b""), "json", {})
         for n in range(50):
             message = RawImage(
-                frame_id="eye", width=160, height=120, encoding="rgb8", step=480, data=noise(n).tobytes()
+                frame_id="eye",
+                width=160,
+                height=120,
+                encoding="rgb8",
+                step=480,
+                data=noise(n).tobytes()[: 99 if n in damaged else None],
             )
             message.timestamp.FromNanoseconds(ns(n / 10))
             writer.add_message(video, ns(n / 10), 7 * n, message.SerializeToString(), ns(n / 10) + 5)
@@ -152,6 +159,21 @@ def test_a_person_stays_hidden_in_gaps_and_around_the_track_and_all_else_is_kept
         assert how["mine"] == "kept"
         assert json.loads(how["mcaptrack.blurred"])["boxes"] == ["/camera/detections", "/camera/tracks"]
         assert opened.attachment("notes.txt") == b"secret"
+
+
+def test_pictures_that_cannot_be_decoded_are_left_out_with_a_warning(tmp_path):
+    """As nobody can tell whom they show; all others are those of the undamaged log."""
+    walk_log(tmp_path / "a.mcap")
+    walk_log(tmp_path / "damaged.mcap", damaged=(0, 7, 8, 49))
+    wanted, done = (
+        mcaptrack.render(tmp_path / f"{name}.mcap", tmp_path / f"{name}.out.mcap", blur="people")
+        for name in ("a", "damaged")
+    )
+    assert (wanted.pictures, done.pictures) == (50, 46)
+    (said,) = (one.message for one in done.warnings if one.code in ("left-out", "lost"))
+    assert "4 messages of /camera/video without a picture that can be decoded are left out, the first: " in said
+    whole, kept = (messages(tmp_path / f"{name}.out.mcap")["/camera/video"] for name in ("a", "damaged"))
+    assert kept == [one for n, one in enumerate(whole) if n not in (0, 7, 8, 49)]
 
 
 def test_pictures_that_no_detector_saw_are_counted_in_a_warning(tmp_path):

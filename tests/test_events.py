@@ -541,7 +541,7 @@ def test_events_that_would_replace_something_are_left_out_with_a_warning_or_refu
     assert (report.stages, report.events, report.frames) == ([], {}, {})
     with pytest.raises(McaptrackError) as error:
         run_watch(path, topics=("/camera/tracks",), again=True)
-    assert str(error.value) == f"{path}: events {taken}"
+    assert str(error.value) == f"{path}: no events of /camera/tracks: they {taken}"
 
 
 def test_of_two_channels_of_a_topic_the_recorded_one_is_named(tmp_path):

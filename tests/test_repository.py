@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -128,3 +130,80 @@ def test_no_test_is_skipped_for_want_of_a_package_that_is_installed():
     texts = {path.name: path.read_text() for path in (ROOT / "tests").rglob("*.py")}
     skipped = {name: set(re.findall(r"importorskip\(\"([\w-]+)", text)) & INSTALLED for name, text in texts.items()}
     assert not {name: packages for name, packages in skipped.items() if packages}
+
+
+# Functions of the rooms in which a change touches much can be read at once
+
+
+MOST_LINES, MOST_PATHS = 80, 15
+#: Files with larger functions that are still being worked on.
+NOT_YET = {"pipeline/planes.py", "pipeline/runner.py"}
+#: What adds a path through a function: the same as `radon cc` counts (McCabe's complexity).
+FORKS = (ast.If, ast.IfExp, ast.For, ast.While, ast.ExceptHandler, ast.comprehension, ast.Assert, ast.match_case)
+
+
+def parts_of(node: ast.AST) -> Iterator[ast.AST]:
+    """All nodes below one, without functions within it."""
+    for child in ast.iter_child_nodes(node):
+        if not isinstance(child, ast.FunctionDef | ast.ClassDef):
+            yield child
+            yield from parts_of(child)
+
+
+def paths_through(function: ast.FunctionDef) -> int:
+    nodes = [*parts_of(ast.Module(function.body, []))]
+    conditions = sum(len(node.values) - 1 for node in nodes if isinstance(node, ast.BoolOp))
+    filters = sum(len(node.ifs) for node in nodes if isinstance(node, ast.comprehension))
+    otherwise = sum(bool(node.orelse) for node in nodes if isinstance(node, ast.For | ast.While | ast.Try))
+    return 1 + sum(isinstance(node, FORKS) for node in nodes) + conditions + filters + otherwise
+
+
+def lines_of(function: ast.FunctionDef) -> int:
+    """The lines of a function with its signature, without its docstring."""
+    first = function.body[0]
+    said = first.end_lineno - first.lineno + 1 if ast.get_docstring(function) is not None else 0
+    return function.end_lineno - function.lineno + 1 - said
+
+
+def functions_of(text: str) -> Iterator[ast.FunctionDef]:
+    return (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef))
+
+
+def test_paths_and_lines_are_counted():
+    text = '''
+def f(a, b):
+    """Not a line.
+
+    Nor these."""
+    for x in a or b:  # 3
+        if x and (y := [z for z in x if z]):  # 7
+            continue
+    else:  # 8
+        try:
+            return 1 if y else 2  # 9
+        except ValueError:  # 10
+            match y:
+                case 1:  # 11
+                    pass
+
+    def inner():
+        return a if b else a
+'''
+    assert [(node.name, paths_through(node), lines_of(node)) for node in functions_of(text)] == [
+        ("f", 11, 14),
+        ("inner", 2, 2),
+    ]
+
+
+@pytest.mark.parametrize("room", ["api", "pipeline"])
+def test_functions_can_be_read_at_once(room):
+    paths = sorted((ROOT / "mcaptrack" / room).rglob("*.py"))
+    assert paths
+    large = [
+        f"{path.name}: {node.name} has {paths_through(node)} paths and {lines_of(node)} lines"
+        for path in paths
+        if path.relative_to(ROOT / "mcaptrack").as_posix() not in NOT_YET
+        for node in functions_of(path.read_text())
+        if paths_through(node) > MOST_PATHS or lines_of(node) > MOST_LINES
+    ]
+    assert not large, "\n".join(large)

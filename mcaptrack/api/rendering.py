@@ -168,9 +168,8 @@ def render(
             opened, _ = stack.enter_context(pipeline.with_views(opened))
         warn_unused("the name of the output says what is written", gif=gif and output is not None)
         if is_log:
-            period = {"start_s": bool(start_s), "end_s": end_s is not None}
             of_video = {"topic": bool(topic), "width": width is not None, "max_fps": max_fps is not None}
-            warn_unused("the whole log is written", **of_video, **period)
+            warn_unused("the whole log is written", **of_video, start_s=bool(start_s), end_s=end_s is not None)
             counts = write_blurred_log(opened, blurrable(opened, camera), target, progress).pictures
             count, blurred = sum(counts.values()), tuple(counts)
         elif blur is not None:

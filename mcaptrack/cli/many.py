@@ -205,21 +205,30 @@ class EachLog(Called[T]):
         elif folder is not None:
             options["output"], folder = folder, None
         if len(logs) == 1 and not many.concern_one:
-            path = logs[0].path
-            with notices.about(output or path):
-                with stdout_to_stderr():
-                    result = common.with_progress(self.function, talk.progress)(path, **options)
-                self.show(path, result, talk)
-            state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
-            talk.event(f"{path}: {state}", "log", log=str(path), state=state)
-            return [result], {}
+            with notices.about(output or logs[0].path):
+                return [self._process_here(logs[0].path, options, talk)], {}
+        done = self._process_in_workers(logs, options, folder, talk)
+        _summarise(done, talk)
+        return [done.results[log.path] for log in logs if log.path in done.results], {"fleet": done.to_json()}
+
+    def _process_here(self, path: Location, options: Mapping[str, Any], talk: common.Talk) -> T:
+        with stdout_to_stderr():
+            result: T = common.with_progress(self.function, talk.progress)(path, **options)
+        self.show(path, result, talk)
+        state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
+        talk.event(f"{path}: {state}", "log", log=str(path), state=state)
+        return result
+
+    def _process_in_workers(
+        self, logs: Sequence[NamedLog], options: Mapping[str, Any], folder: PathLike | None, talk: common.Talk
+    ) -> FleetResult[T]:
         from mcaptrack.fleet import run as run_fleet
 
         listener: _Printer[T] = _Printer(self, talk, [log.path for log in logs])
         try:
-            is_hidden = talk.quiet or self.prints_results or many.json_lines or is_json()
+            is_hidden = talk.quiet or self.prints_results or self.many.json_lines or is_json()
             with LiveTable.on_terminal(is_hidden) as table:
-                done = run_fleet(
+                return run_fleet(
                     self.function,
                     logs,
                     options,
@@ -230,7 +239,7 @@ class EachLog(Called[T]):
                     on_outcome=listener.hear,
                     on_status=lambda status: listener.watch(status, table),
                     on_note=talk.say,
-                    **many.for_fleet(),
+                    **self.many.for_fleet(),
                 )
         except (KeyboardInterrupt, SystemExit) as ended:
             if isinstance(ended, KeyboardInterrupt) or ended.code == 128 + signal.SIGTERM:
@@ -238,8 +247,6 @@ class EachLog(Called[T]):
                     f"ended by a signal: {listener.ended} of {len(logs)} logs were processed; the same command goes on"
                 )
             raise
-        _summarise(done, talk)
-        return [done.results[log.path] for log in logs if log.path in done.results], {"fleet": done.to_json()}
 
 
 class _Printer(Generic[T]):

@@ -22,6 +22,8 @@ from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url
 from mcaptrack.location import is_remote, parse
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from mcaptrack import TableList
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
@@ -113,20 +115,22 @@ def _asked(arguments: Sequence[str], file: Path | None, tables: bool) -> tuple[l
         raise McaptrackError("there is no query; give it last, in quotes, or with -f FILE (--tables lists the tables)")
     if not names:
         raise McaptrackError("there is no log; give logs or folders of tables before the query")
-    if file is None and arguments[-1] != "-":
-        sql = arguments[-1]
-    elif file is None or str(file) == "-":
-        sql = sys.stdin.read()
-    else:
-        try:
-            sql = file.read_text(encoding="utf-8-sig")
-        except OSError as error:
-            raise McaptrackError(f"{file} can't be read: {error.strerror or error}") from None
-        except UnicodeDecodeError:
-            raise McaptrackError(f"{file} is not text in UTF-8") from None
+    sql = arguments[-1] if file is None and arguments[-1] != "-" else _read(file)
     if not sql.strip(" \t\r\n;"):
         raise McaptrackError("the query is empty")
     return [Path(name) for name in names], sql
+
+
+def _read(file: Path | None) -> str:
+    """Return the query in a file; None or "-" is stdin."""
+    if file is None or str(file) == "-":
+        return sys.stdin.read()
+    try:
+        return file.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise McaptrackError(f"{file} can't be read: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise McaptrackError(f"{file} is not text in UTF-8") from None
 
 
 def _exists(word: str) -> bool:
@@ -178,10 +182,6 @@ def _write(answer: Any, form: Form, output: Path | None, json: bool) -> None:
 
 def _print_answer(answer: Any, limit: int) -> str:
     """Print an answer as a table with the columns that fit; returns a note on what is not shown, or ""."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
     from mcaptrack.tables import cells
 
     shown = min(limit or answer.num_rows, answer.num_rows)
@@ -189,36 +189,39 @@ def _print_answer(answer: Any, limit: int) -> str:
     if answer.schema.names == _PLAN:
         show(*(line for row in rows for line in (row[1] or "").splitlines()))
         return ""
-    widest = _WIDEST if sys.stdout.isatty() else _WIDEST_UNBROKEN
-    rows = [[None if word is None else printable(word) for word in row] for row in rows]
-    were_cut = sum(len(word) > widest for row in rows for word in row if word is not None)
-    rows = [[None if word is None else _cut(word, widest) for word in row] for row in rows]
+    out, is_terminal = console(), sys.stdout.isatty()
+    widest = _WIDEST if is_terminal else _WIDEST_UNBROKEN
+    words = [[None if word is None else printable(word) for word in row] for row in rows]
+    rows = [[_cut(word, widest) for word in row] for row in words]
     names = [printable(name) for name in answer.schema.names]
-    out = console()
-    fitting = _fitting(names, rows, out.width) if sys.stdout.isatty() else len(names)
+    fitting = _fitting(names, rows, out.width) if is_terminal else len(names)
+    out.print(_table(names[:fitting], numbers, rows))
+    cut = sum(word is not None and len(word) > widest for row in words for word in row)
+    notes = {
+        f"{cut} long value{'s are' if cut > 1 else ' is'} cut; --format json or csv has all of it": cut,
+        f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all": shown < answer.num_rows,
+        "no rows": not answer.num_rows,
+        f"{fitting} of {len(names)} columns fit; without: {', '.join(names[fitting:])}": fitting < len(names),
+    }
+    return "; ".join(note for note, holds in notes.items() if holds)
+
+
+def _table(names: Sequence[str], are_numbers: Sequence[bool], rows: Sequence[Sequence[str | None]]) -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for name, is_number in zip(names[:fitting], numbers, strict=False):
+    for name, is_number in zip(names, are_numbers, strict=False):
         justify: Literal["left", "right"] = "right" if is_number else "left"
         table.add_column(name, justify=justify, no_wrap=not sys.stdout.isatty(), overflow="fold")
     for row in rows:
-        table.add_row(*(Text("null", "dim") if word is None else word for word in row[:fitting]))
-    out.print(table)
-    notes = (
-        [f"{were_cut} long value{'s are' if were_cut > 1 else ' is'} cut; --format json or csv has all of it"]
-        if were_cut
-        else []
-    )
-    if shown < answer.num_rows:
-        notes.append(f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all")
-    elif answer.num_rows == 0:
-        notes.append("no rows")
-    if fitting < len(names):
-        notes.append(f"{fitting} of {len(names)} columns fit; without: {', '.join(names[fitting:])}")
-    return "; ".join(notes)
+        table.add_row(*(Text("null", "dim") if word is None else word for word in row[: len(names)]))
+    return table
 
 
-def _cut(word: str, widest: int) -> str:
-    return word if len(word) <= widest else word[: widest - 1] + "\N{HORIZONTAL ELLIPSIS}"
+def _cut(word: str | None, widest: int) -> str | None:
+    return word if word is None or len(word) <= widest else word[: widest - 1] + "\N{HORIZONTAL ELLIPSIS}"
 
 
 def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: int) -> int:

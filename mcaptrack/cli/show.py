@@ -15,6 +15,7 @@ from mcaptrack.location import Location
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from rich.text import Text
     from rich.tree import Tree
 
     from mcaptrack import ExportResult, LogInfo
@@ -170,23 +171,29 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
     waiting = [(root, channel, 1) for channel in reversed(made_from.get(None, []))]
     while waiting:
         parent, channel, depth = waiting.pop()
-        label = Text(printable(channel["topic"]))
-        label.append(f"  {printable(channel['transform'])}" if channel["transform"] else "", "dim")
-        for plugin in (channel["plugins"] or {}).values():
-            package = f"{plugin['distribution']} {plugin['version']}".strip()
-            text = f"  {plugin['name']}" + (f" ({package})" if package else "")
-            label.append(printable(text), "dim")
-        corrections = [topic for topic in channel.get("references") or () if topic.endswith("/corrected")]
-        label.append(f"  with {printable(corrections[0])}" if corrections else "", "dim")
-        label.append(f"  in {printable(channel['frame'])}" if channel["frame"] else "", "dim")
-        label.append("  out of date" if channel["stale"] else "", "red")
-        node = parent.add(label)
+        node = parent.add(_label(channel))
         if verbose and channel["parameters"]:
             text = ", ".join(f"{key}={value}" for key, value in sorted(channel["parameters"].items()))
             node.add(Text(printable(text), "dim"))
         below = node if depth < _DEEPEST else parent
         waiting += [(below, other, depth + 1) for other in reversed(made_from.get(channel["topic"], []))]
     return root
+
+
+def _label(channel: dict[str, Any]) -> Text:
+    """Return a channel in a line: what made it, with what, in which frame of reference."""
+    from rich.text import Text
+
+    facts = [channel["transform"] or ""]
+    for plugin in (channel["plugins"] or {}).values():
+        package = f"{plugin['distribution']} {plugin['version']}".strip()
+        facts.append(f"{plugin['name']} ({package})" if package else plugin["name"])
+    facts += [f"with {topic}" for topic in channel.get("references") or () if topic.endswith("/corrected")][:1]
+    facts += [f"in {channel['frame']}"] if channel["frame"] else []
+    label = Text(printable(channel["topic"]))
+    label.append("".join(f"  {printable(fact)}" for fact in facts if fact), "dim")
+    label.append("  out of date" if channel["stale"] else "", "red")
+    return label
 
 
 def _frames(frames: list[dict[str, Any]], start_ns: int) -> Tree:

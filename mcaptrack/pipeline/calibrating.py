@@ -41,7 +41,7 @@ from mcaptrack.schema import GROUND_PLANE, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import planes_in
-from mcaptrack.sources.cameras import Camera, camera_at, given_plane, provenance_of, refined_plane, scenes_of
+from mcaptrack.sources.cameras import Camera, camera_at, corrected_plane, given_plane, provenance_of, scenes_of
 from mcaptrack.sources.cameras import cameras as cameras_of
 from mcaptrack.sources.sidecar import check_topics, encoding_for
 from mcaptrack.transforms.fuse import FootFuser, Places, group, means
@@ -258,30 +258,23 @@ class Refiner:
             )
         models, limit = self._determined(camera, places.xy_m[pairs.places])
         block = np.arange(self.frames) * _BLOCKS // self.frames
-        fits: dict[str, list[Floats]] = {"": [np.eye(3)] * 2}
-        for model in models:
-            corrector = Corrector.around(model, camera.feet.xy_m, camera.plane.homography, camera.plane.lens)
-            fits[model] = []
-            for fold in range(2):
-                feet = camera.feet.at(block[camera.feet.frame] % 2 != fold)
-                tried = [corrector.fit(feet, places, start) for start in starts]
-                costs = [self._cost(feet, places, fit) for fit in tried]
-                fits[model].append(tried[int(np.argmin(costs))])
+        folds = [camera.feet.at(block[camera.feet.frame] % 2 != fold) for fold in range(2)]
+        fits = {"": [np.eye(3)] * 2}
+        fits |= {model: [self._best_fit(model, camera, feet, places, starts) for feet in folds] for model in models}
         costs_of = {model: self._held_out(camera, places, pair_, block) for model, pair_ in fits.items()}
         best = min(costs_of, key=lambda model: float(np.nanmean(costs_of[model])))
         chosen = next(model for model in costs_of if _is_as_good(costs_of[model], costs_of[best]))
-        if not chosen:
-            chosen = best  # it is said how little there is to gain
-        matrix = np.eye(3)
-        if chosen:
-            corrector = Corrector.around(chosen, camera.feet.xy_m, camera.plane.homography, camera.plane.lens)
-            tried = [corrector.fit(camera.feet, places, start) for start in fits[chosen]]
-            matrix = tried[int(np.argmin([self._cost(camera.feet, places, fit) for fit in tried]))]
+        matrix = self._best_fit(chosen, camera, camera.feet, places, fits[chosen]) if chosen else np.eye(3)
         moves = _moves(camera, np.eye(3), matrix)
-        gain = costs_of[""] - costs_of[chosen]
-        if chosen and (not _is_sure(gain) or moves < LEAST_MOVED_M):
+        if not _is_sure(costs_of[""] - costs_of[chosen]) or moves < LEAST_MOVED_M:
             chosen, matrix, moves = "", np.eye(3), 0.0
         return _Found(chosen, matrix, moves, *self._residuals(camera, places, fits[chosen], block), limit)
+
+    def _best_fit(self, model: str, camera: Watched, feet: Feet, places: Feet, starts: Sequence[Floats]) -> Floats:
+        """Return the correction of a kind that fits some feet of a camera best, from any of these starts."""
+        corrector = Corrector.around(model, camera.feet.xy_m, camera.plane.homography, camera.plane.lens)
+        fits = [corrector.fit(feet, places, start) for start in starts]
+        return fits[int(np.argmin([self._cost(feet, places, fit) for fit in fits]))]
 
     def _determined(self, camera: Watched, xy_m: Floats) -> tuple[tuple[str, ...], str]:
         """Return the kinds of correction that people at these places determine, and a remark on what they don't."""
@@ -388,12 +381,10 @@ def calibrate_cameras(
     compared, names_of = _compared(opened, names)
     reference = [names_of.get(name.strip("/"), name.strip("/")) for name in reference]
     chosen = [camera.prefix[1:] for camera in compared]
-    for name in reference:
-        if name not in chosen:
-            raise McaptrackError(f"`reference=` has {name}, which is not compared; {', '.join(chosen)} are")
-    for name in clock_offset_s:
-        if name not in chosen:
-            raise McaptrackError(f"`clock_offset_s=` has {name}, which is not compared; {', '.join(chosen)} are")
+    for parameter, cameras_given in (("reference", reference), ("clock_offset_s", clock_offset_s)):
+        for name in cameras_given:
+            if name not in chosen:
+                raise McaptrackError(f"`{parameter}=` has {name}, which is not compared; {', '.join(chosen)} are")
     sources = read_sources(opened, compared, clock_offset_s).sources
     cameras = {camera.prefix[1:]: camera for camera in compared}
     sources = [_given(opened, source, cameras[source.view.name], reference) for source in sources]
@@ -567,35 +558,33 @@ def changes_of(opened: log.Log, refined: Sequence[Refined], planes: Mapping[str,
 
     Raises McaptrackError if other software recorded a channel with the name of a corrected plane.
     """
-    cameras = {camera.name: camera_at(opened, f"/{camera.name}") for camera in refined}
-    topics = {camera.name: refined_plane(cameras[camera.name]) for camera in refined if camera.model}
-    for topic in topics.values():
-        if not may_replace(opened, topic, REFINE):
-            raise McaptrackError(f"{opened.path}: {topic} {describe_origin(opened, topic)}, and is not replaced")
-    results: dict[str, Made] = {}
     compared = sorted(camera.name for camera in refined if camera.before is not None)
+    topics: dict[str, str] = {}
+    new: dict[str, Made] = {}
+    dropped: list[str] = []
     for camera in refined:
-        if not camera.model:
-            continue
-        base, topic = given_plane(cameras[camera.name]), topics[camera.name]
-        before = opened.frames(base, GROUND_PLANE)[0]
-        parameters = {**as_json(camera), "compared_with": [name for name in compared if name != camera.name]}
-        frame_id = frame_id_of(opened.channels[base].metadata)
-        how = Provenance(REFINE, parameters, base, digest_of(opened, base), frame_id=frame_id)
-        frame = Frame(before.t_ns, before.index, plane_to_rows(planes[camera.name]))
-        results[topic] = Made.of(GROUND_PLANE, [frame], how)
-    dropped = [
-        topic
-        for camera in refined
-        if not camera.model
-        and camera.before is not None
-        and camera.why != REFERENCE
-        and (topic := refined_plane(cameras[camera.name])) in opened.channels
-        and may_replace(opened, topic, REFINE)
-    ]
-    unchanged = tuple(name for name, topic in topics.items() if _is_there(opened, topic, results[topic]))
-    new = {topic: results[topic] for name, topic in topics.items() if name not in unchanged}
+        base = given_plane(camera_at(opened, f"/{camera.name}"))
+        topic = corrected_plane(base)
+        if camera.model:
+            if not may_replace(opened, topic, REFINE):
+                raise McaptrackError(f"{opened.path}: {topic} {describe_origin(opened, topic)}, and is not replaced")
+            topics[camera.name] = topic
+            parameters = {**as_json(camera), "compared_with": [name for name in compared if name != camera.name]}
+            plane = _plane_below(opened, base, planes[camera.name], parameters)
+            if not _is_there(opened, topic, plane):
+                new[topic] = plane
+        elif camera.before is not None and camera.why != REFERENCE and topic in opened.channels:
+            dropped += [topic] if may_replace(opened, topic, REFINE) else []
+    unchanged = tuple(name for name, topic in topics.items() if topic not in new)
     return CorrectedPlanes(topics, new, unchanged, tuple(dropped))
+
+
+def _plane_below(opened: log.Log, base: str, plane: GroundPlane, parameters: dict[str, Any]) -> Made:
+    """Return a plane at the time of the one that was given."""
+    before = opened.frames(base, GROUND_PLANE)[0]
+    frame_id = frame_id_of(opened.channels[base].metadata)
+    how = Provenance(REFINE, parameters, base, digest_of(opened, base), frame_id=frame_id)
+    return Made.of(GROUND_PLANE, [Frame(before.t_ns, before.index, plane_to_rows(plane))], how)
 
 
 def write_changes(opened: log.Log, changes: CorrectedPlanes, output: Path | None) -> bool:

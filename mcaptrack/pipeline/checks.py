@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call, list_names
+from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import collect
@@ -174,11 +175,20 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
                 )
 
 
-def conflict_of(opened: log.Log, topics: Sequence[str], stage: str) -> str:
-    """Return the first of these topics that a stage and its views may not replace, with its origin; "" if none."""
+def may_add(opened: log.Log, topics: Sequence[str], stage: str, what: str, is_asked: bool = False) -> bool:
+    """Return whether a stage and its views may write these topics; if not, warn that ``what`` is left out.
+
+    Raises McaptrackError instead, with ``is_asked``.
+    """
     made_by = {topic: VIEW if "/view/" in topic else stage for topic in topics}
     taken = next((topic for topic, transform in made_by.items() if not may_replace(opened, topic, transform)), "")
-    return f"{taken}, which {describe_origin(opened, taken)}" if taken else ""
+    if not taken:
+        return True
+    text = f"no {what}: they would replace {taken}, which {describe_origin(opened, taken)}"
+    if is_asked:
+        raise McaptrackError(f"{opened.path}: {text}")
+    warn(text, "left-out")
+    return False
 
 
 def may_replace(opened: log.Log, topic: str, transform: str) -> bool:

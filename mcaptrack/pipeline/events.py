@@ -22,7 +22,7 @@ from mcaptrack.evaluation.events import EventOptions, find_events
 from mcaptrack.evaluation.forecasts import FORECAST_INPUTS, find_forecast_errors
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.checks import conflict_of, may_replace
+from mcaptrack.pipeline.checks import may_add, may_replace
 from mcaptrack.pipeline.motion import ground_truth_with
 from mcaptrack.pipeline.staleness import digest_of, is_outdated
 from mcaptrack.pipeline.write import Made, RunState
@@ -87,29 +87,33 @@ def make_events(state: RunState, watch: Watch) -> dict[str, Made]:
         is_up_to_date = has_same_options and not is_outdated(state, outputs(topic))
         if is_up_to_date and not (watch.again or watch.force):
             continue
-        if conflict := conflict_of(opened, outputs(topic), STAGE):
-            if watch.topics:
-                raise McaptrackError(f"{opened.path}: events would replace {conflict}")
-            warn(f"no events of {topic}: they would replace {conflict}", "left-out")
-            continue
-        tracks = state.results[topic].frames if topic in state.results else opened.frame_columns(topic, TRACKS)
-        classes = (truth().classes, state.classes(topic))
-        frames = repaired_tracks(tracks, state.provenance(topic))
-        track_events = find_events(frames, truth().frames, options, opened.path.stem, topic, classes)
-        for note in track_events.notes:
-            warn(note, "not-compared")
-        parameters = track_events.parameters(options)
-        provenance = Provenance(STAGE, parameters, topic, state.digest(topic), references=truth().digests)
-        out[topic + _EVENTS] = events = Made.of(EVENTS, track_events.events, provenance)
-        nouns = nouns_of(truth().frames or (), frames, classes)
-        text = list(log_messages(track_events.events, topic, opened.start_ns, track_events.frame_interval_s, nouns))
-        view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
-        out[topic + _EVENTS + SUFFIX] = Made(EVENTS, [], view, text, foxglove.LOG)
-        out[topic + _COUNTS] = Made.of(COUNTS, track_events.counts, provenance)
+        if may_add(opened, outputs(topic), STAGE, f"events of {topic}", bool(watch.topics)):
+            out |= _events_of(state, topic, options, truth())
     if not watch.topics:
         for name in FORECAST_INPUTS:
             out |= _forecast_errors(state, name, watch.again or watch.force, truth)
     return out
+
+
+def _events_of(state: RunState, topic: str, options: EventOptions, truth: _GroundTruth) -> dict[str, Made]:
+    """Find the events of one channel of tracks, and count tracks and errors in its frames."""
+    opened, classes = state.opened, (truth.classes, state.classes(topic))
+    tracks = state.results[topic].frames if topic in state.results else opened.frame_columns(topic, TRACKS)
+    frames = repaired_tracks(tracks, state.provenance(topic))
+    track_events = find_events(frames, truth.frames, options, opened.path.stem, topic, classes)
+    for note in track_events.notes:
+        warn(note, "not-compared")
+    parameters = track_events.parameters(options)
+    provenance = Provenance(STAGE, parameters, topic, state.digest(topic), references=truth.digests)
+    events = Made.of(EVENTS, track_events.events, provenance)
+    nouns = nouns_of(truth.frames or (), frames, classes)
+    text = list(log_messages(track_events.events, topic, opened.start_ns, track_events.frame_interval_s, nouns))
+    view = Provenance(VIEW, {}, topic + _EVENTS, events.provenance.digest)
+    return {
+        topic + _EVENTS: events,
+        topic + _EVENTS + SUFFIX: Made(EVENTS, [], view, text, foxglove.LOG),
+        topic + _COUNTS: Made.of(COUNTS, track_events.counts, provenance),
+    }
 
 
 def _forecast_errors(state: RunState, name: str, again: bool, truth: Callable[[], _GroundTruth]) -> dict[str, Made]:
@@ -121,8 +125,7 @@ def _forecast_errors(state: RunState, name: str, again: bool, truth: Callable[[]
     topics = (topic + _ERRORS, topic + _SCORES)
     if not again and not is_outdated(state, topics) and later in _inputs_of(state.opened, topics[0]):
         return {}
-    if conflict := conflict_of(state.opened, topics, STAGE):
-        warn(f"no errors of {topic}: they would replace {conflict}", "left-out")
+    if not may_add(state.opened, topics, STAGE, f"errors of {topic}"):
         return {}
     history, offline = state.frames(tracks), state.frames(later)
     try:

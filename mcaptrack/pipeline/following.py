@@ -9,10 +9,10 @@ Letters: N rows, T tracks of the log before, U tracks of this one.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
+from itertools import chain, takewhile
 from typing import Any, Final
 
 import numpy as np
@@ -29,7 +29,6 @@ from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
 from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at, cameras, provenance_of
 from mcaptrack.sources.pictures import picture_size
 from mcaptrack.transforms import STAGES
@@ -124,13 +123,12 @@ class Before:
                 f"{opened.path} is of the camera {prefix[1:]}, and {before.path} is of "
                 f"{', '.join(sorted(names)) or 'none'}; ids go on from one recording of a camera to the next"
             )
-        provenance, again = provenance_of(before, self.tracks), call("run", before.path)
-        if provenance is None or not _is_tracker(provenance) or not before.channels[self.tracks].messages:
+        again = call("run", before.path)
+        if not _is_tracked(before, self.tracks) or not before.channels[self.tracks].messages:
             raise McaptrackError(f"{before.path} has no tracks that ids could go on from; {again} makes them")
         if is_stale(before, self.tracks):
             raise McaptrackError(f"{before.path}: {self.tracks} is out of date; {again} brings it up to date")
-        own = provenance_of(opened, self.tracks)
-        if self.tracks in opened.channels and (own is None or not _is_tracker(own)):
+        if self.tracks in opened.channels and not _is_tracked(opened, self.tracks):
             raise McaptrackError(
                 f"{opened.path}: {self.tracks} wasn't made by `track`, so that its ids stay as they are"
             )
@@ -237,34 +235,21 @@ class Before:
         if not self.is_bridged or not self._has(topic, TRACKS):
             return {}
         before = self._log.frame_columns(topic, TRACKS)
-        before_ns = frame_times(before)
-        at = {t_ns: number for number, t_ns in enumerate(before_ns.tolist()) if t_ns >= self.lead_ns}
+        low = int(np.searchsorted(frame_times(before), self.lead_ns))
+        rows_at = {frame.t_ns: frame.rows for frame in before[low:]}
+        end_ns = self.start_ns + round(_AT_CUT_S * NS_PER_S)
+        near = list(takewhile(lambda frame: frame.t_ns < end_ns, frames))
         votes: defaultdict[tuple[int, int], float] = defaultdict(float)
-        last: dict[int, int] = {}  # the id of each track that was re-tracked, by its own, which goes on already
-        if topic != self.tracks:
-            for number in at.values():
-                rows = before[number].rows
-                last |= dict(zip(rows["source_id"].tolist(), rows["track_id"].tolist(), strict=True))
-        begun: set[int] = set()
-        for frame in frames:
-            if frame.t_ns >= self.start_ns + round(_AT_CUT_S * NS_PER_S):
-                break
-            if frame.t_ns >= self.start_ns:
-                for source, track_id in zip(
-                    frame.rows["source_id"].tolist(), frame.rows["track_id"].tolist(), strict=True
-                ):
-                    if source >= 0 and source in last and track_id not in begun:
-                        votes[track_id, last[source]] += _OF_SOURCE
-                    begun.add(track_id)
-            elif frame.t_ns in at:
+        for frame in near:
+            if frame.t_ns < self.start_ns and frame.t_ns in rows_at:
                 weight = 0.5 ** ((self.start_ns - frame.t_ns) / NS_PER_S / _HALF_S)
-                for pair in _pairs(frame.rows, before[at[frame.t_ns]].rows):
+                for pair in _pairs(frame.rows, rows_at[frame.t_ns]):
                     votes[pair] += weight
-        out: dict[int, int] = {}
-        for (mine, theirs), _ in sorted(votes.items(), key=lambda vote: (-vote[1], vote[0])):
-            if mine not in out and theirs not in out.values():
-                out[mine] = theirs
-        return out
+        if topic != self.tracks:
+            rows_after = (frame.rows for frame in near if frame.t_ns >= self.start_ns)
+            for pair in _of_one_source(rows_at.values(), rows_after):
+                votes[pair] += _OF_SOURCE
+        return _elected(votes)
 
     def _kept(self, schema: Schema, frames: Sequence[Frame], number: Callable[[Ints], Ints] | None) -> Sequence[Frame]:
         """Return the frames of this log without those of the lead; ``number`` returns the new ids of rows."""
@@ -298,9 +283,11 @@ def _gives_ids(job: Job) -> bool:
     return job.transform.reads is DETECTIONS or STAGES[job.stage].repairs_tracks
 
 
-def _is_tracker(provenance: Provenance) -> bool:
-    """Return whether a stage made tracks of detections."""
-    return provenance.transform in STAGES and STAGES[provenance.transform].reads is DETECTIONS
+def _is_tracked(opened: log.Log, topic: str) -> bool:
+    """Return whether a stage made the tracks in a channel of detections."""
+    provenance = provenance_of(opened, topic)
+    stage = STAGES.get(provenance.transform) if provenance else None
+    return stage is not None and stage.reads is DETECTIONS
 
 
 def _start_ns(opened: log.Log, prefix: str) -> int:
@@ -342,6 +329,28 @@ def _renumbered(ids: Ints, same: Mapping[int, int], last_id: int) -> Ints:
     for mine, theirs in same.items():
         out[ids == mine] = theirs
     return out
+
+
+def _elected(votes: Mapping[tuple[int, int], float]) -> dict[int, int]:
+    """Return pairs of ids with the most votes first, each id once."""
+    out: dict[int, int] = {}
+    for (mine, theirs), _ in sorted(votes.items(), key=lambda vote: (-vote[1], vote[0])):
+        if mine not in out and theirs not in out.values():
+            out[mine] = theirs
+    return out
+
+
+def _of_one_source(before: Iterable[Rows], after: Iterable[Rows]) -> Iterator[tuple[int, int]]:
+    """Ids of re-tracked tracks after the cut, each with the id before it of the track that it begins with."""
+    last: dict[int, int] = {}
+    for rows in before:
+        last |= dict(zip(rows["source_id"].tolist(), rows["track_id"].tolist(), strict=True))
+    begun: set[int] = set()
+    for rows in after:
+        for source, track_id in zip(rows["source_id"].tolist(), rows["track_id"].tolist(), strict=True):
+            if source >= 0 and source in last and track_id not in begun:
+                yield track_id, last[source]
+            begun.add(track_id)
 
 
 def _pairs(mine: Rows, theirs: Rows) -> list[tuple[int, int]]:

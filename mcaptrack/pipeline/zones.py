@@ -12,7 +12,7 @@ The zones themselves are in the provenance of these channels, so that later runs
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -21,6 +21,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import SUFFIX
 from mcaptrack.evaluation.zones import (
     PlacedZone,
+    TrackPositions,
     ZoneOptions,
     ZoneTotals,
     find_zone_events,
@@ -36,7 +37,7 @@ from mcaptrack.foxglove.views.image import PictureTimes
 from mcaptrack.geometry.plane import Planes, moved_planes, scene_planes
 from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.checks import conflict_of
+from mcaptrack.pipeline.checks import may_add
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock
 from mcaptrack.pipeline.staleness import is_outdated, planes_to_json
@@ -103,31 +104,18 @@ def make_zones(
     zones = watch.zones or before.zones
     if not zones:
         return {}
-    options = watch.options or (before.options if before.options else ZoneOptions())
+    options = watch.options or before.options or ZoneOptions()
     zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
     topics = watch.topics or _default_topics(state, before)
-    if not topics:
-        if not watch.zones:
-            return {}
+    if watch.zones and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
     out: dict[str, Made] = {}
     faults: list[McaptrackError] = []
-    for topic in topics:
-        if not state.holds(topic, TRACKS):
-            schema_name = opened.channel(topic).schema_name  # raises if there is no such channel
-            raise McaptrackError(f"{opened.path}: {topic} holds {schema_name or 'no schema'}, not tracks")
-        wanted = _parameters(zones, options, planes)
-        if not watch.force and not _is_due(state, topic, wanted):
-            continue
-        if conflict := conflict_of(opened, outputs(topic), STAGE):
-            text = f"no zones of {topic}: they would replace {conflict}"
-            if watch.topics:
-                raise McaptrackError(f"{opened.path}: {text}")
-            warn(text, "left-out")
-            continue
+    parameters = _parameters(zones, options, planes)
+    for topic in _due_topics(state, topics, watch, parameters):
         try:
             pictures = picture_clock(opened, prefix, stamps)
-            out |= _counted(state, topic, planes, zones, options, wanted, pictures)
+            out |= _counted(state, topic, planes, zones, options, parameters, pictures)
         except McaptrackError as error:
             faults.append(error)
     if faults and (not out or watch.topics) and watch.zones:
@@ -135,6 +123,19 @@ def make_zones(
     for fault in faults:
         warn(str(fault), "not-compared")
     return out
+
+
+def _due_topics(
+    state: RunState, topics: Sequence[str], watch: ZoneWatch, parameters: Mapping[str, Any]
+) -> Iterator[str]:
+    """Yield the channels of tracks to count, each when those before it are counted."""
+    for topic in topics:
+        if not state.holds(topic, TRACKS):
+            schema_name = state.opened.channel(topic).schema_name  # raises if there is no such channel
+            raise McaptrackError(f"{state.opened.path}: {topic} holds {schema_name or 'no schema'}, not tracks")
+        is_due = watch.force or _is_due(state, topic, parameters)
+        if is_due and may_add(state.opened, outputs(topic), STAGE, f"zones of {topic}", bool(watch.topics)):
+            yield topic
 
 
 def _counted(
@@ -173,18 +174,9 @@ def _counted(
     crossings = {crossed: out[crossed].provenance.digest}
     view = Provenance(VIEW, {}, visited, out[visited].provenance.digest, references=crossings)
     out[topic + _BELOW + SUFFIX] = Made(ZONE_VISITS, [], view, text, foxglove.LOG)
-    shapes = [
-        drawn_zones.ZoneShape(
-            zone.zone,
-            zone.zone.shape(),
-            zone.shape if zone.units == "metres" else None,
-            zone.forward,
-            ground_height_m(positions, zone.shape) if zone.units == "metres" else 0.0,
-        )
-        for zone in placed
-    ]
-    view = replace(view, input=(counts := topic + _BELOW + "/counts"), input_digest=out[counts].provenance.digest)
-    view = replace(view, references={})
+    shapes = [_shape(zone, positions) for zone in placed]
+    counts = topic + _BELOW + "/counts"
+    view = Provenance(VIEW, {}, counts, out[counts].provenance.digest)
     captions = drawn_zones.ZoneCaptions.of(zones, zone_events.counts)
     moving, frame_id = moved_planes(planes, path), provenance.frame_id or views.ground.frame_of(prefix)
     if len(pictures.t_ns):
@@ -200,6 +192,14 @@ def _counted(
         scenes = DrawnMessages(len(captions.t_ns), lambda: drawn_zones.on_ground(shapes, captions, frame_id))
         out[topic + _BELOW + views.SCENE_SUFFIX] = Made(ZONE_COUNTS, [], view, scenes, foxglove.SCENE)
     return out
+
+
+def _shape(placed: PlacedZone, positions: TrackPositions) -> drawn_zones.ZoneShape:
+    """A zone to draw, on the ground if it was given in metres."""
+    ground, height_m = None, 0.0
+    if placed.units == "metres":
+        ground, height_m = placed.shape, ground_height_m(positions, placed.shape)
+    return drawn_zones.ZoneShape(placed.zone, placed.zone.shape(), ground, placed.forward, height_m)
 
 
 def counted_zones(opened: log.Log, prefix: str) -> list[CountedZones]:

@@ -148,11 +148,6 @@ def is_plane(topic: str) -> bool:
     return topic.removesuffix(f"/{_REFINED}").endswith(f"/{GROUND_PLANE}")
 
 
-def refined_plane(camera: Camera) -> str:
-    """Return the topic of the corrected ground plane of a camera, whether or not the log has it."""
-    return corrected_plane(given_plane(camera))
-
-
 def corrected_plane(topic: str) -> str:
     """Return the topic of the correction of a ground plane, by the topic of this."""
     return f"{topic}/{_REFINED}"

@@ -24,7 +24,8 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, find_camera
 from mcaptrack.sources.foreign.decoding import MessageType, ros_types
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.video import EncodedPicture, H264Encoder, decode_bgr, encode_image
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import H264Encoder, encode_image
 from mcaptrack.sources.video.decode import raw_with
 from mcaptrack.viewing.blur.people import HiddenPeople, hide
 from mcaptrack.viewing.rendering import rate_of
@@ -112,31 +113,21 @@ def blurred_pictures(
 ) -> Iterator[tuple[log.Message, foreign.Picture, Image, Bools, int]]:
     """Each message of a channel of pictures with its picture, the same with people hidden, the mask, and the boxes.
 
-    Messages with pictures that can't be decoded, as before the first key picture of a video, are left out.
+    Messages with pictures that can't be decoded, as before the first key picture of a video, are left out, with a
+    warning. Raises McaptrackError if none can.
     """
-    read = foreign.picture_reader(opened, topic)
-    waiting: dict[int, tuple[log.Message, foreign.Picture]] = {}
-
-    def encoded() -> Iterator[EncodedPicture]:
-        for number, message in enumerate(opened.messages(topic)):
-            picture = read(message)
-            waiting[number] = message, picture
-            where = f"{opened.path}: {topic} at {message.t_ns} ns"
-            yield picture.encoded(message.t_ns, number, where)
-
-    left_out = 0
-    for frame in decode_bgr(encoded()):
-        message, picture = waiting.pop(frame.index)
-        for number in [number for number in waiting if number < frame.index]:
-            del waiting[number]
-            left_out += 1
+    pictures, messages = Pictures(opened, topic), enumerate(opened.messages(topic))
+    read, damaged, left_out = foreign.picture_reader(opened, topic), list[McaptrackError](), len(pictures.t_ns)
+    for frame in pictures.readable(range(len(pictures.t_ns)), damaged):
+        message = next(message for number, message in messages if number == frame.index)
         own = people.at(frame.index)
         image, mask = hide(np.asarray(frame.rows, np.uint8), own)
-        yield message, picture, image, mask, len(own)
-    left_out += len(waiting)
+        yield message, read(message), image, mask, len(own)
+        left_out -= 1
     if left_out:
         what = f"{left_out} messages of {topic} without a picture that can be decoded"
-        warn(f"{opened.path}: {what} are left out", "left-out")
+        first = f", the first: {damaged[0]}" if damaged else ""
+        warn(f"{opened.path}: {what} are left out{first}", "left-out")
 
 
 # Messages of pictures with another picture in them: all other fields stay as they were recorded.
