@@ -43,7 +43,8 @@ class Column:
     A whole number that is missing is -1, in tables, too, as ids of other columns are.
 
     ``since`` is the version that added the column, "" for those that were there from the beginning; ``group`` counts
-    the comments that say so up to it, because columns are added in groups.
+    the comments that say so up to it, because columns are added in groups. ``stated_unit`` is the unit of a column
+    whose name doesn't say it.
     """
 
     name: str
@@ -53,10 +54,13 @@ class Column:
     doc: str
     since: str = ""
     group: int = 0
+    stated_unit: str = ""
 
     @property
     def unit(self) -> str:
-        """The unit in the suffix of the name ("px", "m", "m^2", "m/s"), "" if there is none."""
+        """The unit as it is stated, or in the suffix of the name ("px", "m", "m^2", "m/s"), "" if there is none."""
+        if self.stated_unit:
+            return self.stated_unit
         endings = [ending for ending in UNITS if self.name.endswith(f"_{ending}")]
         return UNITS[max(endings, key=len)] if endings else ""
 

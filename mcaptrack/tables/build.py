@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import Schema
-from mcaptrack.tables.fields import RECORDING, TABLES, Table
+from mcaptrack.tables.fields import RECORDING, TABLES, Table, of_rows
 
 
 class Pointers(NamedTuple):
@@ -33,7 +33,7 @@ class Pointers(NamedTuple):
 
 def table_of(schema: Schema) -> Table:
     """The table for rows of a schema."""
-    return next(table for table in TABLES.values() if table.rows_of is schema)
+    return next((table for table in TABLES.values() if table.rows_of is schema), None) or of_rows(schema)
 
 
 def frames_table(channels: Mapping[str, Pointers], names: Sequence[str] = ()) -> Any:
