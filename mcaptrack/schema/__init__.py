@@ -63,6 +63,11 @@ class Schema:
     def __repr__(self) -> str:
         return f"Schema({self.name!r})"
 
+    @property
+    def is_own(self) -> bool:
+        """Whether a user has defined it, as ``mcaptrack.schema_of`` does."""
+        return self._own is not None
+
     @cached_property
     def definition(self) -> Definition:
         """The parsed schema file, or what a user has defined."""

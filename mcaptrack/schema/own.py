@@ -107,7 +107,7 @@ def _schema(name: str, columns: tuple[OwnColumn, ...]) -> Schema:
 
 def columns_in_metadata(schema: Schema) -> str:
     """Return the columns of a schema of its own as text, for the metadata of its channels; "" for mcaptrack's own."""
-    if schema.name in SCHEMAS:
+    if not schema.is_own:
         return ""
     return json.dumps([[c.name, c.kind, c.unit, c.doc] for c in schema.columns], ensure_ascii=False)
 

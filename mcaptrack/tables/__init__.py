@@ -26,6 +26,7 @@ from mcaptrack.tables import text
 from mcaptrack.tables.build import (
     Pointers,
     TablePieces,
+    as_arrow,
     columns_of,
     frames_table,
     records_table,

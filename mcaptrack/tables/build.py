@@ -17,6 +17,10 @@ from mcaptrack.schema import Schema
 from mcaptrack.tables.fields import RECORDING, TABLES, Table, of_rows
 
 
+#: Whole numbers up to this are exact as float64.
+_EXACT: Final = 2**53
+
+
 class Pointers(NamedTuple):
     """The messages of one channel (M,): time, frame, number of rows (-1 for pictures), and their places in a file.
 
@@ -114,8 +118,8 @@ def table_to_array(table: Any) -> NDArray[Any]:
     return out
 
 
-def columns_of(rows: Any) -> dict[str, NDArray[Any]]:
-    """The columns (N,) of a table of any library that speaks Arrow: pyarrow, pandas, Polars, DuckDB.
+def as_arrow(rows: Any) -> Any:
+    """A table of any library that speaks Arrow (pyarrow, pandas, Polars, DuckDB) as one of pyarrow.
 
     Raises McaptrackError for what Arrow cannot hold.
     """
@@ -127,11 +131,24 @@ def columns_of(rows: Any) -> dict[str, NDArray[Any]]:
         raise McaptrackError(f"the table cannot be read as Arrow: {' '.join(str(error).split())}") from None
     if len(set(table.column_names)) < len(table.column_names):
         raise McaptrackError(f"the table has columns of the same name: {', '.join(table.column_names)}")
-    is_decimal = {field.name: pa.types.is_decimal(field.type) for field in table.schema}
-    return {
-        name: (column.cast(pa.float64()) if is_decimal[name] else column).to_numpy()
-        for name, column in zip(table.column_names, table.columns, strict=True)
-    }
+    return table
+
+
+def columns_of(table: Any) -> dict[str, NDArray[Any]]:
+    """The columns (N,) of a table of Arrow; whole numbers of which some are missing become float64, exactly.
+
+    Raises McaptrackError if they can't, because they are too large.
+    """
+    import pyarrow as pa
+
+    out = {}
+    for field, column in zip(table.schema, table.columns, strict=True):
+        out[field.name] = (column.cast(pa.float64()) if pa.types.is_decimal(field.type) else column).to_numpy()
+        if pa.types.is_integer(field.type) and column.null_count and (np.abs(out[field.name]) > _EXACT).any():
+            raise McaptrackError(
+                f"the column {field.name} has whole numbers above 2^53, and some are missing; rows can't hold both"
+            )
+    return out
 
 
 def repeated(names: Sequence[str], counts: Sequence[int], among: Sequence[str] = ()) -> Any:

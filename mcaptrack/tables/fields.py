@@ -101,7 +101,7 @@ def _with_unit(field: Any) -> Any:
 
     metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     unit = "" if pa.types.is_boolean(field.type) else _NONE
-    return field.with_metadata({"unit": unit} | metadata)
+    return field.with_metadata({"unit": unit, "description": ""} | metadata)
 
 
 _TOPIC: Final = Field("topic", _NAME, "channel of the log that the row comes from")
