@@ -11,7 +11,7 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import warnings_about
+from mcaptrack.api.common import detail, warnings_about
 from mcaptrack.api.options import no_progress
 from mcaptrack.api.products import write_products
 from mcaptrack.api.rows import frames_of
@@ -25,6 +25,7 @@ from mcaptrack.registry import distribution_of, entry_points, package_of
 from mcaptrack.schema import DETECTIONS, EVENTS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import has_classes
 from mcaptrack.schema.own import columns_in_metadata, name_for
+from mcaptrack.schema.proto import Column
 from mcaptrack.schema.provenance import INGEST, WRITTEN_BY, Provenance
 from mcaptrack.sources.camera_motion import path_of, tracks_topic
 from mcaptrack.sources.cameras import USUAL, name_above
@@ -74,6 +75,7 @@ def write_rows(
         if names_by_number and not has_classes(schema):
             raise McaptrackError(f"`classes=` names classes of rows, and {schema.name} has no column class_id")
         _refuse_to_replace(opened, name, schema, replace)
+        detail(f"{name}: rows of {schema.name}, with {', '.join(map(_described, schema.columns))}")
         planes = pipeline.read_planes(opened, prefix) or ()
         frames = _numbered(
             opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
@@ -100,6 +102,11 @@ def _is_in_space(schema: Schema, frames: Sequence[Frame]) -> bool:
     if schema is TRACKS:
         return any(np.isfinite(rows["z_m"]).any() for rows in parts)
     return schema is DETECTIONS and bool(parts) and all(np.isnan(rows["x_px"]).all() for rows in parts)
+
+
+def _described(column: Column) -> str:
+    """Return a column with its unit, as text."""
+    return f"{column.name} ({column.unit})" if column.unit else column.name
 
 
 def _write_undrawn(opened: logs.Log, name: str, channel: Made) -> None:

@@ -171,7 +171,8 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
     while waiting:
         parent, channel, depth = waiting.pop()
         label = Text(printable(channel["topic"]))
-        label.append(f"  {printable(channel['transform'])}" if channel["transform"] else "", "dim")
+        made_by = f"written by {channel['written_by']}" if channel["written_by"] else channel["transform"]
+        label.append(f"  {printable(made_by)}" if made_by else "", "dim")
         for plugin in (channel["plugins"] or {}).values():
             package = f"{plugin['distribution']} {plugin['version']}".strip()
             text = f"  {plugin['name']}" + (f" ({package})" if package else "")

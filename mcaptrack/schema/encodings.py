@@ -115,9 +115,10 @@ def ros_definition(definition: Definition) -> str:
     lines = [f"# {definition.doc}", f"{row}[] rows", _LINE, f"MSG: {row}"]
     width = max(len(_TYPES[column.kind]) + len(column.name) for column in definition.columns) + 1
     for column in definition.columns:
-        missing = "" if not column.optional else "; NaN if missing" if column.is_nullable else "; -1 if missing"
-        unit = f"[{column.stated_unit}] " if column.stated_unit else ""
-        lines.append(f"{_TYPES[column.kind]} {column.name}".ljust(width) + f" # {unit}{column.doc}{missing}")
+        missing = "" if not column.optional else "NaN if missing" if column.is_nullable else "-1 if missing"
+        unit = f"in {column.stated_unit}" if column.stated_unit else ""
+        comment = "; ".join(filter(None, (column.doc, unit, missing)))
+        lines.append(f"{_TYPES[column.kind]} {column.name}".ljust(width) + (f" # {comment}" if comment else ""))
     return "\n".join(lines) + "\n"
 
 

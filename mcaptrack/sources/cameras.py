@@ -239,13 +239,18 @@ def has_own_rows(channel: log.Channel) -> bool:
 
 
 def names_by_topic(opened: log.Log) -> dict[str, str]:
-    """Return the name above the source of each channel of pictures, rows and views, without reading a message."""
-    return {
+    """Return the name above the source of each channel of pictures, rows and views, without reading a message.
+
+    Rows of a user's own schema stand by the channels of that name, if there are any.
+    """
+    own = {topic for topic, channel in opened.channels.items() if has_own_rows(channel)}
+    names = {
         topic: name_above(chain_of(opened, topic)[-1])[1:]
         for topic, channel in opened.channels.items()
-        if not has_own_rows(channel)
-        and (channel.schema_name in SCHEMAS or provenance_of(opened, topic) or foreign.holds_pictures(channel))
+        if channel.schema_name in SCHEMAS or provenance_of(opened, topic) or foreign.holds_pictures(channel)
     }
+    others = {name for topic, name in names.items() if topic not in own}
+    return {topic: name for topic, name in names.items() if name in others}
 
 
 class _Channels:
