@@ -275,7 +275,9 @@ class LogReader:
         """
         if (of_rows := self._topic_of_rows(topic)) is not None:
             if times is not None:
-                raise McaptrackError(f"`times=` chooses pictures, and {of_rows[0]} holds rows; choose rows by their t_ns")
+                raise McaptrackError(
+                    f"`times=` chooses pictures, and {of_rows[0]} holds rows; choose rows by their t_ns"
+                )
             return iter(self._log.frame_columns(*of_rows))
         channel = find_pictures(self._log, topic)
         wanted = None if times is None else shown_pictures(self._log, channel, times)
@@ -421,7 +423,7 @@ class LogReader:
         return supervision_of(self._log.frames(topics[0], schema or TRACKS), names)
 
     def _topic_of_rows(self, topic: str) -> tuple[str, Schema] | None:
-        """Return the channel of rows with this topic, or the only one with a topic that ends with it, and its schema."""
+        """Return the channel of rows with this topic, or the only one that ends with it, and its schema."""
         schemas = {channel.topic: channel.schema for channel in self._log.channels.values()}
         end = "/" + topic.strip("/")
         topics = [topic] if topic in schemas else [name for name in schemas if name.endswith(end)]

@@ -19,9 +19,9 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import PERSON, UNKNOWN, class_name, is_person
 from mcaptrack.sources.own_rows import (
+    OURS,
     UNNUMBERED,
     BoxFormat,
-    OURS,
     boxes_of,
     check_frames,
     checked_names,
@@ -36,9 +36,9 @@ from mcaptrack.sources.own_rows import (
     time_of,
 )
 from mcaptrack.sources.own_schemas import (
-    columns_of_arrow,
     columns_of_dtype,
     columns_of_objects,
+    columns_of_type,
     derived,
     is_dataclass,
 )
@@ -294,7 +294,9 @@ def schema_of(
     >>> [(column.name, column.kind, column.unit) for column in speed.columns]
     [('track_id', 'sfixed64', ''), ('speed', 'float', 'm/s')]
     """
-    return derived(name, columns, units, doc)
+    is_of_arrow = hasattr(columns, "__arrow_c_schema__")
+    listed = tables.columns_of_arrow(columns) if is_of_arrow else columns_of_type(columns)
+    return derived(name, listed, units, doc)
 
 
 def frames_of(rows: Any, schema: Schema | None, own_name: str) -> tuple[Schema, list[Frame], dict[int, str]]:
@@ -318,7 +320,7 @@ def frames_of(rows: Any, schema: Schema | None, own_name: str) -> tuple[Schema, 
     ):  # of pyarrow, pandas, Polars, DuckDB
         table = tables.as_arrow(rows)
         columns, names = numbered_columns(tables.columns_of(table))
-        schema, frames = frames_of_columns(columns, schema, own_name, columns_of_arrow(table.schema))
+        schema, frames = frames_of_columns(columns, schema, own_name, tables.columns_of_arrow(table.schema))
     else:
         members = _members(rows)
         if members and is_dataclass(members[0]) and not is_supervision(members[0]):

@@ -303,9 +303,7 @@ def record_of(schema: Schema, encoding: Encoding) -> tuple[str, str, bytes]:
     return schema.name, PROTOBUF, schema.descriptor
 
 
-def schema_name_of(
-    name: str, schema_encoding: str, message_encoding: str, metadata: Mapping[str, str] = {}
-) -> str:
+def schema_name_of(name: str, schema_encoding: str, message_encoding: str, metadata: Mapping[str, str] = {}) -> str:
     """The name of the schema of a channel: mcaptrack.Tracks also for its rows as ROS messages."""
     rows = schema_of_ros(name) if (schema_encoding, message_encoding) == (ROS2MSG, CDR) else ""
     return rows if schema_of_channel(rows, metadata) else name

@@ -26,9 +26,10 @@ _LONGEST: Final = 200
 _COLUMN: Final = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*\.[A-Z][A-Za-z0-9]*")
 #: Packages of messages that other software defines; "sensor" is that of sensor_msgs in ROS.
-_TAKEN: Final = frozenset(
-    "actionlib builtin_interfaces diagnostic foxglove geometry google map mcaptrack nav pcl ros rosgraph sensor shape "
-    "std stereo tf tf2 trajectory unique_identifier vision visualization".split()
+_TAKEN: Final = (
+    *("actionlib", "builtin_interfaces", "diagnostic", "foxglove", "geometry", "google", "map", "mcaptrack", "nav"),
+    *("pcl", "ros", "rosgraph", "sensor", "shape", "std", "stereo", "tf", "tf2", "trajectory", "unique_identifier"),
+    *("vision", "visualization"),
 )
 #: Columns of each table of rows, beside those of its schema.
 RESERVED: Final = ("t", "t_ns", "frame", "row", "topic", "recording", "class", "zone")
@@ -45,9 +46,11 @@ def checked_name(name: object) -> str:
             f"{name!r:.60} can't name a schema; names are such as Speed or my_tool.Speed: letters and digits, "
             "beginning with a capital, below a package in lower case"
         )
-    package = whole.partition(".")[0]
+    package, _, last = whole.partition(".")
     if package in _TAKEN:
-        raise McaptrackError(f"{whole} is in the package {package}, which is not yours; name the schema {PACKAGE}.{whole.partition('.')[2]}")
+        raise McaptrackError(
+            f"{whole} is in the package {package}, which is not yours; name the schema {PACKAGE}.{last}"
+        )
     return whole
 
 
@@ -80,7 +83,9 @@ def own_schema(name: str, columns: Iterable[OwnColumn]) -> Schema:
     for column in listed:
         where = f"{whole}.{column.name}"
         if column.name in RESERVED:
-            raise McaptrackError(f"{where} is a column that tables have beside those of rows; rename it")
+            raise McaptrackError(
+                f"{where} is a column that tables have beside those of rows; rename it, or leave it out"
+            )
         if not _COLUMN.fullmatch(column.name) or len(column.name) > _LONGEST:
             raise McaptrackError(
                 f"{column.name!r:.60} can't name a column of {whole}; names have lower-case letters, digits and single "

@@ -234,7 +234,7 @@ def cameras(opened: log.Log) -> list[Camera]:
 
 
 def has_own_rows(channel: log.Channel) -> bool:
-    """Return whether a channel has rows of a user's own schema, which may be about anything, and belong to no camera."""
+    """Return whether a channel has rows of a user's own schema: they may be about anything, and have no camera."""
     return channel.schema is not None and channel.schema.is_own
 
 

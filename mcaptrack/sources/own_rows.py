@@ -152,12 +152,12 @@ def frames_of_columns(
         raise McaptrackError(f"the table has no column t_ns (times in nanoseconds); it has {', '.join(columns)}")
     if schema is None:
         facts = {column.name: column for column in about}
-        stated = [
-            facts.get(column, ColumnOfUser(column, values.dtype))._replace(dtype=values.dtype)
+        given = [
+            ColumnOfUser(column, np.dtype((values.dtype, values.shape[1:])), *facts.get(column, ("", ""))[-2:])
             for column, values in columns.items()
             if column not in BESIDE
         ]
-        schema = schema_of_columns(name, stated)
+        schema = schema_of_columns(name, given)
     own = {column.name for column in schema.columns}
     strange = sorted(set(columns) - own - {*BESIDE, "index"})
     if strange:

@@ -58,10 +58,13 @@ class ColumnOfUser(NamedTuple):
 
 
 def derived(
-    name: str, source: Any, units: Mapping[str, str] | None = None, doc: Mapping[str, str] | None = None
+    name: str,
+    listed: Iterable[ColumnOfUser],
+    units: Mapping[str, str] | None = None,
+    doc: Mapping[str, str] | None = None,
 ) -> Schema:
     """Return a schema of its own; see ``mcaptrack.schema_of``."""
-    columns = [column for column in _columns(source) if column.name not in BESIDE]
+    columns = [column for column in listed if column.name not in BESIDE]
     names = [column.name for column in columns]
     facts: list[dict[str, str]] = []
     for parameter, texts in (("units", units), ("doc", doc)):
@@ -114,23 +117,10 @@ def _values(kind: type, column: ColumnOfUser, objects: Sequence[Any]) -> NDArray
     return array.astype(column.dtype) if column.dtype.kind in "fb" else array
 
 
-def columns_of_arrow(schema: Any) -> list[ColumnOfUser]:
-    """Return the columns of a schema of Arrow."""
-    out = []
-    for field in schema:
-        texts = {key.decode(): value.decode("utf-8", "replace") for key, value in (field.metadata or {}).items()}
-        out.append(ColumnOfUser(field.name, _numpy(field.type), *_facts(texts)))
-    return out
-
-
-def _columns(source: Any) -> list[ColumnOfUser]:
-    """The columns of a dtype, a dataclass or a schema of Arrow."""
+def columns_of_type(source: Any) -> list[ColumnOfUser]:
+    """Return the columns of a dtype or a dataclass. Raises McaptrackError for anything else."""
     if isinstance(source, type) and dataclasses.is_dataclass(source):
         return _fields(source)
-    if hasattr(source, "__arrow_c_schema__"):
-        import pyarrow as pa
-
-        return columns_of_arrow(pa.schema(source))
     try:
         names = np.dtype(source).names
     except (TypeError, ValueError):
@@ -146,17 +136,6 @@ def _columns(source: Any) -> list[ColumnOfUser]:
 def columns_of_dtype(dtype: np.dtype[Any]) -> list[ColumnOfUser]:
     """Return the columns of a dtype with names."""
     return [ColumnOfUser(name, dtype[name]) for name in dtype.names or ()]
-
-
-def _numpy(kind: Any) -> np.dtype[Any]:
-    """The dtype of a type of Arrow; that of objects for other types than numbers and times."""
-    import pyarrow as pa
-
-    if pa.types.is_decimal(kind):
-        return np.dtype("f8")
-    if pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind):
-        return np.dtype(kind.to_pandas_dtype())
-    return np.dtype("M8[ns]" if pa.types.is_temporal(kind) else "O")
 
 
 def _kind(name: str, dtype: np.dtype[Any]) -> str:
@@ -181,7 +160,7 @@ def _fields(kind: type) -> list[ColumnOfUser]:
         if get_origin(hint) is Annotated:
             hint, *extras = get_args(hint)
             unit = next((extra for extra in extras if isinstance(extra, str)), "")
-        stated, doc = _facts(field.metadata)
+        stated, doc = facts_of(field.metadata)
         dtype = _dtype(f"{kind.__name__}.{field.name}", hint)
         out.append(ColumnOfUser(field.name, dtype, stated or unit, doc))
     return out
@@ -199,7 +178,7 @@ def _dtype(where: str, hint: Any) -> np.dtype[Any]:
     raise McaptrackError(f"the column {where} holds {_OTHERWISE}")
 
 
-def _facts(metadata: Mapping[Any, Any]) -> tuple[str, str]:
-    """The unit and the description in the metadata of a field."""
+def facts_of(metadata: Mapping[Any, Any]) -> tuple[str, str]:
+    """Return the unit and the description in the metadata of a field, of a dataclass or of Arrow."""
     unit = metadata.get("unit", "")
     return "" if unit in _PLAIN else unit, next((metadata[key] for key in _DOCS if metadata.get(key)), "")

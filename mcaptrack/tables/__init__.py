@@ -28,6 +28,7 @@ from mcaptrack.tables.build import (
     TablePieces,
     as_arrow,
     columns_of,
+    columns_of_arrow,
     frames_table,
     records_table,
     rows_of_topic,

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import Schema
+from mcaptrack.sources.own_schemas import ColumnOfUser, facts_of
 from mcaptrack.tables.fields import RECORDING, TABLES, Table, of_rows
-
 
 #: Whole numbers up to this are exact as float64.
 _EXACT: Final = 2**53
@@ -144,10 +144,31 @@ def columns_of(table: Any) -> dict[str, NDArray[Any]]:
     out = {}
     for field, column in zip(table.schema, table.columns, strict=True):
         out[field.name] = (column.cast(pa.float64()) if pa.types.is_decimal(field.type) else column).to_numpy()
+        if pa.types.is_boolean(field.type) and column.null_count:
+            raise McaptrackError(
+                f"the column {field.name} has flags, and some are missing, which rows can't say: give numbers"
+            )
         if pa.types.is_integer(field.type) and column.null_count and (np.abs(out[field.name]) > _EXACT).any():
             raise McaptrackError(
                 f"the column {field.name} has whole numbers above 2^53, and some are missing; rows can't hold both"
             )
+    return out
+
+
+def columns_of_arrow(schema: Any) -> list[ColumnOfUser]:
+    """The columns of a schema of Arrow, with units and descriptions; those of other types than numbers as objects."""
+    import pyarrow as pa
+
+    def dtype(kind: Any) -> Any:
+        if pa.types.is_decimal(kind):
+            return np.float64
+        is_number = pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)
+        return kind.to_pandas_dtype() if is_number else "M8[ns]" if pa.types.is_temporal(kind) else object
+
+    out = []
+    for field in pa.schema(schema):
+        texts = {key.decode(): value.decode("utf-8", "replace") for key, value in (field.metadata or {}).items()}
+        out.append(ColumnOfUser(field.name, np.dtype(dtype(field.type)), *facts_of(texts)))
     return out
 
 

@@ -237,7 +237,8 @@ def export(
         Called with a text, the number of finished tables and their total.
     form : {"parquet", "arrow", "csv", "jsonl"}
     topics : sequence of str
-        Foreign channels that get tables of their own, as those with rows of a user's own schema always do. Existing ones are updated, and removed if their channel is gone.
+        Foreign channels that get tables of their own, as those with rows of a user's own schema always do.
+        Existing ones are updated, and removed if their channel is gone.
     blobs : bool
         Whether these tables have fields of bytes.
     force : bool
