@@ -98,16 +98,18 @@ def own_schema(name: str, columns: Iterable[OwnColumn]) -> Schema:
                 raise McaptrackError(
                     f"the {what} of {where} is printable text of at most {_LONGEST} characters, not {text!r:.60}"
                 )
-    return _schema(whole, listed)
+    return _schema(Definition(whole, _DOC, tuple(map(_column, listed, range(1, len(listed) + 1)))))
+
+
+def _column(own: OwnColumn, number: int) -> Column:
+    is_float = own.kind in ("double", "float")
+    column = Column(own.name, own.kind, number, is_float, own.doc, stated_unit=own.unit)
+    return replace(column, stated_unit=column.unit)  # that of its name, if there is no other
 
 
 @lru_cache(maxsize=1024)
-def _schema(name: str, columns: tuple[OwnColumn, ...]) -> Schema:
-    made = []
-    for number, own in enumerate(columns, start=1):
-        column = Column(own.name, own.kind, number, own.kind in ("double", "float"), own.doc, stated_unit=own.unit)
-        made.append(replace(column, stated_unit=column.unit))  # of the name, if there is no other
-    return Schema(name, definition=Definition(name, _DOC, tuple(made)))
+def _schema(definition: Definition) -> Schema:
+    return Schema(definition.name, definition=definition)
 
 
 def columns_in_metadata(schema: Schema) -> str:
