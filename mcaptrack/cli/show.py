@@ -171,7 +171,7 @@ def _lineage(channels: list[dict[str, Any]], verbose: bool) -> Tree:
     while waiting:
         parent, channel, depth = waiting.pop()
         label = Text(printable(channel["topic"]))
-        made_by = f"written by {channel['written_by']}" if channel["written_by"] else channel["transform"]
+        made_by = f"written by {name}" if (name := channel.get("written_by")) else channel["transform"]
         label.append(f"  {printable(made_by)}" if made_by else "", "dim")
         for plugin in (channel["plugins"] or {}).values():
             package = f"{plugin['distribution']} {plugin['version']}".strip()

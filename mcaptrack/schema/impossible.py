@@ -46,7 +46,7 @@ def _detections(rows: Rows, _frame: Ints) -> Fault:
 
 
 def _tracks(rows: Rows, frame: Ints) -> Fault:
-    """A row that is no detection, or whose id is negative or that of an earlier row of its frame."""
+    """A row that is no detection, or with an id that is negative or stands in an earlier row of its frame, too."""
     if fault := _detections(rows, frame) or _below(rows, "track_id", 0):
         return fault
     if (row := _first(_repeated(frame, rows["track_id"]))) is None:

@@ -44,7 +44,7 @@ class Column:
 
     ``since`` is the version that added the column, "" for those that were there from the beginning; ``group`` counts
     the comments that say so up to it, because columns are added in groups. ``stated_unit`` is the unit of a column
-    whose name doesn't say it.
+    with a name that doesn't say it.
     """
 
     name: str
