@@ -25,7 +25,9 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS, VIDEO, Frame, Schema
+from tests.bags import T0
 from tests.commands import done
+from tests.test_ros_in_place import check_whole, drive, raw
 from tests.worlds import write_clip
 
 DTYPES = ["f8", ">f4", "f2", "i8", ">i4", "i2", "i1", "u8", "u4", "u2", "u1", "?"]
@@ -144,6 +146,28 @@ class TestRoundTrip:
             ]
             frames = opened.table("frames").select(["topic", "t_ns", "frame", "rows"]).to_pylist()
         assert [tuple(row.values()) for row in frames] == [("/car/speed", 5, 2, 0), ("/car/speed", 9, 4, 1)]
+
+    def test_rows_are_found_by_the_end_of_their_topic_if_it_is_the_only_one(self, tmp_path):
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/a/speed", cars())
+            opened.write("/b/speed", cars(v=[1.0, 2.0]))
+            opened.write("/b/height", cars())
+            assert len(list(opened.frames("height"))) == 2
+            for topic, options, words in (
+                ("speed", {}, "several channels speed: /a/speed, /b/speed; name one"),
+                ("height", {"times": [0]}, "`times=` chooses pictures, and /b/height holds rows"),
+                ("width", {}, "no channels width with pictures"),
+            ):
+                with pytest.raises(McaptrackError, match=words):
+                    next(opened.frames(topic, **options))
+
+    def test_the_whole_recording_of_ros_2_is_still_read_by_ros_tools(self, tmp_path):
+        path = drive(tmp_path / "drive", shots=4)
+        recorded = raw(path)
+        with mcaptrack.open(path) as opened:
+            opened.write("/wheels/speed", [Fix(T0, 1.0), Fix(T0 + 5, 2.0)], sidecar=False)
+            opened.write("/wheels/predictions", TestOwnForecasts.steps(t_ns=[T0, T0]), sidecar=False)
+        check_whole(path, recorded)
 
 
 def _without_class(rows: Any) -> Any:
@@ -299,6 +323,12 @@ class TestWriting:
                 mcaptrack.McaptrackWarning, match="own.MyRows, because mcaptrack.Tracks has no column gait;"
             ):
                 opened.write("/my/rows", near)
+
+            box = cars(x_px=[1.0, 2.0], y_px=[1.0, 2.0], w_px=[1.0, 2.0])
+            with pytest.warns(
+                mcaptrack.McaptrackWarning, match="own.MyBoxes, because mcaptrack.Detections needs h_px, too"
+            ):
+                opened.write("/my/boxes", box)
 
     def test_one_name_stands_for_one_set_of_columns(self, tmp_path):
         speed = mcaptrack.schema_of("Speed", [("speed_m_per_s", "f8")])

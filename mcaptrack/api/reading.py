@@ -24,6 +24,7 @@ from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
+from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.own_rows import times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
@@ -423,12 +424,20 @@ class LogReader:
         return supervision_of(self._log.frames(topics[0], schema or TRACKS), names)
 
     def _topic_of_rows(self, topic: str) -> tuple[str, Schema] | None:
-        """Return the channel of rows with this topic, or the only one that ends with it, and its schema."""
-        schemas = {channel.topic: channel.schema for channel in self._log.channels.values()}
-        end = "/" + topic.strip("/")
-        topics = [topic] if topic in schemas else [name for name in schemas if name.endswith(end)]
-        schema = schemas[topics[0]] if len(topics) == 1 else None
-        return None if schema is None else (topics[0], schema)
+        """Return the channel of rows with this topic, or the only one that ends with it, and its schema.
+
+        None if there is none, or if pictures have such a topic.
+        """
+        channels = self._log.channels
+        ending = [channel for name, channel in channels.items() if name.endswith("/" + topic.strip("/"))]
+        fitting = [channels[topic]] if topic in channels else ending
+        of_rows = [(channel.topic, channel.schema) for channel in fitting if channel.schema is not None]
+        if not of_rows or any(map(holds_pictures, fitting)):
+            return None
+        if len(of_rows) > 1:
+            names = ", ".join(sorted(name for name, _ in of_rows))
+            raise McaptrackError(f"{self.path} has several channels {topic}: {names}; name one")
+        return of_rows[0]
 
     def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
         pixels = decode_gray if colour == "grey" else decode_bgr

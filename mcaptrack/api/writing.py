@@ -137,9 +137,10 @@ def _program(by: str | None) -> str:
         return " ".join(filter(None, distribution_of(module))) or module
     if not file:
         return "a notebook" if "ipykernel" in sys.modules else "Python"
-    script = Path(file).name
-    package = next((package_of(point) for point in entry_points("console_scripts") if point.name == script), ())
-    plain = "".join(character if character.isprintable() else "?" for character in script)[:_LONGEST_NAME]
+    script = Path(file)
+    points = entry_points("console_scripts") if not script.suffix else []
+    package = next((package_of(point) for point in points if point.name == script.name), ())
+    plain = "".join(character if character.isprintable() else "?" for character in script.name)[:_LONGEST_NAME]
     return " ".join(filter(None, package)) or plain
 
 
@@ -179,7 +180,8 @@ def _topic(opened: logs.Log, topic: str) -> str:
 def _refuse_to_replace(opened: logs.Log, name: str, schema: Schema, replace: bool) -> None:
     """Raise McaptrackError if there is a channel of this name that has to stay."""
     alike = (c for c in opened.channels.values() if c.topic != name and schema.is_own and c.schema_name == schema.name)
-    other = next((channel.topic for channel in alike if channel.schema is not schema), None)
+    columns = columns_in_metadata(schema)
+    other = next((c.topic for c in alike if c.schema is None or columns_in_metadata(c.schema) != columns), None)
     if other is not None:
         raise McaptrackError(
             f"{opened.path}: {other} has other columns of {schema.name}; give this schema another name, as in "

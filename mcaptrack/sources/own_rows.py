@@ -109,21 +109,20 @@ def columns_in_space(arrays: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
 def schema_of_columns(name: str, columns: Sequence[ColumnOfUser]) -> Schema:
     """Return the schema of mcaptrack that has these columns, or else one of its own with this name.
 
-    A column that keeps rows from being detections or tracks is named in a warning.
+    What keeps rows with a box or a position from being detections or tracks is named in a warning.
     """
     names = {column.name for column in columns}
     fitting = next((schema for schema in OURS if _fits(schema, names)), None)
     if fitting is not None:
         return fitting
     schema = of_columns(name, columns)
-    near = TRACKS if "track_id" in names else DETECTIONS
-    strange = sorted(names - {column.name for column in near.columns})
-    if _is_placed(names):
-        warn(
-            f"rows are of {schema.name}, because {near.name} has no column {', '.join(strange)}; `schema=` says what "
-            "rows are",
-            "other",
-        )
+    parts = [group for group in (BOX_PX, PLACE_M) if names & {*group}]
+    if parts:
+        near = TRACKS if "track_id" in names else DETECTIONS
+        strange = sorted(names - {column.name for column in near.columns})
+        lacking = [column for column in parts[0] if column not in names]
+        why = f"has no column {', '.join(strange)}" if strange else f"needs {', '.join(lacking)}, too"
+        warn(f"rows are of {schema.name}, because {near.name} {why}; `schema=` says what rows are", "other")
     return schema
 
 
