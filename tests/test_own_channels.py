@@ -169,6 +169,18 @@ class TestRoundTrip:
             opened.write("/wheels/predictions", TestOwnForecasts.steps(t_ns=[T0, T0]), sidecar=False)
         check_whole(path, recorded)
 
+    def test_a_bag_has_them_as_messages(self, tmp_path):
+        path = tmp_path / "a.mcap"
+        with mcaptrack.open(path, create=True) as opened:
+            for topic in ("/gps/a", "/gps/b"):
+                opened.write(topic, [Fix(T0, 1.0), Fix(T0 + 5, 2.0, 3.0)], schema=mcaptrack.schema_of("Fix", Fix))
+        bag = mcaptrack.export(path, form="rosbag2", output=tmp_path / "bag").folder
+        with AnyReader([bag]) as reader:
+            found = [(c.topic, t, reader.deserialize(content, c.msgtype).rows) for c, t, content in reader.messages()]
+        for topic in ("/gps/a", "/gps/b"):
+            mine = [(t_ns, row.lat, row.lon) for name, t_ns, rows in found if name == topic for row in rows]
+            np.testing.assert_array_equal(mine, [(T0, 1, np.nan), (T0 + 5, 2, 3)])
+
 
 def _without_class(rows: Any) -> Any:
     """A table or array without the names of classes, which the rows of a schema don't have."""
