@@ -19,7 +19,7 @@ _PARTS = {
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["Recording", "open"],
     "rendering": ["RenderResult", "render"],
-    "rows": ["detections"],
+    "rows": ["detections", "schema_of"],
     "run": ["run"],
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],

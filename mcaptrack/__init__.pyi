@@ -32,6 +32,7 @@ from mcaptrack.api.recording import open as open  # noqa: A004
 from mcaptrack.api.rendering import RenderResult as RenderResult
 from mcaptrack.api.rendering import render as render
 from mcaptrack.api.rows import detections as detections
+from mcaptrack.api.rows import schema_of as schema_of
 from mcaptrack.api.run import run as run
 from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
@@ -118,6 +119,7 @@ __all__ = [
     "retrack",
     "run",
     "sample",
+    "schema_of",
     "track",
     "train",
     "tune",

@@ -109,7 +109,9 @@ def test_stages_write_the_same_results_beside_an_object_as_beside_a_file(store, 
     with mcaptrack.open(url) as opened:
         rows = mcaptrack.detections([[9, 20, 17, 28]], t_ns=0, box_format="xyxy")
         assert opened.write("/mine/detections", [rows]) == 1
+        assert opened.write("/mine/speed", np.array([(5, 1.5)], [("t_ns", "i8"), ("speed_m_per_s", "f8")])) == 1
         assert "/mine/detections" in opened.topics
+        assert opened.array("/mine/speed")["speed_m_per_s"].tolist() == [1.5]
     assert store.get("night/b.mcap") == bare.read_bytes()
     assert sorted(store.names()) == ["night/b.mcap", "night/b.results.mcap"]
 

@@ -22,8 +22,9 @@ from mcaptrack.api.rows import supervision_of
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
-from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
+from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.own_rows import times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
@@ -165,7 +166,7 @@ class LogReader:
         Parameters
         ----------
         name : str
-            One of ``tables``; or the topic of any other channel, for a table of its flattened messages.
+            One of ``tables``; or the topic of any channel, for a table of its rows, or of its flattened messages.
         topic : str, optional
             Return the rows of this channel only.
 
@@ -210,7 +211,7 @@ class LogReader:
         Parameters
         ----------
         name : str
-            One of ``tables``; or the topic of any other channel.
+            One of ``tables``; or the topic of any channel.
         topic : str, optional
             Return the rows of this channel only.
 
@@ -240,7 +241,7 @@ class LogReader:
     def frames(
         self, topic: str = "video", times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:
-        """Decode the pictures of a channel, in the order of time.
+        """Decode the pictures of a channel, or read its rows, in the order of time.
 
         Parameters
         ----------
@@ -250,17 +251,19 @@ class LogReader:
             Times in whole nanoseconds: decode the picture that is shown at each, the last one that is not later. By
             default all pictures.
         colour : {"bgr", "rgb", "grey"}, default "bgr"
-            Order of the colours.
+            Order of the colours of pictures.
 
         Returns
         -------
         iterator of mcaptrack.schema.Frame
-            ``t_ns``, ``index``, and ``rows``: the picture, (H, W, 3) uint8, or (H, W) for "grey".
+            ``t_ns``, ``index``, and ``rows``: the picture, (H, W, 3) uint8, or (H, W) for "grey"; or the rows of a
+            message, (N,) with a field for each column, as ``Recording.write`` takes them. Missing numbers are NaN.
 
         Raises
         ------
         McaptrackError
-            If there is no such channel of pictures, if a picture is damaged, or for a time before the first picture.
+            If there is no such channel of pictures or rows, if a picture is damaged, or for a time before the first
+            picture.
 
         Examples
         --------
@@ -271,6 +274,12 @@ class LogReader:
         (0, (48, 64))
 
         """
+        if (of_rows := self._topic_of_rows(topic)) is not None:
+            if times is not None:
+                raise McaptrackError(
+                    f"`times=` chooses pictures, and {of_rows[0]} holds rows; choose rows by their t_ns"
+                )
+            return iter(self._log.frame_columns(*of_rows))
         channel = find_pictures(self._log, topic)
         wanted = None if times is None else shown_pictures(self._log, channel, times)
         frames = self._decoded(channel, wanted, colour)
@@ -413,6 +422,22 @@ class LogReader:
         schema = boxes[topics[0]]
         names = class_names(self._log.channel(topics[0]).metadata)
         return supervision_of(self._log.frames(topics[0], schema or TRACKS), names)
+
+    def _topic_of_rows(self, topic: str) -> tuple[str, Schema] | None:
+        """Return the channel of rows with this topic, or the only one that ends with it, and its schema.
+
+        None if there is none, or if pictures have such a topic.
+        """
+        channels = self._log.channels
+        ending = [channel for name, channel in channels.items() if name.endswith("/" + topic.strip("/"))]
+        fitting = [channels[topic]] if topic in channels else ending
+        of_rows = [(channel.topic, channel.schema) for channel in fitting if channel.schema is not None]
+        if not of_rows or any(map(holds_pictures, fitting)):
+            return None
+        if len(of_rows) > 1:
+            names = ", ".join(sorted(name for name, _ in of_rows))
+            raise McaptrackError(f"{self.path} has several channels {topic}: {names}; name one")
+        return of_rows[0]
 
     def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
         pixels = decode_gray if colour == "grey" else decode_bgr

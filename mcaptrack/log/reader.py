@@ -32,6 +32,7 @@ from mcaptrack.schema.classes import with_only_class
 from mcaptrack.schema.encodings import ROW_ENCODINGS, RowReader, reader_of, schema_name_of
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import split_rows
+from mcaptrack.schema.own import schema_of_channel
 
 T = TypeVar("T")
 
@@ -52,6 +53,11 @@ class Channel(NamedTuple):
     def holds(self, schema: Schema) -> bool:
         """Whether it has rows of a schema, in any encoding of rows."""
         return self.schema_name == schema.name and self.message_encoding in ROW_ENCODINGS
+
+    @property
+    def schema(self) -> Schema | None:
+        """The schema of its rows, mcaptrack's or a user's own; None if it holds no rows."""
+        return schema_of_channel(self.schema_name, self.metadata) if self.message_encoding in ROW_ENCODINGS else None
 
 
 # A log as it was when it was opened, even if its file changes afterwards.
@@ -376,7 +382,7 @@ class Log:
 
     def _channel(self, record: ChannelRecord) -> Channel:
         schema = self.index.schemas.get(record.schema_id)
-        name = schema_name_of(schema.name, schema.encoding, record.message_encoding) if schema else ""
+        name = schema_name_of(schema.name, schema.encoding, record.message_encoding, record.metadata) if schema else ""
         count = self.index.counts.get(record.id, 0)
         return Channel(record.id, record.topic, name, record.message_encoding, record.metadata, count)
 

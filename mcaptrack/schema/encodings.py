@@ -6,7 +6,7 @@ A channel of rows is read by its own encoding. Digests don't depend on it: they 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, Protocol
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Bytes, Ints
 from mcaptrack.geometry.ragged import ragged_range
-from mcaptrack.schema import SCHEMAS, Frame, Rows, Schema
+from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.codec import RowCodec
+from mcaptrack.schema.own import schema_of_channel
 from mcaptrack.schema.proto import KINDS, Definition
 
 Encoding = Literal["protobuf", "cdr"]
@@ -114,8 +115,10 @@ def ros_definition(definition: Definition) -> str:
     lines = [f"# {definition.doc}", f"{row}[] rows", _LINE, f"MSG: {row}"]
     width = max(len(_TYPES[column.kind]) + len(column.name) for column in definition.columns) + 1
     for column in definition.columns:
-        missing = "" if not column.optional else "; NaN if missing" if column.is_nullable else "; -1 if missing"
-        lines.append(f"{_TYPES[column.kind]} {column.name}".ljust(width) + f" # {column.doc}{missing}")
+        missing = "" if not column.optional else "NaN if missing" if column.is_nullable else "-1 if missing"
+        unit = f"in {column.stated_unit}" if column.stated_unit else ""
+        comment = "; ".join(filter(None, (column.doc, unit, missing)))
+        lines.append(f"{_TYPES[column.kind]} {column.name}".ljust(width) + (f" # {comment}" if comment else ""))
     return "\n".join(lines) + "\n"
 
 
@@ -300,10 +303,10 @@ def record_of(schema: Schema, encoding: Encoding) -> tuple[str, str, bytes]:
     return schema.name, PROTOBUF, schema.descriptor
 
 
-def schema_name_of(name: str, schema_encoding: str, message_encoding: str) -> str:
+def schema_name_of(name: str, schema_encoding: str, message_encoding: str, metadata: Mapping[str, str] = {}) -> str:
     """The name of the schema of a channel: mcaptrack.Tracks also for its rows as ROS messages."""
     rows = schema_of_ros(name) if (schema_encoding, message_encoding) == (ROS2MSG, CDR) else ""
-    return rows if rows in SCHEMAS else name
+    return rows if schema_of_channel(rows, metadata) else name
 
 
 def reader_of(schema: Schema, message_encoding: str, definition: bytes) -> RowReader:

@@ -21,6 +21,8 @@ INGEST, VIEW, FUSE, REFINE = "ingest", "view", "fuse", "calibrate"
 #: Ends of the topics of views: on pictures, and on the ground.
 VIEW_SUFFIX: Final = "/view/image"
 SCENE_SUFFIX: Final = "/view/scene"
+#: The parameter of channels that a user wrote, and may replace: the program that did.
+WRITTEN_BY: Final = "written_by"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
 #: Beginnings of older versions: their results are read, but not made again with the same parameters.
@@ -50,6 +52,7 @@ class Provenance:
     out to be. ``warnings`` are the warnings when it was made, with code and message. ``continued`` says from which
     channel of the log before its ids go on (``after``, a digest), and the largest id so far (``last_id``).
     ``output`` is the end of the topic of an output that only the class of another package has, below its main output.
+    ``columns`` are those of a schema of a user's own (see ``schema.own``).
     """
 
     transform: str
@@ -69,6 +72,12 @@ class Provenance:
     zones: Mapping[str, str] = field(default_factory=dict)
     continued: Mapping[str, str] = field(default_factory=dict)
     output: str = ""
+    columns: str = ""
+
+    @property
+    def written_by(self) -> str:
+        """The program of a user that wrote the channel with ``Recording.write``; "" for others."""
+        return str(self.parameters.get(WRITTEN_BY, "")) if self.transform == INGEST else ""
 
     @property
     def is_of_older_version(self) -> bool:
@@ -101,6 +110,7 @@ class Provenance:
             "class_id": self.class_id,
             "frame_id": self.frame_id,
             "zones": json.dumps(dict(self.zones), ensure_ascii=False),
+            "columns": self.columns,
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
             "continued": json.dumps(dict(self.continued), sort_keys=True),

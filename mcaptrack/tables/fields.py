@@ -82,12 +82,17 @@ class Table:
 
     def is_of_tracks(self) -> bool:
         """Whether its rows name tracks by their ids, and so have the classes of these."""
-        of = self.rows_of
-        return of is not None and not has_classes(of) and "track_id" in {column.name for column in of.columns}
+        return "track_id" in (names := self._columns_of_ours) and "class_id" not in names
 
     def is_of_zones(self) -> bool:
         """Whether its rows name zones by their ids."""
-        return self.rows_of is not None and "zone_id" in {column.name for column in self.rows_of.columns}
+        return "zone_id" in self._columns_of_ours
+
+    @property
+    def _columns_of_ours(self) -> set[str]:
+        """The columns of its rows, if they are of a schema of mcaptrack."""
+        of = self.rows_of
+        return {column.name for column in of.columns} if of is not None and of.name in SCHEMAS else set()
 
 
 def _with_unit(field: Any) -> Any:
@@ -96,7 +101,7 @@ def _with_unit(field: Any) -> Any:
 
     metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     unit = "" if pa.types.is_boolean(field.type) else _NONE
-    return field.with_metadata({"unit": unit} | metadata)
+    return field.with_metadata({"unit": unit, "description": ""} | metadata)
 
 
 _TOPIC: Final = Field("topic", _NAME, "channel of the log that the row comes from")
@@ -327,14 +332,16 @@ def _plural(schema: Schema) -> str:
     return name if name.endswith("s") else name + "s"
 
 
-def _of_rows(schema: Schema) -> Table:
+def of_rows(schema: Schema) -> Table:
+    """The table of rows of a schema."""
     name = _plural(schema)
-    order = ("topic", "track_id", "t_ns") if name in _BY_TRACK else ("topic", "t_ns")
+    is_by_track = schema.name in SCHEMAS and name in _BY_TRACK
+    order = ("topic", "track_id", "t_ns") if is_by_track else ("topic", "t_ns")
     return Table(name, schema.definition.doc, ("topic", "row"), order, (*TIMES, _ROW), schema)
 
 
 def _all_tables() -> Iterator[Table]:
-    yield from (_FRAMES, *(_of_rows(schema) for schema in SCHEMAS.values()), _SUMMARY, _METRICS, _CHANNELS)
+    yield from (_FRAMES, *(of_rows(schema) for schema in SCHEMAS.values()), _SUMMARY, _METRICS, _CHANNELS)
     yield _RECORDINGS  # last: its digest says that the others are complete
 
 

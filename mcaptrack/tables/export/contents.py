@@ -19,7 +19,7 @@ from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.location import Location, shortened
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts
@@ -154,10 +154,7 @@ class LogTables:
         """As ``table``, but a table with many rows comes as ``TablePieces``, which are made while they are read."""
         table = TABLES[name]
         if table.rows_of is not None:
-            channels = {topic: self._frames(topic) for topic in self.topics(name)}
-            of_tracks = {topic: self._track_names(topic) for topic in channels} if table.is_of_tracks() else {}
-            zones = {topic: self._zone_names(topic) for topic in channels} if table.is_of_zones() else {}
-            return tables.rows_in_pieces(table.rows_of, channels, self._class_names, of_tracks, zones)
+            return self._rows(table.rows_of, self.topics(name))
         makers: Mapping[str, Callable[[], Any]] = {
             "frames": self._places,
             "track_summary": lambda: tables.summary_table(
@@ -171,6 +168,18 @@ class LogTables:
         }
         return makers[name]()
 
+    def _rows(self, schema: Schema, topics: Sequence[str]) -> TablePieces:
+        """The rows of channels of a schema, with the names of their classes, tracks and zones."""
+        table, channels = tables.table_of(schema), {topic: self._frames(topic) for topic in topics}
+        of_tracks = {topic: self._track_names(topic) for topic in channels} if table.is_of_tracks() else {}
+        zones = {topic: self._zone_names(topic) for topic in channels} if table.is_of_zones() else {}
+        return tables.rows_in_pieces(schema, channels, self._class_names, of_tracks, zones)
+
+    def own_topics(self) -> list[str]:
+        """The channels with rows of a user's own schemas: none of ``TABLES`` has them."""
+        schemas = {channel.topic: channel.schema for channel in self.opened.channels.values()}
+        return sorted(topic for topic, schema in schemas.items() if schema and schema.name not in SCHEMAS)
+
     def topics(self, name: str) -> list[str]:
         """The channels from which a table is made, in order."""
         if name in ("channels", "recordings"):
@@ -178,7 +187,7 @@ class LogTables:
         if name == "frames":
             pictures = {c.topic for c in self.opened.channels.values() if foreign.holds_pictures(c)}
             of_rows = (self.topics(table.name) for table in TABLES.values() if table.rows_of is not None)
-            return sorted(pictures.union(*of_rows))
+            return sorted(pictures.union(self.own_topics(), *of_rows))
         if name == "track_summary":
             return self.topics("tracks")
         if name == "metrics":
@@ -228,10 +237,13 @@ class LogTables:
         return pieces.table(), left_out
 
     def message_pieces(self, topic: str, blobs: bool = False) -> tuple[TablePieces, list[str]]:
-        """The messages of any channel as a flat table in pieces, and the fields that were left out.
+        """The rows of a channel, or the messages of any other as a flat table; in pieces, and the fields left out.
 
         Raises McaptrackError, with topic and time, for messages that can't be read.
         """
+        schema = self.opened.channel(topic).schema
+        if schema is not None:
+            return self._rows(schema, [topic]), []
         places = self._pointers(topic, of_rows=False)
         kind = message_type_of(self.opened, topic)
         try:
@@ -265,11 +277,9 @@ class LogTables:
             if holds_boxes(self.opened, topic):
                 self._kept[topic] = self._boxes(topic)
                 return self._kept[topic]
-            schema = next(
-                table.rows_of
-                for table in TABLES.values()
-                if table.rows_of is not None and table.rows_of.name == self.opened.channel(topic).schema_name
-            )
+            schema = self.opened.channel(topic).schema
+            if schema is None:
+                raise KeyError(topic)
             self._kept[topic] = self.opened.frame_columns(topic, schema)
             self._class_names[topic] = class_names(self.opened.channel(topic).metadata)
         return self._kept[topic]
