@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
 from pathlib import Path
@@ -128,3 +129,18 @@ def test_no_test_is_skipped_for_want_of_a_package_that_is_installed():
     texts = {path.name: path.read_text() for path in (ROOT / "tests").rglob("*.py")}
     skipped = {name: set(re.findall(r"importorskip\(\"([\w-]+)", text)) & INSTALLED for name, text in texts.items()}
     assert not {name: packages for name, packages in skipped.items() if packages}
+
+
+def test_only_types_and_names_of_the_mcap_package_are_used():
+    """Reading and writing are ours, so that its reader and writer can say whether they are right."""
+    used = {}
+    for path in (ROOT / "mcaptrack").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for name in names:
+                if name.partition(".")[0] == "mcap":
+                    used.setdefault(name, set()).add(path.relative_to(ROOT / "mcaptrack").parts[0])
+    assert used.pop("mcap.opcode") == {"log"}
+    assert used.pop("mcap.records") == {"log", "api"}
+    assert used.keys() == {"mcap.decoder", "mcap.exceptions", "mcap.well_known"}

@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaptrack import environment
@@ -15,7 +17,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.checksums import crc_of
-from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Opcode, Record, walk
+from mcaptrack.log.records import Bytes, ChunkHead, Damaged, Record, walk
 
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]
@@ -62,9 +64,9 @@ def message_head(buffer: Bytes, record: Record) -> tuple[int, int, int, int]:
     return head
 
 
-def chunk_record(buffer: Bytes, chunk: ChunkIndexRecord) -> Record:
+def chunk_record(buffer: Bytes, chunk: ChunkIndex) -> Record:
     """The record of an indexed chunk."""
-    return _chunk_at(buffer, chunk.offset)
+    return _chunk_at(buffer, chunk.chunk_start_offset)
 
 
 def _chunk_at(buffer: Bytes, offset: int) -> Record:

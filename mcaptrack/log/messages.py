@@ -14,6 +14,8 @@ from itertools import islice
 from typing import Final, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
@@ -33,18 +35,7 @@ from mcaptrack.log.chunks import (
     read_index_entries,
 )
 from mcaptrack.log.index import Index
-from mcaptrack.log.records import (
-    BLOCK,
-    CHUNK_HEAD_BYTES,
-    MESSAGE_HEAD,
-    Bytes,
-    ChunkIndexRecord,
-    Damaged,
-    Opcode,
-    Record,
-    read_chunk,
-    record_at,
-)
+from mcaptrack.log.records import BLOCK, CHUNK_HEAD_BYTES, MESSAGE_HEAD, Bytes, Damaged, Record, read_chunk, record_at
 from mcaptrack.schema import Rows, Schema
 from mcaptrack.schema.encodings import RowReader
 
@@ -140,8 +131,9 @@ def fingerprint(buffer: Bytes, index: Index, channel_id: int | None = None, chec
     for row in rows:
         chunk = index.chunks[row]
         # Offsets of chunks matter for the whole log, because they locate its messages, but not for one channel.
-        place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
-        say(place, chunk.start_ns, chunk.end_ns, chunk.uncompressed_size, checksums.of(buffer, index, row))
+        place = (chunk.chunk_start_offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
+        span = (chunk.message_start_time, chunk.message_end_time)
+        say(place, *span, chunk.uncompressed_size, checksums.of(buffer, index, row))
     for number in sorted(index.loose) if channel_id is None else [channel_id]:
         for offset in index.loose[number][:, 1].tolist() if number in index.loose else []:
             record = record_at(buffer, offset)
@@ -201,7 +193,7 @@ class MessageBatch(NamedTuple):
     """
 
     channel: int
-    chunk: ChunkIndexRecord | None
+    chunk: ChunkIndex | None
     is_direct: bool
     t_ns: Times
     offset: Ints
@@ -238,8 +230,10 @@ class MessageBatches:
             chunk = index.chunks[row]
             if not overlaps(chunk, self._span):
                 continue
-            at = chunk.message_index_offsets[channel_id]
-            entries = read_index_entries(source, at, channel_id) if at else index.entries[chunk.offset][channel_id]
+            if at := chunk.message_index_offsets[channel_id]:
+                entries = read_index_entries(source, at, channel_id)
+            else:
+                entries = index.entries[chunk.chunk_start_offset][channel_id]
             listed += len(entries)
             if is_left_in_file(chunk.compression, chunk.compressed_size):
                 self._add_pieces(channel_id, row, entries)
@@ -337,10 +331,10 @@ class MessageBatches:
             yield [self[member] for member in sorted(group)]
 
 
-def overlaps(chunk: ChunkIndexRecord, span: Span) -> bool:
+def overlaps(chunk: ChunkIndex, span: Span) -> bool:
     """Whether a chunk may have messages in a span of times."""
     first, last = span
-    return (first is None or chunk.end_ns >= first) and (last is None or chunk.start_ns < last)
+    return (first is None or chunk.message_end_time >= first) and (last is None or chunk.message_start_time < last)
 
 
 def to_int64(t_ns: Times) -> Ints:
@@ -495,10 +489,10 @@ class Messages:
         for chunk in self.index.chunks.with_channels(channels):
             if not overlaps(chunk, span):
                 continue
-            end = chunk.offset + chunk.length  # its message indexes follow
+            end = chunk.chunk_start_offset + chunk.chunk_length  # its message indexes follow
             indexes.append((end, end + chunk.message_index_length))
             is_direct = is_left_in_file(chunk.compression, chunk.compressed_size)
-            wholes.append((end if is_direct else chunk.offset, end + chunk.message_index_length))
+            wholes.append((end if is_direct else chunk.chunk_start_offset, end + chunk.message_index_length))
         is_one = are_read and sum(end - start for start, end in wholes) <= _READ_AT_ONCE_BYTES
         self.source.expect(wholes if is_one else indexes, GAP_BYTES if is_one or not are_read else _MIN_GAP_BYTES)
         batches = MessageBatches(self.source, self.index, channels, span)
@@ -506,17 +500,17 @@ class Messages:
             self.source.expect(wholes)
         return batches
 
-    def _content(self, chunk: ChunkIndexRecord) -> Bytes:
+    def _content(self, chunk: ChunkIndex) -> Bytes:
         """The records in a chunk."""
-        content = self._opened.pop(chunk.offset, None)
+        content = self._opened.pop(chunk.chunk_start_offset, None)
         if content is None:
             content, mark = open_chunk_with_checksum(self.source, chunk_record(self.source, chunk))
-            self._remember_chunk(chunk.offset, mark)
+            self._remember_chunk(chunk.chunk_start_offset, mark)
         else:
             self._opened_bytes -= len(content)
         if len(chunk.message_index_offsets) == 1 and isinstance(content, memoryview):
             return content  # no other channel needs it
-        self._opened[chunk.offset] = content
+        self._opened[chunk.chunk_start_offset] = content
         self._opened_bytes += len(content)
         while self._opened_bytes > _KEPT_BYTES and len(self._opened) > 1:
             self._opened_bytes -= len(self._opened.popitem(last=False)[1])
@@ -531,7 +525,7 @@ class Messages:
                 return content, batch.offset
             base = read_chunk(self.source, chunk_record(self.source, batch.chunk)).start
             if not batch.is_direct:
-                raise Damaged("a chunk is larger than its index says", batch.chunk.offset)
+                raise Damaged("a chunk is larger than its index says", batch.chunk.chunk_start_offset)
         if not len(batch.offset):
             return memoryview(b""), batch.offset
         places = batch.offset + base

@@ -12,6 +12,8 @@ from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple, Self, TypeVar
 
 import numpy as np
+from mcap.records import Channel as ChannelRecord
+from mcap.well_known import SchemaEncoding
 
 from mcaptrack import notices
 from mcaptrack.errors import DamagedError, McaptrackError, call, list_names
@@ -24,7 +26,7 @@ from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.journal import changed, find_journal, recover_hint
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, TimeOutOfRange
-from mcaptrack.log.records import ChannelRecord, Damaged
+from mcaptrack.log.records import Damaged
 from mcaptrack.log.remote import RemoteFile
 from mcaptrack.objects import Version
 from mcaptrack.schema import Frame, Schema
@@ -400,7 +402,7 @@ class Log:
         if schema is None:
             return (channel.message_encoding,)
         data = bytes(schema.data)
-        if schema.encoding in ("ros1msg", "ros2msg"):
+        if schema.encoding in (SchemaEncoding.ROS1, SchemaEncoding.ROS2):
             data = b"\n".join(b" ".join(line.partition(b"#")[0].split()) for line in data.splitlines())
             data = b"\n".join(filter(None, data.split(b"\n")))
         return (channel.message_encoding, schema.name, schema.encoding, hashlib.sha256(data).hexdigest())
@@ -419,7 +421,7 @@ class Log:
             return None
         with self.snapshot.reporting_damage():
             whole = self.snapshot.record(offsets[-1])
-            return records.read_metadata(whole, records.record_at(whole, 0))[1]
+            return records.read_metadata(whole, records.record_at(whole, 0)).metadata
 
     def attachment(self, name: str) -> bytes | None:
         """The data of the last attachment of that name."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -58,9 +59,9 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
 
 
 def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
-    if kind.encoding == "json":
+    if kind.encoding == MessageEncoding.JSON:
         return json.loads
-    if kind.encoding == "protobuf":
+    if kind.encoding == MessageEncoding.Protobuf:
         return _protobuf(kind)
     return unpacker(kind)
 
