@@ -21,7 +21,6 @@ from mcaptrack.api.declared import checked
 from mcaptrack.api.reading import LogReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite
-from mcaptrack.location import Url
 
 __all__ = ["Recording", "open"]
 
@@ -92,13 +91,9 @@ class Recording(LogReader):
         """
         from mcaptrack.api.writing import write_rows
 
-        path = self._log.path
-        path = path if isinstance(path, Url) or path.absolute() == self._place else self._place
-        with self._reading:
-            count = write_rows(path, topic, rows, classes=classes, frame_id=frame_id, replace=replace, sidecar=sidecar)
-            self.close()
-            self._open(path)
-        return count
+        with self._now():
+            path = self._path_now()
+            return write_rows(path, topic, rows, classes=classes, frame_id=frame_id, replace=replace, sidecar=sidecar)
 
 
 @checked

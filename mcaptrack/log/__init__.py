@@ -72,6 +72,23 @@ def read(path: Location, *, sidecar: bool | Callable[[Log], bool] | None = None)
     return log
 
 
+def is_current(opened: Log, place: Location) -> bool:
+    """Whether ``read`` would give the same log at this place: neither it nor its results were changed since.
+
+    Raises McaptrackError if a store can't tell.
+    """
+    has_results = not place.name.endswith(RESULTS_SUFFIX)
+    parts = [(place, opened), *([(results_path(place), opened.results)] if has_results else [])]
+    return all(_is_at(where, part) for where, part in parts)
+
+
+def _is_at(place: Location, part: Log | None) -> bool:
+    """Whether a place still holds a part of a log as it was opened; None is nothing there."""
+    if isinstance(place, Url):
+        return objects.find(place) == (part.version if part else None)
+    return part.snapshot.is_at(place) if part else not place.exists()
+
+
 def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:
     """The channels with one of these schemas, sorted by topic."""
     return [channel for _, channel in sorted(log.channels.items()) if channel.schema_name in names]

@@ -49,6 +49,14 @@ def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
     return decoder_with_errors(message_type_of(opened, topic), lambda message: message)
 
 
+def recorded_decoder(kind: MessageType) -> Callable[[bytes], Any]:
+    """A function that decodes messages by their definition in the log: messages of protobuf and of ROS, dicts of JSON.
+
+    Raises McaptrackError as ``unpacker`` does; so does the returned function for malformed payloads.
+    """
+    return decoder_with_errors(kind, lambda message: message, _unpacker(kind))
+
+
 def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
     """A function that flattens a payload to a row: path of each field -> value.
 
