@@ -67,6 +67,7 @@ __all__ = [
     "CameraCorrection",
     "ChannelInfo",
     "ColumnInfo",
+    "DecodedMessage",
     "DemoResult",
     "DoctorResult",
     "DropResult",
