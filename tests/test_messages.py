@@ -18,6 +18,7 @@ import mcap_ros2.writer
 import numpy as np
 import pandas as pd
 import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from mcap.decoder import DecoderFactory
 from mcap.exceptions import DecoderNotFoundError
 from mcap.reader import make_reader
@@ -391,3 +392,21 @@ def test_topics_are_names_of_channels_or_their_ends(strange, tmp_path):
 def test_a_log_without_messages_has_none(tmp_path):
     with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
         assert list(opened.messages()) == list(opened.messages(reverse=True)) == list(opened.messages([], 0, 0)) == []
+
+
+def test_files_of_a_protobuf_definition_come_in_any_order(tmp_path):
+    inner = FileDescriptorProto(name="a.proto", package="p")
+    inner.message_type.add(name="Inner").field.add(name="x", number=1, type=5, label=1)
+    outer = FileDescriptorProto(name="b.proto", package="p", dependency=["a.proto"])
+    outer.message_type.add(name="Outer").field.add(name="inner", number=1, type=11, label=1, type_name=".p.Inner")
+    for files in ([inner, outer], [outer, inner]):
+        path = tmp_path / "a.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            schema = writer.register_schema("p.Outer", "protobuf", FileDescriptorSet(file=files).SerializeToString())
+            writer.add_message(writer.register_channel("/a", "protobuf", schema), 1, b"\x0a\x02\x08\x05", 1)
+            writer.finish()
+        with mcaptrack.open(path) as opened:
+            assert [plain(one.decoded) for one in opened.messages()] == [{"inner": {"x": 5}}]
+            assert opened.table("/a").column("inner_x").to_pylist() == [5]

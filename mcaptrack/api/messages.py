@@ -102,7 +102,7 @@ def _decoder(schema: Schema | None, channel: Channel, factories: Iterable[Decode
     try:
         return recorded_decoder(MessageType(*fields, channel.message_encoding))
     except McaptrackError as error:
-        raise NoDecoderError(f"{error}; a decoder factory of the mcap package can (`decoder_factories=`)") from None
+        raise NoDecoderError(f"{error}; `decoder_factories=` takes decoders of the mcap package") from None
 
 
 def _with_own_id(schema: Schema | None) -> Schema | None:

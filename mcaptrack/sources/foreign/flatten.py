@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from graphlib import TopologicalSorter
 from typing import Any, Final
 
 import numpy as np
@@ -83,9 +84,14 @@ def _protobuf(kind: MessageType) -> Callable[[bytes], Any]:
     try:
         if len(kind.schema) > _MAX_DESCRIPTOR:
             raise ValueError(f"it has {len(kind.schema)} bytes")
+        listed = FileDescriptorSet.FromString(kind.schema).file
+        files = {file.name: file for file in listed}
+        if len(files) < len(listed):
+            raise ValueError("it has two files of the same name")
+        imports = {name: [other for other in file.dependency if other in files] for name, file in files.items()}
         pool = DescriptorPool()
-        for file in FileDescriptorSet.FromString(kind.schema).file:
-            pool.Add(file)
+        for name in TopologicalSorter(imports).static_order():  # the order of the files in a log is free
+            pool.Add(files[name])
         message_class: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
     except Exception as error:  # a third-party parser that raises various exceptions
         why = " ".join(str(error).split())[:120] or type(error).__name__
