@@ -79,10 +79,8 @@ def decoded_messages(
 
 def checked_factories(factories: Any) -> tuple[DecoderFactory, ...]:
     """Return decoder factories as a tuple. Raises McaptrackError for anything else, such as their classes."""
-    given = (factories,) if isinstance(factories, DecoderFactory | type) else factories
-    if not isinstance(given, Iterable):
-        given = (given,)
-    given = tuple(given)
+    several = isinstance(factories, Iterable) and not isinstance(factories, type)
+    given: tuple[Any, ...] = tuple(factories) if several else (factories,)
     for factory in given:
         if isinstance(factory, type) or not callable(getattr(factory, "decoder_for", None)):
             raise McaptrackError(
