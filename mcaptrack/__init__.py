@@ -14,6 +14,7 @@ _PARTS = {
     "fusing": ["fuse"],
     "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
+    "messages": ["DecodedMessage"],
     "notebook": ["Player"],
     "outputs": ["ReportResult", "report"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],

@@ -18,6 +18,7 @@ from mcaptrack.api.health import DoctorResult as DoctorResult
 from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
+from mcaptrack.api.messages import DecodedMessage as DecodedMessage
 from mcaptrack.api.notebook import Player as Player
 from mcaptrack.api.outputs import ReportResult as ReportResult
 from mcaptrack.api.outputs import report as report
@@ -67,6 +68,7 @@ __all__ = [
     "CameraCorrection",
     "ChannelInfo",
     "ColumnInfo",
+    "DecodedMessage",
     "DemoResult",
     "DoctorResult",
     "DropResult",

@@ -19,6 +19,7 @@ from mcaptrack.fleet import find_logs
 from mcaptrack.location import parse
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call, done
+from tests.logs import some_log
 
 
 def _tracks(frames: int = 150, each: int = 8) -> list[Frame]:
@@ -266,3 +267,48 @@ def test_a_log_in_a_store_is_recovered_to_a_file(store, template):
     done("recover", url)
     with mcaptrack.open("a.recovered.mcap") as opened:
         assert "/camera/tracks" in opened.topics
+
+
+def test_messages_of_an_object_are_those_of_the_file_in_few_requests(store, large):
+    url = store.put("large.mcap", large)
+    with mcaptrack.open(url) as remote, mcaptrack.open(large) as local:
+        assert list(remote.messages(decode=False)) == list(local.messages(decode=False))
+        period = {"start": 10**9, "end": 2 * 10**9, "reverse": True, "decode": False}
+        assert list(remote.messages(**period)) == list(local.messages(**period))
+    with mcaptrack.open(url) as remote, store.counted() as requests:
+        assert len(list(remote.messages("/camera/tracks"))) == 150
+    assert [request.method for request in requests].count("GET") <= 2
+    assert sum(request.bytes for request in requests) < 2**20
+
+
+def test_a_recording_in_a_store_is_never_stale(store, large, tmp_path):
+    content = {name: some_log(tmp_path / f"{name}.mcap", **{name: (TRACKS, [])}) for name in ("/one", "/other")}
+    url = store.put("a.mcap", large)
+    with mcaptrack.open(url) as opened:
+        begun = opened.messages(decode=False)
+        store.put("a.mcap", content["/one"])
+        assert "/one" in opened.topics
+        with pytest.raises(McaptrackError, match=r"a.mcap was replaced by another version while it was being read"):
+            list(begun)
+        begun = opened.messages(decode=False)  # of an object that is small enough to be kept whole
+        wanted = list(opened.messages(decode=False))
+        store.put("a.mcap", content["/other"])
+        assert "/other" in opened.topics
+        assert list(begun) == wanted
+        for change, there in (
+            (lambda: mcaptrack.track(url, tracker="sort", force=True), True), (lambda: store.client.delete_object(
+                Bucket="bucket", Key="a.results.mcap"), False),
+        ):  # fmt: skip
+            change()
+            assert any(c["part"] == "results" for c in mcaptrack.info(url).to_json()["channels"]) == there
+            with mcaptrack.open(url) as fresh:
+                assert opened.table("channels").equals(fresh.table("channels"))
+
+
+def test_a_process_that_was_forked_from_one_that_has_used_a_store_says_so(store, large, monkeypatch):
+    url = store.put("large.mcap", large)
+    with mcaptrack.open(url) as opened:
+        monkeypatch.setattr(os, "getpid", lambda: -1)
+        for work in (lambda: opened.topics, lambda: mcaptrack.open(url)):
+            with pytest.raises(McaptrackError, match=r"can't be reached: this process was forked .* by spawning"):
+                work()

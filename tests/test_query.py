@@ -232,7 +232,7 @@ def test_a_query_reads_only_the_tables_it_names(known, tmp_path):
     with log.read(known) as opened:
         number = opened.channel("/camera/predictions").id
         (chunk,) = (c for c in opened.index.chunks if number in c.message_index_offsets)
-    content[chunk.offset + 120] ^= 0xFF
+    content[chunk.chunk_start_offset + 120] ^= 0xFF
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(content)
     assert run(damaged, "select count(*) as n from tracks where topic = '/camera/truth'", "--format", "csv").out == (

@@ -21,7 +21,6 @@ from mcaptrack.api.declared import checked
 from mcaptrack.api.reading import LogReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite
-from mcaptrack.location import Url
 from mcaptrack.schema import Schema
 
 __all__ = ["Recording", "open"]
@@ -102,11 +101,9 @@ class Recording(LogReader):
         """
         from mcaptrack.api.writing import write_rows
 
-        path = self._log.path
-        path = path if isinstance(path, Url) or path.absolute() == self._place else self._place
-        with self._reading:
-            count = write_rows(
-                path,
+        with self._now():
+            return write_rows(
+                self._path_now(),
                 topic,
                 rows,
                 schema=schema,
@@ -116,9 +113,6 @@ class Recording(LogReader):
                 replace=replace,
                 sidecar=sidecar,
             )
-            self.close()
-            self._open(path)
-        return count
 
 
 @checked

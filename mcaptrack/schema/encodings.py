@@ -12,6 +12,7 @@ from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
+from mcap.well_known import SchemaEncoding
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Bytes, Ints
@@ -26,8 +27,6 @@ PROTOBUF: Final = "protobuf"
 CDR: Final = "cdr"
 #: Encodings of messages with rows.
 ROW_ENCODINGS: Final = (PROTOBUF, CDR)
-#: The encoding of the definitions of ROS 2 messages.
-ROS2MSG: Final = "ros2msg"
 #: The number of frames that are encoded together.
 _BATCH: Final = 256
 
@@ -299,13 +298,13 @@ def _swapped(values: NDArray[Any], which: Bools) -> NDArray[Any]:
 def record_of(schema: Schema, encoding: Encoding) -> tuple[str, str, bytes]:
     """Name, encoding and data of the schema record of a channel with rows in this encoding."""
     if encoding == CDR:
-        return ros_name(schema.name), ROS2MSG, ros_definition(schema.definition).encode()
+        return ros_name(schema.name), SchemaEncoding.ROS2, ros_definition(schema.definition).encode()
     return schema.name, PROTOBUF, schema.descriptor
 
 
 def schema_name_of(name: str, schema_encoding: str, message_encoding: str, metadata: Mapping[str, str] = {}) -> str:
     """The name of the schema of a channel: mcaptrack.Tracks also for its rows as ROS messages."""
-    rows = schema_of_ros(name) if (schema_encoding, message_encoding) == (ROS2MSG, CDR) else ""
+    rows = schema_of_ros(name) if (schema_encoding, message_encoding) == (SchemaEncoding.ROS2, CDR) else ""
     return rows if schema_of_channel(rows, metadata) else name
 
 

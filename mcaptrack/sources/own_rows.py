@@ -6,6 +6,7 @@ All are checked. Letters: N rows.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
 from operator import index as as_index
 from typing import Any, Final, Literal
 
@@ -52,6 +53,7 @@ _IN_SPACE: Final = {
     "heading_rad": "headings_rad",
     "source_id": "source_ids",
 }
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
 
 
@@ -207,8 +209,28 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
 
 def time_of(t_ns: Any) -> int:
     """Return a time in whole nanoseconds. Raises McaptrackError for anything else, such as seconds."""
-    value = t_ns.astype("datetime64[ns]").astype(np.int64) if isinstance(t_ns, np.datetime64) else t_ns
+    value = nanoseconds_of(t_ns, "`t_ns=`") if isinstance(t_ns, datetime | np.datetime64) else t_ns
     return _whole_number(value, 0, LAST_NS, f"`t_ns=` needs {_IN_NS}, since 1970 from 0 to {LAST_NS}")
+
+
+def nanoseconds_of(time: Any, name: str) -> int:
+    """Return a time in whole nanoseconds since 1970, also from a timestamp. Raises McaptrackError with ``name``."""
+    value = time
+    if isinstance(time, datetime):
+        if hasattr(time, "to_datetime64"):  # of pandas, to the nanosecond
+            value = time.to_datetime64()
+        elif time.tzinfo is None:
+            raise McaptrackError(f"{name} needs a time zone, such as `datetime(..., tzinfo=UTC)`; {time} has none")
+        else:
+            value = (time - _EPOCH) // timedelta(microseconds=1) * 1000
+    if isinstance(value, np.datetime64):
+        if np.isnat(value):
+            raise McaptrackError(f"{name} needs a time, not NaT")
+        value = value.astype("datetime64[ns]").astype(np.int64)
+    try:
+        return as_index(value)
+    except TypeError:
+        raise McaptrackError(f"{name} needs {_IN_NS}, not {kind_of(time)}") from None
 
 
 def times_of(values: Any, name: str) -> Ints:
