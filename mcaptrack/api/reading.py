@@ -31,6 +31,7 @@ from mcaptrack.tables import export
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from supervision import Detections
 
 Colour = Literal["bgr", "rgb", "grey"]
 _Seconds = Annotated[float | None, Option(least=0, most=1e9)]
@@ -373,7 +374,7 @@ class LogReader:
         """
         return fetch_message(self._log, row)
 
-    def supervision(self, topic: str) -> Iterator[tuple[int, Any]]:
+    def supervision(self, topic: str) -> Iterator[tuple[int, Detections]]:
         """Return detections or tracks as ``supervision.Detections``, frame by frame.
 
         Parameters

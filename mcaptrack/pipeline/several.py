@@ -20,8 +20,8 @@ from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.protocol import traits_of
 
-#: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
-Progress = Callable[[str, float, float | None], None]
+#: Called with the name of a stage, the amount that is done, and the total.
+Progress = Callable[[str, int, int], None]
 #: Takes a note.
 Say = Callable[[str], None]
 #: Changes an open log, or a copy of it at the path; returns the prefix of the camera, and what was done.
