@@ -98,7 +98,7 @@ class Table:
 
     @property
     def code(self) -> Code | None:
-        """The column of its rows, besides the class, whose numbers stand for names."""
+        """The column of its rows, besides the class, with numbers instead of names."""
         return None if self.rows_of is None else CODES.get(self.rows_of.name)
 
     def is_of_tracks(self) -> bool:
@@ -142,7 +142,10 @@ TRACK_TOPIC: Final = Field(
 
 @dataclass(frozen=True)
 class Code:
-    """A column whose numbers stand for names, which the column ``beside`` has; () if each channel has its own names."""
+    """A column with numbers instead of names.
+
+    The column ``beside`` it has the ``names``; these are empty if each channel has its own.
+    """
 
     column: str
     beside: Field
