@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema import SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables import catalogue
 from mcaptrack.tables.export.contents import best_tracks, worst_score
@@ -76,6 +76,28 @@ def test_warnings_and_versions_of_channels_are_named_once(tmp_path):
         (row,) = opened.table("recordings").to_pylist()
         assert opened.table("warnings").num_rows == 0
     assert {name: row[name] for name in wanted} == {"warnings": 0, "warning_texts": None, "versions": None}
+
+
+def test_metadata_that_no_table_can_hold_harms_no_table(tmp_path):
+    half, of_tracks = "\ud800", "mcaptrack.Tracks"
+    made = {"mcaptrack.transform": "retrack", "mcaptrack.version": "0.3"}
+    odd = {
+        "warnings": [["x", half], ["y"], 7], "plugins": {"transform": {"name": half}, "predictor": 5},
+        "zones": {"0": half, "x": "y"}, "classes": {"1": half},
+        "parameters": {"cameras": [half, [], None], "poor_scale": [1], "retracker": 5, half: half},
+    }  # fmt: skip
+    with log.create(tmp_path / "a.mcap") as writer:
+        for schema in SCHEMAS.values():
+            topic = f"/camera/{schema.name.partition('.')[2].lower()}"
+            record = (schema.name, "protobuf", schema.descriptor)
+            metadata = made | {f"mcaptrack.{name}": json.dumps(value) for name, value in odd.items()}
+            number = writer.add_channel(topic, record, "protobuf", metadata if schema.name != of_tracks else made)
+            writer.add_message(number, 0, 0, schema.codec.encode(schema.empty(1)))
+    mcaptrack.export(tmp_path / "a.mcap", tmp_path / "tables")
+    with mcaptrack.open(tmp_path / "a.mcap") as opened:
+        assert ("x", "?") in {(row["code"], row["message"]) for row in opened.table("warnings").to_pylist()}
+        assert opened.table("sightings")["camera_name"].to_pylist() == ["?"]
+        assert opened.table("zone_visits")["zone"].to_pylist() == ["?"]
 
 
 def test_a_log_has_a_row(tmp_path):

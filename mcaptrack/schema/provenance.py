@@ -134,6 +134,8 @@ def _read(text: str, kind: type[T]) -> T:
         return kind()
     try:
         value = json.loads(text)
+        if "\\ud" in text.lower():  # half a character, which no table and no file can hold, may be written like this
+            value = json.loads(json.dumps(value, ensure_ascii=False).encode("utf-8", "replace"))
     except (ValueError, RecursionError):
         return kind()
     return value if isinstance(value, kind) else kind()
