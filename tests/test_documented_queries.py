@@ -21,20 +21,34 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.schema import EVENTS, FORECAST_ERRORS, PREDICTIONS, TRACKS, ZONE_CROSSINGS, Frame
+from mcaptrack.schema import (
+    DECISIONS,
+    EVENTS,
+    FORECAST_ERRORS,
+    PREDICTIONS,
+    TRACKS,
+    ZONE_COUNTS,
+    ZONE_CROSSINGS,
+    ZONE_VISITS,
+    Frame,
+    Schema,
+)  # fmt: skip
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from mcaptrack.sources.demo import demo_scene
 from mcaptrack.tables.export import export
 from tests.logs import write_channels
 from tests.test_query import PRELUDE
+from tests.test_zones import HOLED, LINE, SQUARE, collection, feature
 from tests.worlds import ns, tracks_at
 from tools import pages
 from tools.pages import ROOT
 
 NS = 1_000_000_000
 SCENE = replace(demo_scene(), fps=7, width_px=480, height_px=270)
-LINE = {"type": "LineString", "coordinates": [[0, 5], [0, 20]], "units": "m"}
+ZONES = collection(
+    feature("gate", "LineString", LINE), feature("square", "Polygon", [SQUARE]), feature("ring", "Polygon", HOLED)
+)
 Rows = list[list[Any]]
 
 
@@ -75,7 +89,7 @@ def seven(tmp_path_factory) -> Iterator[Log]:
     footage = demo.draw(SCENE, folder)
     path = folder / "log.mcap"
     mcaptrack.ingest(footage.video, path, ground_plane=footage.ground_plane, truth=footage.ground_truth)
-    mcaptrack.run(path, zones=LINE)
+    mcaptrack.run(path, zones=ZONES)
     for name in ("demo.tables", "tables"):
         (folder / name).symlink_to("log.tables")
     with log.read(path) as opened:
@@ -389,10 +403,10 @@ def test_crossings_join_the_tracks_that_cross(seven):
             for t_ns, row in seven.rows(topic.removeprefix("/camera/"), ZONE_CROSSINGS):
                 xy_m = tracks[int(row["track_id"])].xy_m
                 path_m = np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum()
-                wanted.append(["line 1", t_ns, int(row["track_id"]), path_m])
+                wanted.append(["gate", t_ns, int(row["track_id"]), path_m])
     assert len(wanted) > 10
     for row, other in zip(sorted(found), sorted(wanted), strict=True):
-        assert row[1:] == pytest.approx(other[1:])
+        assert row == pytest.approx(other)
 
 
 def test_warnings_join_what_made_the_channel(of_two_classes):
@@ -403,6 +417,100 @@ def test_every_statement_of_tables_is_asked():
     parts = ["as people", "mean_speed_m_s", "zone_crossings", "warnings/"]
     statements = [one for query in queries("tables.md") for one in query.split(";") if one.strip()]
     assert [sum(part in one for part in parts) for one in statements] == [1] * len(parts)
+
+
+# Other pages
+
+
+def every_channel(seven: Log, schema: Schema) -> Iterator[tuple[str, list[tuple[int, Any]]]]:
+    """The topic below the camera of each channel of a schema, and its rows with their times."""
+    for topic, channel in sorted(seven.opened.channels.items()):
+        if channel.schema_name == schema.name:
+            below = topic.removeprefix("/camera/")
+            yield below, seven.rows(below, schema)
+
+
+def ids_by_topic(seven: Log) -> Rows:
+    found = every_channel(seven, TRACKS)
+    return [[f"/camera/{below}", len({int(row["track_id"]) for _, row in rows})] for below, rows in found]
+
+
+def visits_by_zone(seven: Log) -> Rows:
+    out = []
+    for below, rows in every_channel(seven, ZONE_VISITS):
+        for number, name in ((3, "ring"), (2, "square")):
+            stays_s = [row["dwell_s"] for _, row in rows if row["zone_id"] == number]
+            out.append([f"/camera/{below}", name, len(stays_s), np.mean(stays_s)])
+    return out
+
+
+def most_inside(seven: Log) -> Rows:
+    most: dict[tuple[str, str, int], int] = {}
+    for below, rows in every_channel(seven, ZONE_COUNTS):
+        for t_ns, row in rows:
+            key = (f"/camera/{below}", ("gate", "square", "ring")[row["zone_id"] - 1], t_ns // (10 * NS) * 10)
+            most[key] = max(most.get(key, 0), int(row["inside"]))
+    return [[*key, count] for key, count in sorted(most.items())]
+
+
+def long_tracks(seven: Log) -> Rows:
+    out = []
+    for below, _ in every_channel(seven, TRACKS):
+        for who, track in seven.tracks(below).items():
+            if track.t_ns[-1] - track.t_ns[0] > 2 * NS:
+                steps_m = np.linalg.norm(np.diff(track.xy_m, axis=0), axis=1)
+                out.append([f"/camera/{below}", who, (track.t_ns[-1] - track.t_ns[0]) / NS, steps_m.sum()])
+    return out
+
+
+def every_switch(seven: Log) -> Rows:
+    columns = ("truth_id", "previous_id", "track_id")
+    return [
+        [f"/camera/{below}", *(int(row[name]) for name in columns), t_ns]
+        for below, rows in every_channel(seven, EVENTS)
+        for t_ns, row in rows
+        if row["kind"] == 4
+    ]
+
+
+def joins(seven: Log) -> Rows:
+    columns = ("track_id", "previous_id", "source_id", "probability", "alternative_id")
+    return [
+        [t_ns, *(row[name].item() for name in columns)]
+        for t_ns, row in seven.rows("retracks/decisions", DECISIONS)
+        if row["kind"] == 1
+    ]
+
+
+#: The answers to queries of other pages, by page and a part of the query.
+OTHERS: dict[tuple[str, str], Callable[[Log], Rows]] = {
+    ("README.md", "from tracks group"): ids_by_topic,
+    ("README.md", "log.tables/tracks"): ids_by_topic,
+    ("docs/zones.md", "zone_visits"): visits_by_zone,
+    ("docs/zones.md", "zone_counts"): most_inside,
+    ("docs/troubleshooting.md", "track_summary"): long_tracks,
+    ("docs/results.md", "events"): every_switch,
+    ("docs/results.md", "decisions"): joins,
+    ("docs/tutorial.md", "count(distinct track_id)"): ids_by_topic,
+    ("docs/tutorial.md", "from events"): lambda seven: [
+        [row[4], *row[1:4]] for row in every_switch(seven) if row[0] == "/camera/tracks/events"
+    ],
+}
+
+
+@pytest.mark.parametrize(("page", "part"), OTHERS)
+def test_queries_of_other_pages_give_what_frames_give(seven, page, part):
+    asks = set()
+    for block in pages.blocks(ROOT / page):
+        if block.language == "sql":
+            asks |= {*block.text.split(";")}
+        elif block.language == "sh":
+            asks |= {*re.findall(r'^mcaptrack query \S+ "(.*)"$', block.text, re.M)}
+    (query,) = (query.replace("probability < 0.8", "probability <= 1") for query in asks if part in query)
+    wanted = OTHERS[page, part](seven)
+    assert len(wanted) > 0
+    for row, other in zip(sorted(asked(seven.folder, query)), sorted(wanted), strict=True):
+        assert row == pytest.approx(other)
 
 
 # Python
