@@ -516,16 +516,35 @@ def test_queries_of_other_pages_give_what_frames_give(seven, page, part):
 # Python
 
 
-def test_other_libraries_measure_stays_and_arrivals(seven):
+@pytest.fixture(scope="module")
+def returning(tmp_path_factory) -> Iterator[Log]:
+    """A log of somebody who leaves the rectangle for 3 s and comes back, and of somebody who stays out, at 7 Hz."""
+    folder = tmp_path_factory.mktemp("returning")
+    places = [(0.0 if n < 7 or n > 28 else 5.0, 12.0) for n in range(40)]
+    frames = [Frame(n * NS // 7, n, tracks_at({1: place, 2: (9.0, 12.0)})) for n, place in enumerate(places)]
+    with log.read(
+        write_channels(folder / "a.mcap", {"/camera/truth": (TRACKS, Provenance("ingest", {}), frames)})
+    ) as opened:
+        export(opened, folder / "demo.tables")
+        yield Log(opened, folder)
+
+
+@pytest.mark.parametrize("name", ["seven", "returning"])
+def test_stays_and_arrivals_are_the_same_in_all_libraries(name, request):
+    of = request.getfixturevalue(name)
+    wanted = stays(of), arrivals(of)
+    assert max(visits for _, visits, _ in wanted[0]) == 1 + (name == "returning")
+    for part, rows in zip(("as visits", "as begin"), wanted, strict=True):
+        for row, other in zip(asked(of.folder, the_query("sql.md", part)), rows, strict=True):
+            assert row == pytest.approx(other, abs=0.051)
     for block in pages.blocks(ROOT / "docs" / "sql.md"):
         if block.language == "python":
             names: dict[str, Any] = {}
-            with chdir(seven.folder):
+            with chdir(of.folder):
                 exec(block.text, names)
-            found = [names[name] for name in ("seconds", "begin")]
-            rows = [of.rows() if hasattr(of, "rows") else list(of.items()) for of in found]
-            for of, wanted in zip(rows, (stays(seven), arrivals(seven)), strict=True):
-                assert [(row[0], row[-1]) for row in of] == [(row[0], pytest.approx(row[-1])) for row in wanted]
+            for found, rows in zip((names["seconds"], names["begin"]), wanted, strict=True):
+                pairs = found.rows() if hasattr(found, "rows") else list(found.items())
+                assert pairs == [(row[0], pytest.approx(row[-1])) for row in rows]
 
 
 def test_snippets_of_python_measure_people(seven):
