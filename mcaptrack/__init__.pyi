@@ -1,3 +1,5 @@
+import collections.abc
+
 from mcaptrack.api.calibrating import CalibrateResult as CalibrateResult
 from mcaptrack.api.calibrating import CameraCorrection as CameraCorrection
 from mcaptrack.api.calibrating import calibrate as calibrate
@@ -63,6 +65,9 @@ from mcaptrack.notices import Notice as Notice
 from mcaptrack.training.result import TrainResult as TrainResult
 
 _MODULES: dict[str, str]
+
+def _lazily(package: str, modules: collections.abc.Mapping[str, str]) -> collections.abc.Callable[[str], object]: ...
+
 __all__ = [
     "CalibrateResult",
     "CameraCorrection",

@@ -38,6 +38,7 @@ from mcaptrack.tables import export
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from supervision import Detections
 
 T = TypeVar("T")
 Colour = Literal["bgr", "rgb", "grey"]
@@ -423,7 +424,7 @@ class LogReader:
         with self._now() as opened:
             return fetch_message(opened, row)
 
-    def supervision(self, topic: str) -> Iterator[tuple[int, Any]]:
+    def supervision(self, topic: str) -> Iterator[tuple[int, Detections]]:
         """Return detections or tracks as ``supervision.Detections``, frame by frame.
 
         Parameters

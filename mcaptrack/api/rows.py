@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,6 +43,9 @@ from mcaptrack.sources.own_schemas import (
     derived,
     is_dataclass,
 )
+
+if TYPE_CHECKING:
+    from supervision import Detections
 
 # ``supervision.Detections`` as frames of rows, and back; the package need not be installed to write them.
 #
@@ -135,7 +138,7 @@ def names_of_supervision(detections_: Any) -> dict[int, str]:
     return checked_names({number: name for number, name in out.items() if number != UNKNOWN})
 
 
-def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterator[tuple[int, Any]]:
+def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterator[tuple[int, Detections]]:
     """Yield the time in nanoseconds and the ``supervision.Detections`` of each frame of detections or tracks.
 
     ``names`` are the names of classes by number, for ``data["class_name"]``, if there are others than people. Rows

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, Self, TypeVar
@@ -14,6 +15,8 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 from mcaptrack import __version__
 from mcaptrack.notices import known_code, warn
 
+#: Halves of characters (surrogates).
+_HALVES: Final = re.compile("[\ud800-\udfff]")
 T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
 #: ``transform`` of channels that were ingested, of views, of scenes, and of corrected ground planes.
@@ -153,6 +156,9 @@ def _read(text: str, kind: type[T]) -> T:
         return kind()
     try:
         value = json.loads(text)
+        if "\\ud" in text.lower():  # half a character, which no table can hold, stays as it is written
+            whole = json.dumps(value, ensure_ascii=False)
+            value = json.loads(_HALVES.sub(lambda half: f"\\\\u{ord(half[0]):x}", whole))
     except (ValueError, RecursionError):
         return kind()
     return value if isinstance(value, kind) else kind()
