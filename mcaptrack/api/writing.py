@@ -105,13 +105,18 @@ def _described(column: Column) -> str:
 
 def _program(by: str | None) -> str:
     """Return the name of the program that writes: as it is given, or that of the running one, without its place."""
-    if by is not None:
-        if not isinstance(by, str) or not by.strip() or not by.isprintable() or len(by) > _LONGEST_NAME:
-            raise McaptrackError(
-                f"`by=` is the name of a program, such as 'my_tool 1.2', of at most {_LONGEST_NAME} characters, not "
-                f"{by!r:.60}"
-            )
-        return by
+    if by is None:
+        return _running_program()
+    if not isinstance(by, str) or not by.strip() or not by.isprintable() or len(by) > _LONGEST_NAME:
+        raise McaptrackError(
+            f"`by=` is the name of a program, such as 'my_tool 1.2', of at most {_LONGEST_NAME} characters, not "
+            f"{by!r:.60}"
+        )
+    return by
+
+
+def _running_program() -> str:
+    """Return the name of the running program, with the version of its package."""
     main = sys.modules.get("__main__")
     spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
     if spec is not None:
@@ -151,12 +156,17 @@ def _topic(opened: logs.Log, topic: str) -> str:
         raise McaptrackError(f"{topic!r:.80} is no topic; give one such as detections or /camera/detections")
     if len(name.encode()) > _LONGEST:
         raise McaptrackError(f"{topic:.80}... is longer than {_LONGEST} bytes; give the channel a shorter topic")
-    above, _, last = name.rpartition("/")
-    is_above_usual = above in opened.channels or above.endswith(tuple(f"/{end}" for end in USUAL))
-    is_beside = last == "view" or (last in _BESIDE and is_above_usual)
-    if is_beside or "/view/" in name or name.endswith(tuple(f"/{end}" for end in USUAL if end not in _HOLDS)):
+    if _is_reserved(opened, name):
         raise McaptrackError(f"{name} is a name of what stages make or of pictures; write to another, such as {_SUCH}")
     return name
+
+
+def _is_reserved(opened: logs.Log, name: str) -> bool:
+    """Return whether a topic is that of pictures, of results of stages, or of what stands beside a channel."""
+    above, _, last = name.rpartition("/")
+    is_above_usual = above in opened.channels or above.endswith(tuple(f"/{end}" for end in USUAL))
+    is_beside = last == "view" or "/view/" in name or (last in _BESIDE and is_above_usual)
+    return is_beside or name.endswith(tuple(f"/{end}" for end in USUAL if end not in _HOLDS))
 
 
 def _refuse_to_replace(opened: logs.Log, name: str, schema: Schema, replace: bool) -> None:
