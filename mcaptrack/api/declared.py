@@ -223,7 +223,8 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
     """The type of one value of an option, and whether it may have several.
 
     Python takes more than a command line can say: of ``str | Sequence[str]`` an option takes several texts, of
-    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path, of ``Mapping[str, float]`` texts such as a=1.
+    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path, of ``Mapping[str, float]`` texts such as a=1, of
+    ``Literal["a", "b"] | str`` (names, and those of installed packages) a text.
     """
     parts = _parts(hint)
     if any(get_origin(part) is Mapping for part in parts) and str not in parts:
@@ -233,8 +234,7 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
         return on_command_line(several[0])[0], True
     if any(get_origin(part) is os.PathLike for part in parts):
         return Path, False
-    kind = next((part for part in parts if get_origin(part) is Literal), None)
-    if kind is not None:
+    if any(get_origin(part) is Literal for part in parts) and str not in parts:
         names = tuple(name for part in parts if get_origin(part) is Literal for name in get_args(part))
         return Literal[names], False
     return next(
@@ -292,6 +292,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
                 continue
             kinds = _kinds(function).get(name, ())
             choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+            choices = [] if str in kinds else choices
             if "" in map(_name_of, _paths_in(value, kinds)):
                 raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
             if choices:
@@ -422,6 +423,7 @@ def _name_of(path: Any) -> Any:
 def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
     """Raise McaptrackError for a value of another type. Types that aren't in ``_TYPES`` are not checked here."""
     types = [get_origin(kind) or kind for kind in kinds if kind is not type(None)]
+    types = [kind for kind in types if kind is not Literal]
     if not types or not set(types) <= set(_TYPES) or isinstance(value, tuple(types)):
         return
     if value is None and type(None) in kinds:

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import operator
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
 
 from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
-from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, no_progress, output
+from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, named, no_progress, output
 from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, place_of
-from mcaptrack.location import Location
+from mcaptrack.files import is_same_file, place_of, publish, publish_folder, refuse_overwrite
+from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice, warn
 
 if TYPE_CHECKING:
+    from mcaptrack.api.reading import LogReader
+    from mcaptrack.registry import Entry
     from mcaptrack.tables.rosbag2 import Storage
 
 #: ROS 2 bags by the format of ``export``.
 _BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
+_BUILT_IN = (*get_args(TableFormat), *get_args(BagFormat), *get_args(ExchangeFormat))
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,9 @@ def export(
     log: EachLog,
     output: Annotated[PathLike | None, output("LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log")] = None,
     *,
-    form: Annotated[TableFormat | BagFormat | ExchangeFormat, Option(FILES, flag="format")] = "parquet",
+    form: Annotated[
+        TableFormat | BagFormat | ExchangeFormat | str, named("exporter", _BUILT_IN, FILES, "format")
+    ] = "parquet",
     topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
     blobs: Annotated[bool, Option(FILES)] = False,
     force: Force = False,
@@ -90,7 +97,8 @@ def export(
         working folder.
     form : {"parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3", "mot", "kitti", "coco", "cvat", ...}
         Tables (parquet, arrow, csv, jsonl), a ROS 2 bag, or a file with the boxes of one channel: MOTChallenge, KITTI
-        tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun.
+        tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun; or the format of an installed
+        package, or module:Class.
 
         "rosbag2" is a bag in MCAP, "rosbag2-sqlite3" one in a database.
     topic : str or sequence of str, optional
@@ -136,6 +144,8 @@ def export(
         )
     if form in _BAGS:
         return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
+    if form not in get_args(TableFormat):
+        return _export_by_package(path, optional_path(output), form, topic, blobs, force)
     folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
@@ -202,6 +212,73 @@ def _export_file(
     return ExportResult(
         path, target, {done.topic: done.rows}, (done.topic,), tuple(dict.fromkeys(warnings)), files=(target,)
     )
+
+
+class ExporterOfPackage(NamedTuple):
+    """A format of another package, as the registry found it, its object, and what its class says of it."""
+
+    entry: Entry
+    exporter: Any
+    end: str
+    is_folder: bool
+
+
+def exporter_of_package(form: str) -> ExporterOfPackage | None:
+    """The format of another package that has this name; None for built-in ones.
+
+    Raises McaptrackError if there is none, or if it can't be used.
+    """
+    from mcaptrack.registry import find
+
+    if form in _BUILT_IN:
+        return None
+    entry = find("exporter", form)
+    exporter = entry.made("write")
+    end = getattr(exporter, "end", f".{entry.name.rpartition(':')[2].lower()}")
+    if not isinstance(end, str) or not re.fullmatch(r"(\.[\w-]+)+", end):
+        raise McaptrackError(
+            f"{entry} has end = {end!r:.40}; it is the end of the name of a file, such as '.speeds.csv'"
+        )
+    return ExporterOfPackage(entry, exporter, end, bool(getattr(exporter, "is_folder", False)))
+
+
+def _export_by_package(
+    path: Location, output: Path | None, form: str, topic: str | Sequence[str] | None, blobs: bool, force: bool
+) -> ExportResult:
+    """Write a log by the exporter of another package."""
+    from mcaptrack.api.reading import LogReader
+
+    with warnings_about(path) as warnings:
+        by = exporter_of_package(form)
+        assert by is not None
+        warn_unused(f"the {by.entry} has no tables of channels", topic=bool(topic), blobs=blobs)
+        target = output or local_name(path, by.end)
+        if by.is_folder and target.exists() and not force:
+            raise McaptrackError(f"{target} exists; `force=True` replaces it")
+        if by.is_folder and target.exists() and not target.is_dir():
+            raise McaptrackError(f"{target} is a file; {by.entry} writes a folder")
+        if not by.is_folder:
+            refuse_overwrite(target, force)
+        with LogReader(path) as recording:
+            if any(is_same_file(part.path, target) for part in recording._log.parts):
+                raise McaptrackError(f"{target} is a log; give the file another name with `output=`")
+            with (publish_folder if by.is_folder else publish)(target) as part:
+                rows = write_by_package(by, recording, part)
+    return ExportResult(path, target, rows, tuple(rows), tuple(dict.fromkeys(warnings)), files=(target,))
+
+
+def write_by_package(by: ExporterOfPackage, recording: LogReader, part: Path) -> dict[str, int]:
+    """Let an exporter write a file or folder; returns its numbers of rows. Raises McaptrackError for what is wrong."""
+    from mcaptrack.registry import blamed
+
+    with blamed(by.entry, "failed"):
+        rows = by.exporter.write(recording, part)
+    if not (part.is_dir() if by.is_folder else part.is_file()):
+        raise McaptrackError(
+            f"{by.entry} wrote no {'folder' if by.is_folder else 'file'}; it has to make the path it gets"
+        )
+    with blamed(by.entry, "gave no numbers of rows by the names of tables or channels"):
+        return {str(name): operator.index(count) for name, count in dict(rows).items()}
 
 
 def refuse_same_tables(logs_to_export: Sequence[Location], output: Path | None) -> None:

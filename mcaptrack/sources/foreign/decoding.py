@@ -30,6 +30,7 @@ Unpack = Callable[[bytes], Any]
 ENCODINGS: Final = ("protobuf", "json", "ros1", "cdr")
 #: Longer definitions are refused, because parsing them takes long.
 _MAX_DEFINITION: Final = 2**20
+_MAX_DESCRIPTOR: Final = 4 * 2**20
 _ROS_NAME: Final = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)", re.ASCII)
 _IDL_HEAD: Final = re.compile(r"^=+\r?\nIDL: .*\r?\n", re.MULTILINE)
 
@@ -81,6 +82,8 @@ def unpacker(kind: MessageType) -> Unpack:
     """A function that decodes messages of this type. Raises McaptrackError if the type is not supported."""
     if kind.encoding == "protobuf" and kind.name.startswith("foxglove."):
         return lambda payload: foxglove.unpack(kind.name, payload)
+    if kind.encoding == "protobuf":
+        return protobuf_unpacker(kind)
     if kind.encoding == "json":
         return lambda payload: json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
     if kind.encoding in ("ros1", "cdr"):
@@ -88,6 +91,27 @@ def unpacker(kind: MessageType) -> Unpack:
     raise McaptrackError(
         f"{kind.name} in the encoding {kind.encoding or 'unknown'!r} is not read; {', '.join(ENCODINGS)} are"
     )
+
+
+def protobuf_unpacker(kind: MessageType) -> Unpack:
+    """A decoder for protobuf, by the definition in the log."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
+
+    try:
+        if len(kind.schema) > _MAX_DESCRIPTOR:
+            raise ValueError(f"it has {len(kind.schema)} bytes")
+        pool = DescriptorPool()
+        for file in FileDescriptorSet.FromString(kind.schema).file:
+            pool.Add(file)
+        message_class: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
+    except Exception as error:  # a third-party parser that raises various exceptions
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise McaptrackError(
+            f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
+        ) from None
+    return message_class.FromString  # type: ignore[no-any-return]
 
 
 def _ros_unpacker(kind: MessageType) -> Unpack:

@@ -1,0 +1,241 @@
+"""Label formats of other packages (``contracts.LabelFormat``): which file is of which, and their boxes, checked.
+
+Letters: N rows, F frames.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final, NamedTuple, get_args
+
+import numpy as np
+
+from mcaptrack.choices import Role
+from mcaptrack.contracts import LabelBoxes, Space
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import refuse_special
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.notices import warn
+from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
+from mcaptrack.schema.classes import PERSON, is_person
+from mcaptrack.schema.provenance import Plugin
+from mcaptrack.sources.ingest.labels.content import (
+    NO_CLASS,
+    NO_ID,
+    BoxRows3D,
+    Labels,
+    WantedClasses,
+    numbered,
+)
+
+_KIND: Final = "label_format"
+_COLUMNS: Final = {"picture": 4, "ground": 7}
+
+
+class FormatOfPackage(NamedTuple):
+    """A format, as the registry found it, and its object."""
+
+    entry: Entry
+    format: Any
+    space: Space
+
+    @property
+    def plugin(self) -> Plugin:
+        """What the provenance of a channel says of it."""
+        return Plugin(self.entry.name, self.entry.implementation, self.entry.distribution, self.entry.version)
+
+    def recognises(self, path: Path) -> bool:
+        """Whether a file is of this format, as far as it can tell."""
+        if not hasattr(self.format, "recognises"):
+            return False
+        with blamed(self.entry, f"failed to look at {path}"):
+            return bool(self.format.recognises(path))
+
+    def boxes(self, path: Path) -> LabelBoxes:
+        """The boxes of a file. Raises McaptrackError, with the format, if it can't be read."""
+        refuse_special(path)
+        with blamed(self.entry, f"can't read {path}"):
+            boxes = self.format.read(path)
+        if not isinstance(boxes, LabelBoxes):
+            raise McaptrackError(f"{self.entry} gave a {type(boxes).__name__} of {path}; read has to give LabelBoxes")
+        return boxes
+
+    def labels(self, path: Path, role: Role, wanted: WantedClasses) -> Labels:
+        """The boxes of a file in pictures, checked as those of all formats are."""
+        columns = self._columns(path)
+        with self._named():
+            rows = Labels(
+                *columns.in_table(self.entry.name),
+                labelled=columns.labelled, first_frame=columns.first_frame, plugin=self.plugin, times_s=columns.times_s,
+            )  # fmt: skip
+            names = _numbers_of(columns.names)
+            rows.class_id = np.array([*names, NO_CLASS])[rows.class_id] if names else rows.class_id
+            return rows.settled(role, wanted, dict(zip(names, columns.names, strict=True)) or None)
+
+    def rows_3d(self, path: Path, role: Role) -> BoxRows3D:
+        """The boxes of a file on the ground, checked as those of all formats are."""
+        columns = self._columns(path)
+        is_timed = columns.times_s is not None
+        labelled = columns.labelled
+        if columns.times_s is not None:
+            times = np.rint(columns.times_s * NS_PER_S).astype(np.int64)
+            columns, labelled = columns._replace(frame=times[columns.frame]), times[labelled]
+        with self._named():
+            rows = BoxRows3D(
+                *columns.in_table(self.entry.name),
+                names=columns.names, labelled=np.union1d(labelled, columns.frame), is_timed=is_timed,
+                frame_id=columns.frame_id, plugin=self.plugin,
+            )  # fmt: skip
+            rows.check(role)
+        return rows
+
+    def _named(self) -> Any:
+        return blamed(self.entry, "gave boxes that can't be labels")
+
+    def _columns(self, path: Path) -> _Columns:
+        given = self.boxes(path)
+        with blamed(self.entry, f"gave what are no boxes of {path}"):
+            return _columns_of(path, given, self.space)
+
+
+class _Columns(NamedTuple):
+    """``LabelBoxes`` as arrays. ``frame`` (N,) and ``labelled`` (F,) are numbers of frames, or places in ``times_s``.
+    ``kind`` (N,) are places in ``names``, or -1.
+    """
+
+    path: Path
+    boxes: Floats
+    frame: Ints
+    id: Ints
+    kind: Ints
+    names: list[str]
+    score: Floats
+    labelled: Ints
+    times_s: Floats | None
+    first_frame: int
+    frame_id: str
+
+    def at(self, row: int) -> str:
+        """The place of a row in messages."""
+        return f"{self.path}: box {row + 1}"
+
+    def in_table(self, name: str) -> tuple[Any, ...]:
+        """The first fields of a ``BoxTable`` of the format of this name."""
+        return self.path, name, self.at, self.frame, self.id, self.boxes, self.score, self.kind
+
+
+def _columns_of(path: Path, given: LabelBoxes, space: Space) -> _Columns:
+    """Raise ValueError for what has another type, shape or range."""
+    width = _COLUMNS[space]
+    boxes = np.asarray(given.boxes, np.float64)
+    boxes = boxes.reshape(0, width) if not boxes.size else boxes
+    if boxes.ndim != 2 or boxes.shape[1] != width:
+        raise ValueError(f"boxes of shape {boxes.shape}; with space = {space!r} they are (N, {width})")
+    count = len(boxes)
+    if (given.frame is None) == (given.t_s is None):
+        raise ValueError("frame and t_s; one of the two says which picture a box is of")
+    labelled = np.asarray([] if given.labelled is None else given.labelled, np.float64).reshape(-1)
+    frames = _numbers("frame" if given.t_s is None else "t_s", given.frame if given.t_s is None else given.t_s, count)
+    if not np.isfinite(labelled).all():
+        raise ValueError("labelled frames that are not finite")
+    times = None
+    if given.t_s is None:
+        for name, values in (("frame", frames), ("labelled", labelled)):
+            if (values != np.rint(values)).any():
+                raise ValueError(
+                    f"{name} with {values[values != np.rint(values)][0]:g}, which is no number of a picture"
+                )
+        frame, described = frames.astype(np.int64), np.unique(labelled).astype(np.int64)
+    else:
+        if (frames < 0).any() or (frames > LAST_NS / NS_PER_S).any():
+            raise ValueError("a t_s that is no number of seconds from 0 to the year 2262")
+        times, places = np.unique(np.concatenate([frames, labelled]), return_inverse=True)
+        frame, described = places[:count], np.unique(places[count:])
+    kind, names = _classes(given, count)
+    score = np.full(count, np.nan) if given.score is None else np.asarray(given.score, np.float64)
+    if score.shape != (count,):
+        raise ValueError(f"score of shape {score.shape} for {count} boxes")
+    first = given.first_frame
+    if isinstance(first, bool) or not isinstance(first, int | np.integer):
+        raise ValueError(f"first_frame={first!r:.40}, which is no whole number")
+    return _Columns(
+        path, boxes, frame, _ids(given, count), kind, names, score, described, times, int(first), str(given.frame_id)
+    )
+
+
+def _numbers(name: str, values: Any, count: int) -> Floats:
+    array = np.asarray(values, np.float64)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} of shape {array.shape} for {count} boxes, or with numbers that are not finite")
+    return array
+
+
+def _ids(given: LabelBoxes, count: int) -> Ints:
+    if given.track_id is None:
+        return np.full(count, NO_ID)
+    ids = np.asarray(given.track_id)
+    if ids.shape != (count,):
+        raise ValueError(f"track_id of shape {ids.shape} for {count} boxes")
+    if ids.dtype.kind in "iu":
+        return ids.astype(np.int64)
+    if ids.dtype.kind not in "UO" or not all(isinstance(text, str) for text in ids.tolist()):
+        raise ValueError(f"track_id of type {ids.dtype}; ids are whole numbers or texts")
+    has_id = ids.astype(str) != ""
+    out = np.full(count, NO_ID)
+    out[has_id] = numbered(ids[has_id].tolist())[0]
+    return out
+
+
+def _classes(given: LabelBoxes, count: int) -> tuple[Ints, list[str]]:
+    """The place of the class of each box (N,) among the names, or -1; and the names, in alphabetical order."""
+    if given.class_name is None:
+        return np.full(count, NO_CLASS), []
+    texts = list(given.class_name)
+    if isinstance(given.class_name, str) or len(texts) != count or not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"class_name that are not {count} texts")
+    names = sorted({text for text in texts if text.strip()})
+    places = {name: place for place, name in enumerate(names)}
+    return np.array([places.get(text, NO_CLASS) for text in texts], np.int64), names
+
+
+def _numbers_of(names: list[str]) -> list[int]:
+    """The class ids of names: people are 1, the others follow in their order."""
+    rest = iter(range(PERSON + 1, PERSON + 1 + len(names)))
+    return [PERSON if is_person(name) else next(rest) for name in names]
+
+
+def format_of_package(name: str) -> FormatOfPackage | None:
+    """The format of another package that has this name; None for "auto" and built-in ones.
+
+    Raises McaptrackError if there is none, or if it can't be used.
+    """
+    return None if name == "auto" or name in BUILT_IN[_KIND] else _made(find(_KIND, name))
+
+
+@lru_cache(maxsize=16)
+def _made(entry: Entry) -> FormatOfPackage:
+    made = entry.made("read")
+    space = getattr(made, "space", "picture")
+    if space not in get_args(Space):
+        raise McaptrackError(f"{entry} has space = {space!r:.40}; it is 'picture' or 'ground'")
+    return FormatOfPackage(entry, made, space)
+
+
+def recognised(path: Path) -> FormatOfPackage | None:
+    """The format of another package that a file is of, by what these say; one that can't say is named in a warning.
+
+    Raises McaptrackError if several say so.
+    """
+    found: list[FormatOfPackage] = []
+    for name in others(_KIND):
+        try:
+            made = format_of_package(name)
+            found += [made] if made is not None and made.recognises(path) else []
+        except McaptrackError as error:
+            warn(str(error), "other")
+    if len(found) > 1:
+        names = " and ".join(str(made.entry) for made in found)
+        raise McaptrackError(f"{path} is of the {names}; choose one with `label_format=`")
+    return found[0] if found else None
