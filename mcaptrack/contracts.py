@@ -12,7 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, get_args
+
+from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -23,6 +25,15 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 #: Where boxes are: in pictures, in pixels, or on the ground, in metres.
 Space = Literal["picture", "ground"]
+
+
+def space_of(entry: object, made: object) -> Space:
+    """The class attribute ``space`` of a format or reader. Raises McaptrackError, with the entry, if it is no space."""
+    space: Any = getattr(made, "space", "picture")
+    if space not in get_args(Space):
+        raise McaptrackError(f"{entry} has space = {space!r:.40}; it is 'picture' or 'ground'")
+    return space  # type: ignore[no-any-return]
+
 
 #: A velocity or size that isn't stated.
 UNKNOWN_VECTOR: Vector = (nan, nan, nan)

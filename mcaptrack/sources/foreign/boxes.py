@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
 from math import cos, isfinite, isnan, nan, sin
-from typing import Any, Final, NamedTuple, get_args
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.contracts import UNKNOWN_VECTOR, Box, Box3d, Quaternion, Space, Vector
+from mcaptrack.contracts import UNKNOWN_VECTOR, Box, Box3d, Quaternion, Space, Vector, space_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.registry.guard import Guard
@@ -617,9 +617,7 @@ def reader_of(schema_name: str) -> Reader | None:
 @lru_cache(maxsize=64)
 def _of_package(entry: Entry) -> Reader:
     reader, guard = entry.made("read"), Guard(str(entry))
-    space = getattr(reader, "space", "picture")
-    if space not in get_args(Space):
-        raise McaptrackError(f"{entry} has space = {space!r:.40}; it is 'picture' or 'ground'")
+    space = space_of(entry, reader)
 
     def read(message: Any) -> list[Box] | Message3d:
         with blamed(entry, "failed", guard):
@@ -632,7 +630,7 @@ def _of_package(entry: Entry) -> Reader:
 def checked_boxes(entry: Entry, boxes: list[Any]) -> list[Box]:
     """The boxes in a picture that a reader gave, as numbers of Python. Raises McaptrackError for what is none."""
     with blamed(entry, "gave what is no Box"):
-        out = [Box(*map(float, box[:5]), text(box.class_name)) for box in boxes]
+        out = [Box(float(x), float(y), float(w), float(h), number(s), text(name)) for x, y, w, h, s, name in boxes]
         for x, y, w, h, *_ in out:
             _check_box(x, y, w, h)
     return out

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple, get_args
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.choices import Role
-from mcaptrack.contracts import LabelBoxes, Space
+from mcaptrack.contracts import LabelBoxes, Space, space_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Floats, Ints
@@ -64,30 +64,28 @@ class FormatOfPackage(NamedTuple):
 
     def labels(self, path: Path, role: Role, wanted: WantedClasses) -> Labels:
         """The boxes of a file in pictures, checked as those of all formats are."""
-        columns = self._columns(path)
+        given = self._columns(path)
+        rows = Labels(
+            path, self.entry.name, given.at, given.frame, given.id, given.boxes, given.score, given.kind,
+            labelled=given.labelled, first_frame=given.first_frame, plugin=self.plugin, times_s=given.times_s,
+        )  # fmt: skip
+        numbers = _numbers_of(given.names)
+        rows.class_id = np.array([*numbers, NO_CLASS])[given.kind]
         with self._named():
-            rows = Labels(
-                *columns.in_table(self.entry.name),
-                labelled=columns.labelled, first_frame=columns.first_frame, plugin=self.plugin, times_s=columns.times_s,
-            )  # fmt: skip
-            names = _numbers_of(columns.names)
-            rows.class_id = np.array([*names, NO_CLASS])[rows.class_id] if names else rows.class_id
-            return rows.settled(role, wanted, dict(zip(names, columns.names, strict=True)) or None)
+            return rows.settled(role, wanted, dict(zip(numbers, given.names, strict=True)) or None)
 
     def rows_3d(self, path: Path, role: Role) -> BoxRows3D:
         """The boxes of a file on the ground, checked as those of all formats are."""
-        columns = self._columns(path)
-        is_timed = columns.times_s is not None
-        labelled = columns.labelled
-        if columns.times_s is not None:
-            times = np.rint(columns.times_s * NS_PER_S).astype(np.int64)
-            columns, labelled = columns._replace(frame=times[columns.frame]), times[labelled]
+        given = self._columns(path)
+        if given.times_s is not None:
+            times = np.rint(given.times_s * NS_PER_S).astype(np.int64)
+            given = given._replace(frame=times[given.frame], labelled=times[given.labelled])
+        rows = BoxRows3D(
+            path, self.entry.name, given.at, given.frame, given.id, given.boxes, given.score, given.kind,
+            labelled=np.union1d(given.labelled, given.frame), plugin=self.plugin, names=given.names,
+            is_timed=given.times_s is not None, frame_id=given.frame_id,
+        )  # fmt: skip
         with self._named():
-            rows = BoxRows3D(
-                *columns.in_table(self.entry.name),
-                names=columns.names, labelled=np.union1d(labelled, columns.frame), is_timed=is_timed,
-                frame_id=columns.frame_id, plugin=self.plugin,
-            )  # fmt: skip
             rows.check(role)
         return rows
 
@@ -120,10 +118,6 @@ class _Columns(NamedTuple):
     def at(self, row: int) -> str:
         """The place of a row in messages."""
         return f"{self.path}: box {row + 1}"
-
-    def in_table(self, name: str) -> tuple[Any, ...]:
-        """The first fields of a ``BoxTable`` of the format of this name."""
-        return self.path, name, self.at, self.frame, self.id, self.boxes, self.score, self.kind
 
 
 def _columns_of(path: Path, given: LabelBoxes, space: Space) -> _Columns:
@@ -217,10 +211,7 @@ def format_of_package(name: str) -> FormatOfPackage | None:
 @lru_cache(maxsize=16)
 def _made(entry: Entry) -> FormatOfPackage:
     made = entry.made("read")
-    space = getattr(made, "space", "picture")
-    if space not in get_args(Space):
-        raise McaptrackError(f"{entry} has space = {space!r:.40}; it is 'picture' or 'ground'")
-    return FormatOfPackage(entry, made, space)
+    return FormatOfPackage(entry, made, space_of(entry, made))
 
 
 def recognised(path: Path) -> FormatOfPackage | None:
