@@ -233,7 +233,11 @@ def exporter_of_package(form: str) -> ExporterOfPackage | None:
     if form in _BUILT_IN:
         return None
     entry = find("exporter", form)
-    exporter = entry.made("write")
+    return exporter_for(entry, entry.made("write"))
+
+
+def exporter_for(entry: Entry, exporter: Any) -> ExporterOfPackage:
+    """An exporter with what its class says. Raises McaptrackError for what it can't say."""
     end = getattr(exporter, "end", f".{entry.name.rpartition(':')[2].lower()}")
     if not isinstance(end, str) or not re.fullmatch(r"(\.[\w-]+)+", end):
         raise McaptrackError(

@@ -169,8 +169,7 @@ class Entry:
 
     def __str__(self) -> str:
         """Its name in messages: ``tracker nearest (my-package 1.0)``."""
-        package = f"{self.distribution} {self.version}".strip()
-        return f"{in_words(self.kind)} {self.name}" + (f" ({package})" if package and not self.is_built_in else "")
+        return titled(self.kind, self.name, ("", "") if self.is_built_in else (self.distribution, self.version))
 
     def made(self, *methods: str) -> Any:
         """An object of the class, with these methods. Raises McaptrackError if it can't be made, or lacks one."""
@@ -187,6 +186,11 @@ def in_words(kind: str) -> str:
     return kind.replace("_", " ")
 
 
+def titled(kind: str, name: str, package: tuple[str, str] = ("", "")) -> str:
+    """An entry in messages: ``tracker nearest (my-package 1.0)``, by its kind, its name, and package and version."""
+    return f"{in_words(kind)} {name}" + (f" ({' '.join(package).strip()})" if any(package) else "")
+
+
 def _group(kind: str) -> str:
     """The group of entry points of a kind."""
     return f"{_OWN}.{kind}s"
@@ -194,7 +198,12 @@ def _group(kind: str) -> str:
 
 def names(kind: Kind) -> tuple[str, ...]:
     """All names of a kind: built-in ones, then those of entry points. Imports nothing."""
-    return (*BUILT_IN[kind], *sorted({point.name for point in entry_points(_group(kind))} - set(BUILT_IN[kind])))
+    return (*BUILT_IN[kind], *sorted({point.name for point in points(kind)}))
+
+
+def points(kind: Kind) -> list[Point]:
+    """The entry points of a kind; those with the name of a built-in entry don't count."""
+    return [point for point in entry_points(_group(kind)) if point.name not in BUILT_IN[kind]]
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:
@@ -224,23 +233,22 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     'mcaptrack.transforms.sort.ocsort:OcSort'
     """
     if name in BUILT_IN[kind]:
-        implementation = _load(f"{in_words(kind)} {name}", BUILT_IN[kind][name])
+        implementation = _load(titled(kind, name), BUILT_IN[kind][name])
         return Entry(name, kind, implementation, implementation.__module__, _OWN, __version__)
     if ":" in name:
         with _working_folder():
-            implementation = _load(f"{in_words(kind)} {name}", name)
+            implementation = _load(titled(kind, name), name)
         return Entry(name, kind, implementation, implementation.__module__, *distribution_of(implementation.__module__))
-    points = [point for point in entry_points(_group(kind)) if point.name == name]
-    if not points:
+    named = [point for point in points(kind) if point.name == name]
+    if not named:
         raise McaptrackError(_unknown(kind, name))
-    points = [point for point in points if point.package[0] == distribution] or points
-    if len(points) > 1:
-        values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in points))
-        raise McaptrackError(
-            f"several installed packages have a {in_words(kind)} {name}: {values}; name one as module:Class"
-        )
-    package = points[0].package
-    implementation = _load(f"{in_words(kind)} {name} ({' '.join(package)})", points[0].value)
+    named = [point for point in named if point.package[0] == distribution] or named
+    if len(named) > 1:
+        values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))
+        what = titled(kind, name)
+        raise McaptrackError(f"several installed packages have a {what}: {values}; name one as module:Class")
+    package = named[0].package
+    implementation = _load(titled(kind, name, package), named[0].value)
     return Entry(name, kind, implementation, implementation.__module__, *package)
 
 

@@ -410,6 +410,11 @@ class Labels(BoxTable):
         if parts:
             self.doubt(f": of {len(self.boxes)} boxes {' and '.join(parts)}; they stay as they are")
 
+    def refuse_repeated_ids(self) -> None:
+        """Raise McaptrackError if an id appears twice in a frame."""
+        if self.has_ids and (row := self.repeated_id()) >= 0:
+            raise McaptrackError(f"{self.path}: id {self.id[row]} appears twice in frame {self.frame[row]}")
+
     def fit(self, size: tuple[int, int]) -> None:
         """Fit boxes to pictures of a size in pixels: shares of it become pixels, and boxes outside of it a doubt."""
         if self.is_normalised and self.boxes is not None:

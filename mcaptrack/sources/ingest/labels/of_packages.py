@@ -22,6 +22,7 @@ from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources.ingest.labels.content import (
+    MAX_FRAME,
     NO_CLASS,
     NO_ID,
     BoxRows3D,
@@ -72,7 +73,10 @@ class FormatOfPackage(NamedTuple):
         numbers = _numbers_of(given.names)
         rows.class_id = np.array([*numbers, NO_CLASS])[given.kind]
         with self._named():
-            return rows.settled(role, wanted, dict(zip(numbers, given.names, strict=True)) or None)
+            settled = rows.settled(role, wanted, dict(zip(numbers, given.names, strict=True)) or None)
+            if role != "detections":
+                settled.refuse_repeated_ids()
+        return settled
 
     def rows_3d(self, path: Path, role: Role) -> BoxRows3D:
         """The boxes of a file on the ground, checked as those of all formats are."""
@@ -134,17 +138,16 @@ def _columns_of(path: Path, given: LabelBoxes, space: Space) -> _Columns:
     frames = _numbers("frame" if given.t_s is None else "t_s", given.frame if given.t_s is None else given.t_s, count)
     if not np.isfinite(labelled).all():
         raise ValueError("labelled frames that are not finite")
+    most = MAX_FRAME if given.t_s is None else LAST_NS // NS_PER_S
+    for name, values in (("frame" if given.t_s is None else "t_s", frames), ("labelled", labelled)):
+        wrong = (values < 0) | (values > most) | ((values != np.rint(values)) & (given.t_s is None))
+        if wrong.any():
+            what = "picture" if given.t_s is None else "second from 0 to the year 2262"
+            raise ValueError(f"{name} with {values[wrong][0]:g}, which is no number of a {what}")
     times = None
     if given.t_s is None:
-        for name, values in (("frame", frames), ("labelled", labelled)):
-            if (values != np.rint(values)).any():
-                raise ValueError(
-                    f"{name} with {values[values != np.rint(values)][0]:g}, which is no number of a picture"
-                )
         frame, described = frames.astype(np.int64), np.unique(labelled).astype(np.int64)
     else:
-        if (frames < 0).any() or (frames > LAST_NS / NS_PER_S).any():
-            raise ValueError("a t_s that is no number of seconds from 0 to the year 2262")
         times, places = np.unique(np.concatenate([frames, labelled]), return_inverse=True)
         frame, described = places[:count], np.unique(places[count:])
     kind, names = _classes(given, count)
@@ -167,7 +170,7 @@ def _numbers(name: str, values: Any, count: int) -> Floats:
 
 
 def _ids(given: LabelBoxes, count: int) -> Ints:
-    if given.track_id is None:
+    if given.track_id is None or not count:
         return np.full(count, NO_ID)
     ids = np.asarray(given.track_id)
     if ids.shape != (count,):

@@ -119,8 +119,8 @@ def read_labels(
         labels = _read_in_parts(path, label_format, role, wanted) if label_format in _FORMATS else None
     if labels is None:
         labels = _read(path, label_format, role, columns or {}, wanted)
-        if labels.has_ids and role != "detections":
-            refuse_repeated_ids(labels)
+        if role != "detections":
+            labels.refuse_repeated_ids()
         labels = in_order(labels, labels.has_ids)
     if first_frame is not None:
         labels.first_frame = first_frame
@@ -207,12 +207,6 @@ def _has_other_columns(path: Path, number: int, line: str) -> bool:
     except McaptrackError:
         return False
     return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
-
-
-def refuse_repeated_ids(labels: Labels) -> None:
-    """Raise McaptrackError if an id appears twice in a frame."""
-    if (row := labels.repeated_id()) >= 0:
-        raise McaptrackError(f"{labels.path}: id {labels.id[row]} appears twice in frame {labels.frame[row]}")
 
 
 def read_homography(path: Path) -> tuple[float, ...]:
@@ -327,7 +321,7 @@ def _read_in_parts(path: Path, name: Format, role: Role, wanted: WantedClasses) 
     )  # fmt: skip
     if has_ids and role != "detections":
         for part in out.parts:
-            refuse_repeated_ids(part())
+            part().refuse_repeated_ids()
     return out
 
 
