@@ -1,4 +1,4 @@
-"""What label formats, readers of messages and exporters of other packages are, and the types that they give.
+"""Contracts of label formats, readers of messages and exporters of other packages, and the types that they give.
 
 Each is a class that is made without arguments. Detectors, trackers and so on are in ``mcaptrack.transforms.protocol``,
 predictors in ``mcaptrack.predictors.forecast``; a command is a function that ``mcaptrack.api.declared`` declares.
@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from mcaptrack.errors import McaptrackError
 
@@ -23,16 +23,17 @@ if TYPE_CHECKING:
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-#: Where boxes are: in pictures, in pixels, or on the ground, in metres.
-Space = Literal["picture", "ground"]
 
 
-def space_of(entry: object, made: object) -> Space:
-    """The class attribute ``space`` of a format or reader. Raises McaptrackError, with the entry, if it is no space."""
-    space: Any = getattr(made, "space", "picture")
-    if space not in get_args(Space):
-        raise McaptrackError(f"{entry} has space = {space!r:.40}; it is 'picture' or 'ground'")
-    return space  # type: ignore[no-any-return]
+def is_in_space(entry: object, made: object) -> bool:
+    """Whether a format or reader gives boxes in space, in metres, by its class attribute ``in_space``.
+
+    Raises McaptrackError, with the entry, if that is neither True nor False.
+    """
+    in_space = getattr(made, "in_space", False)
+    if not isinstance(in_space, bool):
+        raise McaptrackError(f"{entry} has in_space = {in_space!r:.40}; it is True or False")
+    return in_space
 
 
 #: A velocity or size that isn't stated.
@@ -46,7 +47,7 @@ class LabelBoxes:
     Attributes
     ----------
     boxes : array_like of shape (N, 4) or (N, 7)
-        In a picture left, top, width and height in pixels. On the ground x, y, z (of the centre), length, width and
+        In a picture left, top, width and height in pixels. In space x, y, z (of the centre), length, width and
         height in metres, and heading in radians; what isn't known of any box is NaN.
     frame : array_like of int, shape (N,), optional
         The number of the picture of each box; or ``t_s``.
@@ -63,7 +64,7 @@ class LabelBoxes:
     first_frame : int, default 0
         The number of the first picture.
     frame_id : str, default ""
-        The frame of reference of boxes on the ground.
+        The frame of reference of boxes in space.
     """
 
     boxes: ArrayLike
@@ -80,8 +81,8 @@ class LabelBoxes:
 class LabelFormat(Protocol):
     """A format of label files.
 
-    Class attributes may be left out: ``space`` is "picture" or "ground"; a method ``recognises(path)`` says whether a
-    file is of this format. It is asked only about files that are of no built-in format.
+    May be left out: the class attribute ``in_space`` is True if its boxes are in metres, and not in pictures; a method
+    ``recognises(path)`` says whether a file is of this format. It is asked only about files of no built-in format.
     """
 
     def read(self, path: Path) -> LabelBoxes:
@@ -121,9 +122,9 @@ class Box3d(NamedTuple):
 
 
 class MessageReader(Protocol):
-    """A reader of the messages of one type, by whose name it is installed: ``my_msgs/Things``.
+    """A reader of the messages of one type. Its entry point has the name of the type: ``my_msgs/Things``.
 
-    The class attribute ``space`` may be left out: "picture" (boxes are ``Box``) or "ground" (they are ``Box3d``).
+    The class attribute ``in_space`` may be left out: it is True if boxes are ``Box3d``, and not ``Box``.
     """
 
     def read(self, message: Any) -> Sequence[Box] | Sequence[Box3d]:

@@ -1,4 +1,4 @@
-"""What installed packages declare: their entry points, and which of them a module is of.
+"""Installed packages: the entry points that they declare, and the package that a module is of.
 
 Entry points are read from the files that pip writes. ``importlib.metadata`` reads them, too, but its import takes
 longer than all else that lists the commands.
@@ -36,7 +36,7 @@ class Point(NamedTuple):
 
 
 class Declared(NamedTuple):
-    """The entry points of all packages for mcaptrack, and the names of packages whose entry points can't be read."""
+    """The entry points of all packages for mcaptrack, and the names of packages where they can't be read."""
 
     points: tuple[Point, ...]
     unreadable: tuple[str, ...]

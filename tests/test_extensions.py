@@ -209,16 +209,6 @@ WRONG: list[tuple[Any, str]] = [
 ]
 
 
-class Given:
-    """A format that gives what it is told to."""
-
-    def __init__(self, gives: Any, space: str = "picture") -> None:
-        self.gives, self.space = gives, space
-
-    def read(self, path: Path) -> Any:
-        return self.gives
-
-
 @pytest.mark.parametrize(("gives", "said"), WRONG, ids=range(len(WRONG)))
 def test_boxes_that_cannot_be_labels_are_refused_in_one_line_that_names_the_package(site, monkeypatch, gives, said):
     add(site, "label_format", "odd", "class Part:\n    def read(self, path):\n        return self.gives\n")
@@ -256,7 +246,7 @@ def test_times_names_and_empty_frames_of_labels_are_kept(site):
 
 
 def test_boxes_on_the_ground_give_what_a_table_gives(site):
-    code = "class Part:\n    space = 'ground'\n    def recognises(self, path):\n        return path.suffix == '.lidar'\n    def read(self, path):\n        return self.gives\n"
+    code = "class Part:\n    in_space = True\n    def recognises(self, path):\n        return path.suffix == '.lidar'\n    def read(self, path):\n        return self.gives\n"
     add(site, "label_format", "lidar", code)
     import another
 
@@ -539,12 +529,12 @@ def test_what_a_command_changes_in_the_process_is_undone(site, tracked):
 class Format:
     """A format of numbers; ``breaks`` is the law that it breaks."""
 
-    space = "picture"
+    in_space = False
 
     def __init__(self, breaks: str = "") -> None:
         self.breaks, self.seen = breaks, 0
         if breaks == "space":
-            self.space = "air"
+            self.in_space = "air"
 
     def recognises(self, path: Path) -> bool:
         if self.breaks == "junk":
@@ -571,7 +561,7 @@ class Format:
 class Reader:
     def __init__(self, breaks: str = "") -> None:
         self.breaks, self.seen = breaks, 0
-        self.space = "air" if breaks == "space" else "ground" if breaks == "ground" else "picture"
+        self.in_space = "air" if breaks == "space" else breaks == "ground"
 
     def read(self, message: Any) -> list[Any]:
         self.seen += 1
@@ -620,7 +610,7 @@ class Export:
 
 
 FORMAT_LAWS = {
-    "space": "declares: label format Format has space = 'air'", "boxes": "conforms: .* can't be",
+    "space": "declares: label format Format has in_space = 'air'", "boxes": "conforms: .* can't be",
     "state": "pure: the same file gives other boxes", "file": "pure: ", "folder": "process: it changes the working folder",
     "empty": "damaged: an empty file raises IndexError", "cut": "damaged: .* raises KeyError",
     "other": "recognises: it doesn't", "junk": "recognises: .*UnicodeDecodeError",

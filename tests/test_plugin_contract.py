@@ -188,7 +188,7 @@ CHANGES: dict[str, Callable[[], Any]] = {
     "NumPy's handling of errors": lambda: np.seterr(all="raise"),
     "the recursion limit": lambda: sys.setrecursionlimit(sys.getrecursionlimit() + 100),
     "the filters of warnings": lambda: warnings.simplefilter("ignore"),
-    "sys.path": sys.path.clear,
+    "sys.path": lambda: sys.path.__delitem__(slice(None)),
     "the random state of Python": lambda: random.seed(3),
     "the random state of NumPy": lambda: np.random.seed(3),  # noqa: NPY002
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -38,8 +37,8 @@ class Function:
             return entry.cls(*arguments, **options)
 
 
-class OfPackage(Called[Any]):
-    """What commands of packages have in common."""
+class FromPackage(Called[Any]):
+    """A command of a package, however often it calls its function."""
 
     @classmethod
     def declaration(cls, name: str) -> Callable[..., Any]:
@@ -62,7 +61,7 @@ class OfPackage(Called[Any]):
         return {"result": plain(done)}
 
 
-class OnceOfPackage(OfPackage, Once[Any]):
+class OnceOfPackage(FromPackage, Once[Any]):
     """A command that calls its function once."""
 
     def print_result(self, done: Any, talk: common.Talk) -> None:
@@ -76,7 +75,7 @@ class OnceOfPackage(OfPackage, Once[Any]):
             show(*lines)
 
 
-class EachLogOfPackage(OfPackage, EachLog[Any]):
+class EachLogOfPackage(FromPackage, EachLog[Any]):
     """A command that calls its function with each log."""
 
     writes = False
@@ -95,7 +94,7 @@ class EachLogOfPackage(OfPackage, EachLog[Any]):
                 show(*lines)
 
 
-def class_of(name: str) -> type[OfPackage]:
+def class_of(name: str) -> type[FromPackage]:
     """The class of a command: one that takes a log can take many. Raises McaptrackError for what is no command."""
     entry = find("command", name)
     if not hasattr(entry.cls, "most_used"):
@@ -138,4 +137,4 @@ def lines_of(value: Any) -> Iterator[str]:
 
 
 def _text(value: Any) -> str:
-    return value if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else json.dumps(value)
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -101,13 +101,14 @@ def _write_handlers(handlers: dict[signal.Signals, Any]) -> None:
 
 
 def _read_path() -> list[Any]:
-    if not isinstance(sys.path, list):
+    places: Any = sys.path
+    if not isinstance(places, list):
         sys.path = []
     return list(sys.path)
 
 
 def _write_path(places: list[Any]) -> None:
-    """What others have added stays: their later imports may need it."""
+    """Restore the places; those that others have added stay, since their later imports may need them."""
     sys.path[:] = [*places, *(place for place in _read_path() if place not in places)]
 
 

@@ -19,7 +19,7 @@ from mcaptrack.api.exporting import exporter_for, write_by_package
 from mcaptrack.api.options import PathLike
 from mcaptrack.api.reading import LogReader
 from mcaptrack.api.recording import open as open_log
-from mcaptrack.contracts import Exporter, LabelFormat, MessageReader, space_of
+from mcaptrack.contracts import Exporter, LabelFormat, MessageReader, is_in_space
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.registry import Entry, Kind, in_words
@@ -68,7 +68,7 @@ def check_label_format(label_format: LabelFormat, path: PathLike) -> None:
     >>> check_label_format(Corners(), "a.corners")
     """
     entry = _entry("label_format", label_format, "read")
-    made = FormatOfPackage(entry, label_format, _space_of(entry, label_format))
+    made = FormatOfPackage(entry, label_format, _in_space(entry, label_format))
     file = as_path(path).absolute()
     with same_process(entry.name), TemporaryDirectory() as folder:
         before = _content(file)
@@ -95,9 +95,9 @@ def _labels(made: FormatOfPackage, path: Path, law: str) -> list[Any]:
     try:
         with collected():
             rows: Any = (
-                made.labels(path, "detections", WantedClasses("all"))
-                if made.space == "picture"
-                else made.rows_3d(path, "detections")
+                made.rows_3d(path, "detections")
+                if made.in_space
+                else made.labels(path, "detections", WantedClasses("all"))
             )
     except McaptrackError as error:
         raise LawError(f"{law}: {error}") from None
@@ -160,7 +160,7 @@ def check_message_reader(reader: MessageReader, messages: Sequence[Any]) -> None
     >>> check_message_reader(Things(), [{"things": [{"x": 1, "y": 2, "w": 3, "h": 4}]}])
     """
     entry = _entry("message_reader", reader, "read")
-    space = _space_of(entry, reader)
+    in_space = _in_space(entry, reader)
     decoded = [_decoded(message) if isinstance(message, dict) else message for message in messages]
     if not decoded:
         raise LawError("there are no messages to check the reader with")
@@ -171,11 +171,7 @@ def check_message_reader(reader: MessageReader, messages: Sequence[Any]) -> None
         except Exception as error:
             raise LawError(f"conforms: it raises {type(error).__name__}: {error}") from None
         try:
-            return (
-                list(checked_boxes(entry, given))
-                if space == "picture"
-                else checked_message_3d(entry, message, given).boxes
-            )
+            return checked_message_3d(entry, message, given).boxes if in_space else list(checked_boxes(entry, given))
         except McaptrackError as error:
             raise LawError(f"conforms: {error}") from None
 
@@ -336,9 +332,9 @@ def _entry(kind: Kind, made: Any, method: str) -> Entry:
     return Entry(cls.__name__, kind, cls, cls.__module__, "", "")
 
 
-def _space_of(entry: Entry, made: Any) -> Any:
+def _in_space(entry: Entry, made: Any) -> bool:
     try:
-        return space_of(entry, made)
+        return is_in_space(entry, made)
     except McaptrackError as error:
         raise LawError(f"declares: {error}") from None
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import foxglove, log
-from mcaptrack.contracts import Space
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.notices import warn
@@ -87,8 +86,8 @@ def is_compressed(schema_name: str) -> bool:
     return plain_name(schema_name) in _COMPRESSED
 
 
-def _space_of(channel: log.Channel) -> Space | None:
-    """Where the boxes of a channel's messages are, by the name of their schema; None if they are no boxes.
+def _has_boxes(channel: log.Channel, in_space: bool) -> bool:
+    """Whether a channel's messages are boxes in space, or in pictures, by the name of their schema.
 
     A warning names a package that reads them and can't be imported.
     """
@@ -96,19 +95,19 @@ def _space_of(channel: log.Channel) -> Space | None:
         reader = reader_of(channel.schema_name)
     except McaptrackError as error:
         warn(f"{error}; messages of {channel.topic} are not read", "other")
-        return None
-    return None if reader is None else reader.space
+        return False
+    return reader is not None and reader.in_space == in_space
 
 
 def holds_detections(channel: log.Channel) -> bool:
     """Whether a channel's messages are boxes in pictures of another detector, by the name of their schema."""
-    return _space_of(channel) == "picture"
+    return _has_boxes(channel, in_space=False)
 
 
 def may_hold_boxes_3d(channel: log.Channel) -> bool:
     """Whether a channel's messages may be 3D boxes of other software, by the name of their schema."""
     is_recorded = Provenance.from_metadata(channel.metadata) is None  # views of mcaptrack are drawings, too
-    return is_recorded and _space_of(channel) == "ground"
+    return is_recorded and _has_boxes(channel, in_space=True)
 
 
 def is_drawing(channel: log.Channel) -> bool:

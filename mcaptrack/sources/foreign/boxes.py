@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.contracts import UNKNOWN_VECTOR, Box, Box3d, Quaternion, Space, Vector, space_of
+from mcaptrack.contracts import UNKNOWN_VECTOR, Box, Box3d, Quaternion, Vector, is_in_space
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.registry.guard import Guard
@@ -98,7 +98,7 @@ def boxes_decoder(kind: MessageType, classes: Classes) -> Callable[[bytes], Rows
     ``classes`` collects the class names.
     """
     reader = reader_of(kind.name)
-    if reader is None or reader.space != "picture":
+    if reader is None or reader.in_space:
         raise McaptrackError(
             f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} is read"
         )
@@ -585,7 +585,7 @@ DRAWINGS: Final = ("foxglove.SceneUpdate", "visualization_msgs/MarkerArray", "vi
 def boxes_3d_decoder(kind: MessageType) -> Callable[[bytes], Message3d]:
     """A function that decodes payloads of a channel to 3D boxes; raises as ``picture_decoder`` does."""
     reader = reader_of(kind.name)
-    if reader is None or reader.space != "ground":
+    if reader is None or not reader.in_space:
         raise McaptrackError(f"it holds {kind.name or 'no schema'}, not 3D boxes; {', '.join(BOXES_3D_READ)} are read")
     return decoder_with_errors(kind, reader.read)
 
@@ -593,38 +593,38 @@ def boxes_3d_decoder(kind: MessageType) -> Callable[[bytes], Message3d]:
 # Readers by the type of messages: built-in ones, and those of other packages.
 
 
-class Reader(NamedTuple):
-    """What reads the messages of a type: where their boxes are, and a function that gives them: a list of ``Box``, or a
+class BoxReader(NamedTuple):
+    """A reader of the messages of a type: a function that gives a list of ``Box``, or of boxes in space a
     ``Message3d``.
     """
 
-    space: Space
+    in_space: bool
     read: Callable[[Any], Any]
 
 
-def reader_of(schema_name: str) -> Reader | None:
+def reader_of(schema_name: str) -> BoxReader | None:
     """The reader of a type of messages; None if there is none.
 
     Raises McaptrackError if that of another package can't be imported. Packages that aren't needed are not imported.
     """
     name = plain_name(schema_name)
     if name in BUILT_IN[_KIND]:
-        return Reader("picture" if name in DETECTIONS_READ else "ground", find(_KIND, name).cls)
+        return BoxReader(name not in DETECTIONS_READ, find(_KIND, name).cls)
     named = next((other for other in others(_KIND) if plain_name(other) == name), "")
     return _of_package(find(_KIND, named)) if named else None
 
 
 @lru_cache(maxsize=64)
-def _of_package(entry: Entry) -> Reader:
+def _of_package(entry: Entry) -> BoxReader:
     reader, guard = entry.made("read"), Guard(str(entry))
-    space = space_of(entry, reader)
+    in_space = is_in_space(entry, reader)
 
     def read(message: Any) -> list[Box] | Message3d:
         with blamed(entry, "failed", guard):
             boxes = list(reader.read(message))
-        return checked_boxes(entry, boxes) if space == "picture" else checked_message_3d(entry, message, boxes)
+        return checked_message_3d(entry, message, boxes) if in_space else checked_boxes(entry, boxes)
 
-    return Reader(space, read)
+    return BoxReader(in_space, read)
 
 
 def checked_boxes(entry: Entry, boxes: list[Any]) -> list[Box]:
@@ -637,7 +637,7 @@ def checked_boxes(entry: Entry, boxes: list[Any]) -> list[Box]:
 
 
 def checked_message_3d(entry: Entry, message: Any, boxes: list[Any]) -> Message3d:
-    """The boxes on the ground that a reader gave, with the header of their message, if it has one."""
+    """The boxes in space that a reader gave, with the header of their message, if it has one."""
     try:
         head = head_of(message)
     except (AttributeError, ValueError):

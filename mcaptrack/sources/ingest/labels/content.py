@@ -33,7 +33,7 @@ from mcaptrack.schema.provenance import Plugin
 Format = LabelFormat | str
 #: Formats that hold 3D boxes alone; tables ("csv") may hold either.
 FORMATS_3D: Final[tuple[str, ...]] = ("kitti-3d", "nuscenes", "argoverse")
-#: Formats of data sets, whose boxes suit their pictures. Those of other formats are checked against the pictures.
+#: Formats of data sets: their boxes suit the pictures. Those of other formats are checked against the pictures.
 DATA_SETS: Final = ("mot", "kitti", "sdd", "trajnet", "obsmat")
 ClassIds = NDArray[np.uint32]
 

@@ -66,7 +66,7 @@ def holds_boxes(path: Path) -> bool:
 
 
 def _kind_of(content: Any) -> str:
-    """What JSON holds: annotations, results or rows; "" for anything else."""
+    """The content of JSON: annotations, results or rows; "" for anything else."""
     if isinstance(content, dict):
         return "annotations" if isinstance(content.get("annotations"), list) else ""
     first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.choices import Role
-from mcaptrack.contracts import LabelBoxes, Space, space_of
+from mcaptrack.contracts import LabelBoxes, is_in_space
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Floats, Ints
@@ -32,7 +32,6 @@ from mcaptrack.sources.ingest.labels.content import (
 )
 
 _KIND: Final = "label_format"
-_COLUMNS: Final = {"picture": 4, "ground": 7}
 
 
 class FormatOfPackage(NamedTuple):
@@ -40,11 +39,11 @@ class FormatOfPackage(NamedTuple):
 
     entry: Entry
     format: Any
-    space: Space
+    in_space: bool
 
     @property
     def plugin(self) -> Plugin:
-        """What the provenance of a channel says of it."""
+        """Its description in the provenance of a channel."""
         return Plugin(self.entry.name, self.entry.implementation, self.entry.distribution, self.entry.version)
 
     def recognises(self, path: Path) -> bool:
@@ -79,7 +78,7 @@ class FormatOfPackage(NamedTuple):
         return settled
 
     def rows_3d(self, path: Path, role: Role) -> BoxRows3D:
-        """The boxes of a file on the ground, checked as those of all formats are."""
+        """The boxes of a file in space, checked as those of all formats are."""
         given = self._columns(path)
         if given.times_s is not None:
             times = np.rint(given.times_s * NS_PER_S).astype(np.int64)
@@ -99,7 +98,7 @@ class FormatOfPackage(NamedTuple):
     def _columns(self, path: Path) -> _Columns:
         given = self.boxes(path)
         with blamed(self.entry, f"gave what are no boxes of {path}"):
-            return _columns_of(path, given, self.space)
+            return _columns_of(path, given, self.in_space)
 
 
 class _Columns(NamedTuple):
@@ -124,13 +123,13 @@ class _Columns(NamedTuple):
         return f"{self.path}: box {row + 1}"
 
 
-def _columns_of(path: Path, given: LabelBoxes, space: Space) -> _Columns:
+def _columns_of(path: Path, given: LabelBoxes, in_space: bool) -> _Columns:
     """Raise ValueError for what has another type, shape or range."""
-    width = _COLUMNS[space]
+    width = 7 if in_space else 4
     boxes = np.asarray(given.boxes, np.float64)
     boxes = boxes.reshape(0, width) if not boxes.size else boxes
     if boxes.ndim != 2 or boxes.shape[1] != width:
-        raise ValueError(f"boxes of shape {boxes.shape}; with space = {space!r} they are (N, {width})")
+        raise ValueError(f"boxes of shape {boxes.shape}; with in_space = {in_space} they are (N, {width})")
     count = len(boxes)
     if (given.frame is None) == (given.t_s is None):
         raise ValueError("frame and t_s; one of the two says which picture a box is of")
@@ -214,7 +213,7 @@ def format_of_package(name: str) -> FormatOfPackage | None:
 @lru_cache(maxsize=16)
 def _made(entry: Entry) -> FormatOfPackage:
     made = entry.made("read")
-    return FormatOfPackage(entry, made, space_of(entry, made))
+    return FormatOfPackage(entry, made, is_in_space(entry, made))
 
 
 def recognised(path: Path) -> FormatOfPackage | None:

@@ -363,7 +363,7 @@ def is_3d(path: Path, label_format: Format = "auto", columns: Mapping[str, str] 
         return True
     if label_format not in ("auto", "csv") or not path.exists():
         of_package = format_of_package(label_format)
-        return of_package is not None and of_package.space == "ground"
+        return of_package is not None and of_package.in_space
     if path.is_dir():
         return tables_folder(path) is not None or is_argoverse(path)
     if is_argoverse(path):
