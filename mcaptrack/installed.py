@@ -43,8 +43,9 @@ class Declared(NamedTuple):
 
 
 def entry_points(group: str) -> list[Point]:
-    """The entry points of a group, by package. Their names hold no colon: others are left out."""
-    return [point for point in declared().points if point.group == group and ":" not in point.name]
+    """The entry points of a group, by package. Names with a colon, or that can't be printed, are left out."""
+    points = [point for point in declared().points if point.group == group]
+    return [point for point in points if ":" not in point.name and point.name.isprintable()]
 
 
 def declared() -> Declared:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import subprocess
 import sys
 import tomllib
@@ -14,6 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.message_factory import GetMessages
 from mcap.writer import Writer
 
 import mcaptrack
@@ -25,6 +28,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Plugin, Provenance
+from mcaptrack.sources import foreign
 from mcaptrack.testing import LawError
 from tests.commands import call, done
 from tools import pages
@@ -302,6 +306,39 @@ def test_messages_of_another_type_are_tracked_as_those_of_vision_msgs(site, sche
     assert len(rows_of("a.mcap", "/robot/tracks")) == 9
 
 
+def test_messages_in_protobuf_and_of_ros_2_are_read_by_their_definitions_in_the_log(site):
+    part = "from mcaptrack.contracts import Box\nclass Part:\n    def read(self, message):\n        return [Box(x, 2, 3, 4) for x in message.left]\n"
+    add(site, "message_reader", "my_msgs/Rows", part)
+    info = site / "another-2.0.dist-info" / "entry_points.txt"
+    info.write_text(info.read_text() + "my.Rows = another:Part\n")
+    file = FileDescriptorProto(name="rows.proto", package="my", syntax="proto3")
+    file.message_type.add(name="Rows").field.add(name="left", number=1, type=1, label=3)
+    (packed,) = GetMessages([file]).values()
+    cdr = b"\x00\x01\x00\x00" + struct.pack("<I4x2d", 2, 5, 9)
+    kinds = {
+        "my.Rows": (
+            "protobuf",
+            "protobuf",
+            FileDescriptorSet(file=[file]).SerializeToString(),
+            packed(left=[5, 9]).SerializeToString(),
+        ),
+        "my_msgs/msg/Rows": ("cdr", "ros2msg", b"float64[] left", cdr),
+    }
+    with Path("a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="", library="test")
+        for name, (encoding, schema_encoding, schema, payload) in kinds.items():
+            number = writer.register_channel(
+                f"/{encoding}/rows", encoding, writer.register_schema(name, schema_encoding, schema)
+            )
+            writer.add_message(number, 10**18, payload, 10**18)
+        writer.finish()
+    with log.read(Path("a.mcap")) as opened:
+        for encoding in ("protobuf", "cdr"):
+            (frame,) = foreign.named_detections(opened, f"/{encoding}/rows").frames
+            assert frame.rows["x_px"].tolist() == [5, 9]
+
+
 def test_no_reader_is_imported_for_messages_of_other_types(site):
     robot("a.mcap", "your_msgs/Things", [{"things": []}])
     done("info", "a.mcap")
@@ -500,6 +537,25 @@ def test_a_command_that_cannot_be_is_one_line_and_the_others_work(site, tracked,
     done("longest", "a.mcap")
     assert "odd" in done("--help").out
     assert "no such option: --nope" in call("info", "a.mcap", "--nope").err
+
+
+def test_names_that_are_no_words_are_left_out(site):
+    names = {
+        "--help": "longest:longest",
+        "a b": "longest:longest",
+        "\x1b[31mred": "longest:longest",
+        "a:b": "longest:longest",
+    }
+    install(site, {"mcaptrack.commands": names}, "odd-names")
+    said = done("--help").out
+    assert "odd-names" not in said
+    assert "\x1b[31m" not in said
+    assert "no such command" in call("a b").err
+
+
+def test_two_commands_of_one_name_are_refused(site):
+    add(site, "command", "longest", "")
+    assert "several installed packages have a command longest" in one_line("longest")
 
 
 def test_built_in_commands_are_not_replaced(site, tracked):

@@ -125,12 +125,19 @@ class OfPackage(Listed):
 
 
 def of_packages() -> dict[str, OfPackage]:
-    """The commands of installed packages by name; those with a name of ours are left out. Imports none of them."""
+    """The commands of installed packages by name. Imports none of them.
+
+    Those with a name of ours, or one that is no word, are left out.
+    """
     from mcaptrack.installed import entry_points
 
     points = sorted(entry_points("mcaptrack.commands"), key=lambda point: point.name)
     named = {point.name: " ".join(point.package).strip() or point.value for point in points}
-    return {name: OfPackage(name, _OF_PACKAGES, place) for name, place in named.items() if name not in ENTRIES}
+    return {name: OfPackage(name, _OF_PACKAGES, place) for name, place in named.items() if _is_free(name)}
+
+
+def _is_free(name: str) -> bool:
+    return name not in ENTRIES and re.fullmatch(r"\w[\w-]*", name) is not None
 
 
 class Commands(Mapping[str, Any]):

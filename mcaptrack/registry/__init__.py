@@ -54,6 +54,8 @@ _COMMANDS: Final = (
     "ingest demo run detect motion track sample predict retrack fuse models info view render report query export "
     "evaluate events zones calibrate tune train check recover drop doctor"
 )
+#: Kinds that only entry points name.
+_BY_ENTRY_POINT: Final = ("message_reader", "command")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -246,7 +248,8 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     if len(named) > 1:
         values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))
         what = titled(kind, name)
-        raise McaptrackError(f"several installed packages have a {what}: {values}; name one as module:Class")
+        hint = "remove one of them" if kind in _BY_ENTRY_POINT else "name one as module:Class"
+        raise McaptrackError(f"several installed packages have a {what}: {values}; {hint}")
     package = named[0].package
     implementation = _load(titled(kind, name, package), named[0].value)
     return Entry(name, kind, implementation, implementation.__module__, *package)
