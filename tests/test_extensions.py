@@ -188,14 +188,14 @@ WRONG: list[tuple[Any, str]] = [
     (labels(boxes="no"), "gave what are no boxes"),
     (labels(boxes=[], frame=[], track_id=[]), "holds no boxes"),
     (labels(frame=[0]), "frame of shape"),
-    (labels(frame=[0, NAN]), "not finite"),
+    (labels(frame=[0, NAN]), "frame with nan"),
     (labels(frame=[0, 0.5]), "frame with 0.5"),
     (labels(frame=[0, -1]), "frame with -1, which is no number"),
     (labels(frame=[0, 1e30]), "frame with 1e.30, which is no number"),
     (labels(frame=None), "frame and t_s"),
     (labels(t_s=[0, 1]), "frame and t_s"),
-    (labels(frame=None, t_s=[0, -1]), "no number of a second"),
-    (labels(frame=None, t_s=[0, INF]), "not finite"),
+    (labels(frame=None, t_s=[0, -1]), "t_s with -1, which is no second"),
+    (labels(frame=None, t_s=[0, INF]), "t_s with inf"),
     (labels(frame=None, t_s=["a", "b"]), "could not convert"),
     (labels(track_id=[1]), "track_id of shape"),
     (labels(track_id=[1.5, 2]), "ids are whole numbers or texts"),
@@ -207,7 +207,7 @@ WRONG: list[tuple[Any, str]] = [
     (labels(class_name=["dog", "dog"]), "holds no people"),
     (labels(score=[1]), "score of shape"),
     (labels(score=[1e30, 1]), "a score can't be"),
-    (labels(labelled=[NAN]), "labelled frames"),
+    (labels(labelled=[NAN]), "labelled with nan"),
     (labels(labelled=[0.5]), "labelled with 0.5"),
     (labels(first_frame="1"), "first_frame='1'"),
 ]
@@ -451,6 +451,22 @@ def test_an_exporter_that_cannot_be_is_refused_in_one_line(site, tracked, code, 
     assert said in line
     assert "exporter odd (another 2.0)" in line
     assert sorted(path.name for path in Path().iterdir()) == ["a.mcap", "b.csv"]
+
+
+def test_a_folder_of_others_is_not_replaced(site, tracked):
+    code = "class Part:\n    end = '.parts'\n    is_folder = True\n    def write(self, recording, path): ...\n"
+    add(site, "exporter", "parts", code)
+    for name in (".", "pictures", "x.parts"):
+        Path(name).mkdir(exist_ok=True)
+        Path(name, "mine").write_text("mine")
+    Path("x.parts/a.mcap").write_bytes(tracked.read_bytes())
+    said = "exists, and only folders named *.parts are replaced"
+    for name in (".", "pictures", "pictures/mine"):
+        assert said in one_line("export", "a.mcap", "--format", "parts", "-o", name, "--force")
+    assert "is a log, or holds it" in one_line(
+        "export", "x.parts/a.mcap", "--format", "parts", "-o", "x.parts", "--force"
+    )
+    assert all(Path(name, "mine").read_text() == "mine" for name in (".", "pictures", "x.parts"))
 
 
 def test_an_exporter_does_not_replace_the_log(site, tracked):

@@ -257,18 +257,27 @@ def _export_by_package(
         assert by is not None
         warn_unused(f"the {by.entry} has no tables of channels", topic=bool(topic), blobs=blobs)
         target = output or local_name(path, by.end)
-        if by.is_folder and target.exists() and not force:
-            raise McaptrackError(f"{target} exists; `force=True` replaces it")
-        if by.is_folder and target.exists() and not target.is_dir():
-            raise McaptrackError(f"{target} is a file; {by.entry} writes a folder")
-        if not by.is_folder:
+        if by.is_folder:
+            _refuse_folder(by, target, force)
+        else:
             refuse_overwrite(target, force)
         with LogReader(path) as recording:
-            if any(is_same_file(part.path, target) for part in recording._log.parts):
-                raise McaptrackError(f"{target} is a log; give the file another name with `output=`")
+            for place in (place_of(part.path) for part in recording._log.parts):
+                if isinstance(place, Path) and place_of(target) in (place, *place.parents):
+                    raise McaptrackError(f"{target} is a log, or holds it; give another name with `output=`")
             with (publish_folder if by.is_folder else publish)(target) as part:
                 rows = write_by_package(by, recording, part)
     return ExportResult(path, target, rows, tuple(rows), tuple(dict.fromkeys(warnings)), files=(target,))
+
+
+def _refuse_folder(by: ExporterOfPackage, folder: Path, force: bool) -> None:
+    """Raise McaptrackError for a folder that an exporter may not replace: it may one with the end of its names."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not (folder.is_dir() and folder.name.endswith(by.end)):
+        raise McaptrackError(f"{folder} exists, and only folders named *{by.end} are replaced; name another folder")
+    if not force:
+        raise McaptrackError(f"{folder} exists; `force=True` replaces it")
 
 
 def write_by_package(by: ExporterOfPackage, recording: LogReader, part: Path) -> dict[str, int]:

@@ -297,6 +297,15 @@ def check_command(function: Callable[..., Any], *arguments: Any, **options: Any)
     >>> check_command(hello)
     """
     name = getattr(function, "__name__", repr(function))
+    _check_declaration(function, name)
+    with same_process(name), collected():
+        result = function(*arguments, **options)
+    if not (result is None or isinstance(result, _PRINTED) or hasattr(result, "__dataclass_fields__")):
+        raise LawError(f"conforms: {name} returns a {type(result).__name__}, which can't be printed")
+
+
+def _check_declaration(function: Callable[..., Any], name: str) -> None:
+    """Check what a command says of itself: its help, and the types and the meaning of its parameters."""
     if not hasattr(function, "most_used"):
         raise LawError(f"declares: {name} is not declared; put @declared() of mcaptrack.api.declared above it")
     try:
@@ -317,10 +326,6 @@ def check_command(function: Callable[..., Any], *arguments: Any, **options: Any)
     ]
     if needed:
         raise LawError(f"declares: {name} has no default of {needed[0]}; options may be left out")
-    with same_process(name), collected():
-        result = function(*arguments, **options)
-    if not (result is None or isinstance(result, _PRINTED) or hasattr(result, "__dataclass_fields__")):
-        raise LawError(f"conforms: {name} returns a {type(result).__name__}, which can't be printed")
 
 
 def _entry(kind: Kind, made: Any, method: str) -> Entry:

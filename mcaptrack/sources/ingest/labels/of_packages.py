@@ -15,7 +15,7 @@ from mcaptrack.choices import Role
 from mcaptrack.contracts import LabelBoxes, is_in_space
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
@@ -133,39 +133,49 @@ def _columns_of(path: Path, given: LabelBoxes, in_space: bool) -> _Columns:
     count = len(boxes)
     if (given.frame is None) == (given.t_s is None):
         raise ValueError("frame and t_s; one of the two says which picture a box is of")
-    labelled = np.asarray([] if given.labelled is None else given.labelled, np.float64).reshape(-1)
-    frames = _numbers("frame" if given.t_s is None else "t_s", given.frame if given.t_s is None else given.t_s, count)
-    if not np.isfinite(labelled).all():
-        raise ValueError("labelled frames that are not finite")
-    most = MAX_FRAME if given.t_s is None else LAST_NS // NS_PER_S
-    for name, values in (("frame" if given.t_s is None else "t_s", frames), ("labelled", labelled)):
-        wrong = (values < 0) | (values > most) | ((values != np.rint(values)) & (given.t_s is None))
-        if wrong.any():
-            what = "picture" if given.t_s is None else "second from 0 to the year 2262"
-            raise ValueError(f"{name} with {values[wrong][0]:g}, which is no number of a {what}")
-    times = None
-    if given.t_s is None:
-        frame, described = frames.astype(np.int64), np.unique(labelled).astype(np.int64)
-    else:
-        times, places = np.unique(np.concatenate([frames, labelled]), return_inverse=True)
-        frame, described = places[:count], np.unique(places[count:])
+    frame, labelled, times_s = _frames(given, count) if given.t_s is None else _timed_frames(given, count)
     kind, names = _classes(given, count)
-    score = np.full(count, np.nan) if given.score is None else np.asarray(given.score, np.float64)
-    if score.shape != (count,):
-        raise ValueError(f"score of shape {score.shape} for {count} boxes")
+    score = np.full(count, np.nan) if given.score is None else _column("score", given.score, count)
     first = given.first_frame
     if isinstance(first, bool) or not isinstance(first, int | np.integer):
         raise ValueError(f"first_frame={first!r:.40}, which is no whole number")
     return _Columns(
-        path, boxes, frame, _ids(given, count), kind, names, score, described, times, int(first), str(given.frame_id)
+        path, boxes, frame, _ids(given, count), kind, names, score, labelled, times_s, int(first), str(given.frame_id)
     )
 
 
-def _numbers(name: str, values: Any, count: int) -> Floats:
+def _frames(given: LabelBoxes, count: int) -> tuple[Ints, Ints, None]:
+    """The frames of boxes, and those that are labelled."""
+    frame, labelled = _column("frame", given.frame, count), _labelled(given)
+    for name, values in (("frame", frame), ("labelled", labelled)):
+        _refuse(name, values, (values != np.rint(values)) | (values < 0) | (values > MAX_FRAME), "number of a picture")
+    return frame.astype(np.int64), np.unique(labelled).astype(np.int64), None
+
+
+def _timed_frames(given: LabelBoxes, count: int) -> tuple[Ints, Ints, Floats]:
+    """The frames of boxes, and those that are labelled, as places in the times, which rise."""
+    seconds, labelled = _column("t_s", given.t_s, count), _labelled(given)
+    for name, values in (("t_s", seconds), ("labelled", labelled)):
+        _refuse(name, values, (values < 0) | (values > LAST_NS // NS_PER_S), "second from 0 to the year 2262")
+    times_s, places = np.unique(np.concatenate([seconds, labelled]), return_inverse=True)
+    return places[:count], np.unique(places[count:]), times_s
+
+
+def _labelled(given: LabelBoxes) -> Floats:
+    return np.asarray([] if given.labelled is None else given.labelled, np.float64).reshape(-1)
+
+
+def _column(name: str, values: Any, count: int) -> Floats:
     array = np.asarray(values, np.float64)
-    if array.shape != (count,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} of shape {array.shape} for {count} boxes, or with numbers that are not finite")
+    if array.shape != (count,):
+        raise ValueError(f"{name} of shape {array.shape} for {count} boxes")
     return array
+
+
+def _refuse(name: str, values: Floats, wrong: Bools, what: str) -> None:
+    wrong = wrong | ~np.isfinite(values)
+    if wrong.any():
+        raise ValueError(f"{name} with {values[wrong][0]:g}, which is no {what}")
 
 
 def _ids(given: LabelBoxes, count: int) -> Ints:
