@@ -368,7 +368,7 @@ def _unknown(kind: Kind, name: str) -> str:
     all_names, unreadable, what = names(kind), declared().unreadable, in_words(kind)
     choices = f"there are {', '.join(all_names)}" if all_names else f"no {what} is built in or installed"
     return (
-        f"no {what} is called {name:.80}; {did_you_mean(name, all_names)}{choices}; an installed package gives more by its "
-        f"entry points in {_OWN}.{kind}s, and module:Class names any class"
+        f"no {what} is called {name:.80}; {did_you_mean(name, all_names)}{choices}; an installed package gives more by "
+        f"its entry points in {_OWN}.{kind}s, and module:Class names any class"
         + (f". The entry points of {', '.join(unreadable)} can't be read" if unreadable else "")
     )
