@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from importlib.metadata import packages_distributions, version
+from importlib.metadata import entry_points, packages_distributions, version
 from pathlib import Path
 
 import pytest
@@ -134,6 +134,19 @@ def test_two_packages_of_one_name_are_refused_unless_one_of_them_is_named(instal
             find("tracker", "nearest", distribution)
     assert find("tracker", "nearest", "own-trackers").implementation == "own_trackers:Nearest"
     assert STAGES["track"].find("nearest", "own-trackers").distribution == "own-trackers"
+
+
+def test_of_a_package_that_is_installed_twice_the_first_counts(installed, tmp_path, monkeypatch):
+    later = tmp_path / "later"
+    later.mkdir()
+    package(
+        later, "Own.Trackers", "2.0", "mcaptrack.trackers", {"nearest": "elsewhere:Nearest", "other": "elsewhere:O"}
+    )
+    monkeypatch.setattr(sys, "path", [*sys.path, str(later)])
+    assert names("tracker") == ("sort", "bytetrack", "ocsort", "ground", "nearest")
+    assert find("tracker", "nearest").version == "1.5"
+    declared = {(point.name, point.value) for point in entry_points(group="mcaptrack.trackers")}
+    assert {(point.name, point.value) for point in registry.points("tracker")} == declared
 
 
 GOOD = "Metadata-Version: 2.1\nName: broken\nVersion: 1\n"
