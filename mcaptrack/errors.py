@@ -28,8 +28,9 @@ def did_you_mean(name: str, names: Iterable[str]) -> str:
     """A question for a message, about the name that is meant; "" if none is close."""
     from difflib import get_close_matches
 
-    close = get_close_matches(name, list(names), 1)
-    return f"did you mean {close[0]}? " if close else ""
+    folded = {each.casefold(): each for each in names}
+    close = get_close_matches(name.casefold(), list(folded), 1)
+    return f"did you mean {folded[close[0]]}? " if close else ""
 
 
 def call(function: str, *values: str | Path, **parameters: Any) -> str:

@@ -62,6 +62,26 @@ def publish_stream(path: Path) -> Iterator[IO[bytes]]:
         raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
 
 
+@contextmanager
+def publish_folder(folder: Path) -> Iterator[Path]:
+    """A path of the same name for a folder that the block makes; when it succeeds, that folder replaces ``folder``.
+
+    If the block fails, it is removed. Raises McaptrackError if it can't be written.
+    """
+    part = folder.with_name(shortened(f".{folder.name}", _NAME_BYTES) + ".part")
+    rmtree(part, ignore_errors=True)
+    try:
+        part.mkdir(parents=True)
+        yield part / folder.name
+        if folder.exists():
+            folder.rename(part / "before")  # removed in one step: half of it would be taken for another one
+        (part / folder.name).rename(folder)
+    except OSError as error:
+        raise McaptrackError(f"{folder} can't be written: {error.strerror or error}") from error
+    finally:
+        rmtree(part, ignore_errors=True)
+
+
 def publish_bytes(path: Path, data: bytes) -> None:
     """Write a small file atomically. Raises McaptrackError if it can't be written."""
     with publish_stream(path) as stream:

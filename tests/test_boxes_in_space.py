@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import log
+from mcaptrack.contracts import Box3d
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import collected
@@ -20,7 +21,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources import camera_motion
 from mcaptrack.sources.fixed_frame import named_detections, recorded, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType
-from mcaptrack.sources.foreign.boxes import Box3d, Message3d, boxes_3d_decoder
+from mcaptrack.sources.foreign.boxes import Message3d, boxes_3d_decoder
 from tests.ros_messages import Ros
 from tests.space_logs import (
     NAMES,

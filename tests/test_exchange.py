@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import find
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.ingest.labels.content import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
@@ -71,7 +72,7 @@ CVAT_EXAMPLE = """<?xml version="1.0" encoding="utf-8"?>
 </annotations>
 """
 
-_WRITERS = {name: form.write for name, form in _FORMATS.items() if form.write}
+_WRITERS = {name: find("exporter", name).cls for name in _FORMATS if name != "rerun"}
 
 
 def box(frame: int, left: float, outside: int = 0, more: str = "", inner: str = "") -> str:

@@ -15,10 +15,10 @@ import pytest
 import mcaptrack
 from mcaptrack import environment
 from mcaptrack.api import health
-from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.sources.video.codecs import CODECS
 from tests.commands import call, done
+from tests.distributions import package
 
 
 @pytest.fixture(autouse=True)
@@ -121,15 +121,14 @@ def test_what_an_extra_lacks_is_no_fault(monkeypatch):
     assert "`pip install 'mcaptrack[some]'`" in done("doctor").out
 
 
-def test_a_plug_in_that_cant_be_imported_is_a_warning(monkeypatch):
-    def refuse(kind: str, name: str) -> None:
-        raise McaptrackError(f"{kind} {name} is broken")
-
-    monkeypatch.setattr("mcaptrack.registry.names", lambda kind: ("sort", "mine") if kind == "tracker" else ())
-    monkeypatch.setattr("mcaptrack.registry.find", refuse)
+def test_a_plug_in_that_cant_be_imported_is_a_warning(tmp_path, monkeypatch):
+    package(tmp_path, "own", "1.5", "mcaptrack.trackers", {"mine": "nothing_there:Mine"})
+    monkeypatch.syspath_prepend(str(tmp_path))
     said = json.loads(done("doctor", "--json").out)
-    assert said["plugins"] == {"tracker mine": "tracker mine is broken"}
-    assert [warning["message"] for warning in said["warnings"]] == ["tracker mine is broken"]
+    ((name, why),) = said["plugins"].items()
+    assert name == "tracker mine (own 1.5)"
+    assert why == "tracker mine (own 1.5) can't be imported: ModuleNotFoundError: No module named 'nothing_there'"
+    assert [warning["message"] for warning in said["warnings"]] == [why]
 
 
 def test_limits_are_those_of_the_control_group_and_of_those_above_it(tmp_path):

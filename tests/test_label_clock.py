@@ -24,8 +24,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
-from mcaptrack.sources.ingest.labels.content import FORMATS_3D, OTHERS, Format
-from mcaptrack.sources.ingest.labels.formats import READERS
+from mcaptrack.sources.ingest.labels.content import DATA_SETS
 from mcaptrack.sources.ingest.labels.timeline import timeline_of
 from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.codecs import CODECS
@@ -37,7 +36,6 @@ from tests.worlds import ns, write_clip
 
 #: Corrections belong to tracks of a log: see test_corrections.
 ROLES: tuple[Role, ...] = tuple(role for role in get_args(Role) if role != "corrections")
-FORMATS = tuple(name for name in get_args(Format) if name not in ("auto", *OTHERS, *FORMATS_3D))
 #: By hand: the pictures that are labelled, and by which files. The first ones and the last ones are empty.
 SEEN = {k: [1, 2] if k % 2 else [1] for k in (3, 4, 5, 7, 15)}
 #: For formats that are labelled every so many frames by custom.
@@ -53,12 +51,12 @@ WRITERS: dict[str, Callable[[int, int, bool], str]] = {
 }
 POSITIONS = ("trajnet", "obsmat")
 #: What labels hold makes no difference to their clock, so one format is enough for kinds other than ground truth.
-KINDS = [(f, r) for f, r in itertools.product(FORMATS, ROLES) if r == "truth" or f == "mot"]
+KINDS = [(f, r) for f, r in itertools.product(DATA_SETS, ROLES) if r == "truth" or f == "mot"]
 NAMES = ["-".join(kind) for kind in KINDS]
 
 
 def test_every_format_that_is_read_is_written_here():
-    assert set(WRITERS) == set(FORMATS) == set(READERS)
+    assert set(WRITERS) == set(DATA_SETS)
 
 
 @dataclass
@@ -66,7 +64,7 @@ class World:
     """A file of labels, and everything that it may belong to. Pictures are ``FPS`` a second in all of them."""
 
     folder: Path
-    name: Format = "mot"
+    name: str = "mot"
     role: Role = "truth"
     start_ns: int = 0
     times: list[int] = field(default_factory=list)

@@ -188,6 +188,7 @@ CHANGES: dict[str, Callable[[], Any]] = {
     "NumPy's handling of errors": lambda: np.seterr(all="raise"),
     "the recursion limit": lambda: sys.setrecursionlimit(sys.getrecursionlimit() + 100),
     "the filters of warnings": lambda: warnings.simplefilter("ignore"),
+    "sys.path": lambda: sys.path.__delitem__(slice(None)),
     "the random state of Python": lambda: random.seed(3),
     "the random state of NumPy": lambda: np.random.seed(3),  # noqa: NPY002
 }
@@ -201,6 +202,7 @@ def state() -> tuple[Any, ...]:
         np.geterr(),
         sys.getrecursionlimit(),
         [*warnings.filters],
+        [*sys.path],
         random.getstate(),
         np.random.get_state()[1].tolist(),  # noqa: NPY002
     )
@@ -229,15 +231,15 @@ def test_what_code_of_others_changes_is_undone_at_once_and_named_once(change):
 
     def source() -> Iterator[Any]:
         for frame in sample_frames(DETECTIONS):
-            seen.append(state()[:5])
+            seen.append(state()[:6])
             yield frame
 
     cls = Changing
     with collected() as said:
         for _ in guarded(Entry("mine", "tracker", cls, __name__, "", ""), cls(change), source()):
-            assert state()[:5] == before[:5]
+            assert state()[:6] == before[:6]
     assert state() == before
-    assert all(one == before[:5] for one in seen)
+    assert all(one == before[:6] for one in seen)
     assert [notice.message for notice in said] == [f"tracker mine changed {change}; this was undone"]
     with pytest.raises(LawError, match=f"process: it changes {change} of the process"):
         check_transform(cls(change))

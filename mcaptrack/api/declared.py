@@ -223,7 +223,8 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
     """The type of one value of an option, and whether it may have several.
 
     Python takes more than a command line can say: of ``str | Sequence[str]`` an option takes several texts, of
-    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path, of ``Mapping[str, float]`` texts such as a=1.
+    ``float | str | Fraction`` a text, of ``str | os.PathLike`` a path, of ``Mapping[str, float]`` texts such as a=1, of
+    ``Literal["a", "b"] | str`` (names, and those of installed packages) a text.
     """
     members: dict[Any, list[Any]] = {}  # those of all parts of a kind together, such as all choices
     for part in _parts(hint):
@@ -234,7 +235,7 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
         return on_command_line(members[Sequence][0])[0], True
     if os.PathLike in members:
         return Path, False
-    if Literal in members:
+    if Literal in members and str not in members:
         return Literal[tuple(members[Literal])], False
     return next(kind for kind in (str, bool, float, int) if kind in members), False
 
@@ -289,6 +290,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
                 continue
             kinds = _kinds(function).get(name, ())
             choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+            choices = [] if str in kinds else choices
             if "" in map(_name_of, _paths_in(value, kinds)):
                 raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
             if choices:
@@ -419,6 +421,7 @@ def _name_of(path: Any) -> Any:
 def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
     """Raise McaptrackError for a value of another type. Types that aren't in ``_TYPES`` are not checked here."""
     types = {get_origin(kind) or kind for kind in kinds}
+    types -= {Literal} if str in types else set()  # names, and those of installed packages
     if not types & {*_TYPES} or not types <= {*_TYPES, type(None)} or isinstance(value, tuple(types)):
         return
     if bool in types and type(value).__name__ in ("bool", "bool_"):  # NumPy's

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import operator
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
 
 from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
-from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, no_progress, output
+from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, named, no_progress, output
 from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, place_of
-from mcaptrack.location import Location
+from mcaptrack.files import is_same_file, place_of, publish, publish_folder, refuse_overwrite
+from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice, warn
 
 if TYPE_CHECKING:
+    from mcaptrack.api.reading import LogReader
+    from mcaptrack.registry import Entry
     from mcaptrack.tables.rosbag2 import Storage
 
 #: ROS 2 bags by the format of ``export``.
 _BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
+_BUILT_IN = (*get_args(TableFormat), *get_args(BagFormat), *get_args(ExchangeFormat))
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,9 @@ def export(
     log: EachLog,
     output: Annotated[PathLike | None, output("LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log")] = None,
     *,
-    form: Annotated[TableFormat | BagFormat | ExchangeFormat, Option(FILES, flag="format")] = "parquet",
+    form: Annotated[
+        TableFormat | BagFormat | ExchangeFormat | str, named("exporter", _BUILT_IN, FILES, "format")
+    ] = "parquet",
     topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
     blobs: Annotated[bool, Option(FILES)] = False,
     force: Force = False,
@@ -90,7 +97,8 @@ def export(
         working folder.
     form : {"parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3", "mot", "kitti", "coco", "cvat", ...}
         Tables (parquet, arrow, csv, jsonl), a ROS 2 bag, or a file with the boxes of one channel: MOTChallenge, KITTI
-        tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun.
+        tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun; or the format of an installed
+        package, or module:Class.
 
         "rosbag2" is a bag in MCAP, "rosbag2-sqlite3" one in a database.
     topic : str or sequence of str, optional
@@ -136,6 +144,8 @@ def export(
         )
     if form in _BAGS:
         return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
+    if form not in get_args(TableFormat):
+        return _export_by_package(path, optional_path(output), form, topic, blobs, force)
     folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
@@ -202,6 +212,88 @@ def _export_file(
     return ExportResult(
         path, target, {done.topic: done.rows}, (done.topic,), tuple(dict.fromkeys(warnings)), files=(target,)
     )
+
+
+class ExporterOfPackage(NamedTuple):
+    """A format of another package, as the registry found it, its object, and what its class says of it."""
+
+    entry: Entry
+    exporter: Any
+    end: str
+    is_folder: bool
+
+
+def exporter_of_package(form: str) -> ExporterOfPackage | None:
+    """The format of another package that has this name; None for built-in ones.
+
+    Raises McaptrackError if there is none, or if it can't be used.
+    """
+    from mcaptrack.registry import find
+
+    if form in _BUILT_IN:
+        return None
+    entry = find("exporter", form)
+    return exporter_for(entry, entry.made("write"))
+
+
+def exporter_for(entry: Entry, exporter: Any) -> ExporterOfPackage:
+    """An exporter with what its class says. Raises McaptrackError for what it can't say."""
+    end = getattr(exporter, "end", f".{entry.name.rpartition(':')[2].lower()}")
+    if not isinstance(end, str) or not re.fullmatch(r"(\.[\w-]+)+", end):
+        raise McaptrackError(
+            f"{entry} has end = {end!r:.40}; it is the end of the name of a file, such as '.speeds.csv'"
+        )
+    return ExporterOfPackage(entry, exporter, end, bool(getattr(exporter, "is_folder", False)))
+
+
+def _export_by_package(
+    path: Location, output: Path | None, form: str, topic: str | Sequence[str] | None, blobs: bool, force: bool
+) -> ExportResult:
+    """Write a log by the exporter of another package."""
+    from mcaptrack import log as logs
+    from mcaptrack.api.reading import LogReader
+
+    with warnings_about(path) as warnings:
+        by = exporter_of_package(form)
+        assert by is not None
+        warn_unused(f"the {by.entry} has no tables of channels", topic=bool(topic), blobs=blobs)
+        target = output or local_name(path, by.end)
+        if by.is_folder:
+            _refuse_folder(by, target, force)
+        else:
+            refuse_overwrite(target, force)
+        with logs.read(path) as opened:
+            places = [place_of(part.path) for part in opened.parts]
+        for place in places:
+            if isinstance(place, Path) and place_of(target) in (place, *place.parents):
+                raise McaptrackError(f"{target} is a log, or holds it; give another name with `output=`")
+        with LogReader(path) as recording, (publish_folder if by.is_folder else publish)(target) as part:
+            rows = write_by_package(by, recording, part)
+    return ExportResult(path, target, rows, tuple(rows), tuple(dict.fromkeys(warnings)), files=(target,))
+
+
+def _refuse_folder(by: ExporterOfPackage, folder: Path, force: bool) -> None:
+    """Raise McaptrackError for a folder that an exporter may not replace: it may one with the end of its names."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not (folder.is_dir() and folder.name.endswith(by.end)):
+        raise McaptrackError(f"{folder} exists, and only folders named *{by.end} are replaced; name another folder")
+    if not force:
+        raise McaptrackError(f"{folder} exists; `force=True` replaces it")
+
+
+def write_by_package(by: ExporterOfPackage, recording: LogReader, part: Path) -> dict[str, int]:
+    """Let an exporter write a file or folder; returns its numbers of rows. Raises McaptrackError for what is wrong."""
+    from mcaptrack.registry import blamed
+
+    with blamed(by.entry, "failed"):
+        rows = by.exporter.write(recording, part)
+    if not (part.is_dir() if by.is_folder else part.is_file()):
+        raise McaptrackError(
+            f"{by.entry} wrote no {'folder' if by.is_folder else 'file'}; it has to make the path it gets"
+        )
+    with blamed(by.entry, "gave no numbers of rows by the names of tables or channels"):
+        return {str(name): operator.index(count) for name, count in dict(rows).items()}
 
 
 def refuse_same_tables(logs_to_export: Sequence[Location], output: Path | None) -> None:

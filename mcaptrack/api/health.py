@@ -139,8 +139,7 @@ class DoctorResult:
     cache_can_be_written : bool
         Whether it can be made and written.
     plugins : dict of str to str
-        Detectors, trackers, re-trackers and predictors of other packages, as "tracker nearest", and why each can't be
-        imported; "" where it can.
+        Parts of other packages, as "tracker nearest (my-package 1.0)", and why each can't be imported; "" where it can.
     faults : tuple of str
         What a plain run needs, and this installation lacks.
     store : StoreCheck or None
@@ -341,18 +340,17 @@ def _threads(broken: Collection[str]) -> dict[str, str]:
 
 
 def _plugins() -> dict[str, str]:
-    """Import the plug-ins of installed packages; return why each can't be imported, or "", and warn of it."""
-    from mcaptrack.registry import BUILT_IN, KINDS, find, names
+    """Import the parts of installed packages; return why each can't be imported, or "", and warn of it."""
+    from mcaptrack.registry import KINDS, find, points, titled
 
     reasons = {}
     for kind in KINDS:
-        for name in names(kind):
-            if name in BUILT_IN[kind]:
-                continue
-            reasons[f"{kind} {name}"] = ""
+        for point in points(kind):
+            name = titled(kind, point.name, point.package)
+            reasons[name] = ""
             try:
-                find(kind, name)
+                find(kind, point.name, point.package[0])
             except McaptrackError as error:
-                reasons[f"{kind} {name}"] = str(error)
+                reasons[name] = str(error)
                 warn(str(error), "other")
     return reasons

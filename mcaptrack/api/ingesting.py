@@ -9,19 +9,21 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_args
 
 from mcaptrack.api.declared import OneOfMany, Option, declared
 from mcaptrack.api.options import (
     FILES,
     FPS_PATTERN,
     LABELS,
+    PLUGIN,
     Force,
     GroundPlane,
     PathLike,
     PointOfBox,
     Reports,
     Sidecar,
+    named,
     no_progress,
     output,
 )
@@ -126,7 +128,9 @@ def ingest(
     tracks: _Labels = None,
     truth: _Labels = None,
     motion: Annotated[PathLike | None, Option(_PICTURES)] = None,
-    label_format: Annotated[LabelFormat, Option(_READING, flag="format", tuning=True)] = "auto",
+    label_format: Annotated[
+        LabelFormat | str, named("label_format", get_args(LabelFormat), _READING, "format", PLUGIN)
+    ] = "auto",
     first_frame: Annotated[int | None, Option(_READING, 0, 10**12, tuning=True)] = None,
     frames: Annotated[int | None, Option(_READING, 1, 10_000_000, tuning=True)] = None,
     columns: Annotated[str | Mapping[str, str] | None, Option(_READING)] = None,
@@ -190,7 +194,8 @@ def ingest(
         File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform from pixels of
         the frame before.
     label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "cvat", "yolo", "supervision", ...}
-        Format of the label files. auto: as the content tells; csv: any table with a header.
+        Format of the label files, one of an installed package, or module:Class. auto: as the content tells; csv: any
+        table with a header.
 
         Those of 3D boxes are "csv", "kitti-3d", "nuscenes" and "argoverse".
     first_frame : int, optional
@@ -255,6 +260,7 @@ def ingest(
     from mcaptrack.sources.ingest import ingest as make_log
     from mcaptrack.sources.ingest.labels.content import WantedClasses
     from mcaptrack.sources.ingest.labels.delimited import parse_columns
+    from mcaptrack.sources.ingest.labels.of_packages import format_of_package
 
     if into is not None and output is not None:
         raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
@@ -287,6 +293,7 @@ def ingest(
     )
     make = partial(make_log, path, options=options, progress=progress)
     with warnings_about(path) as warnings:
+        format_of_package(label_format)  # refused before anything is read
         if into is None:
             target = default_log(path) if output is None else log_output(output, path)
             refuse_overwrite(target, force or is_same_file(target, path))

@@ -116,6 +116,17 @@ def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown
     return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)
 
 
+def named(kind: Kind, built_in: Sequence[str], panel: str, flag: str, tuning: str = "") -> Option:
+    """The option that chooses a format by name: a built-in one, or of another package."""
+
+    def every() -> Sequence[str]:
+        from mcaptrack.registry import others
+
+        return (*built_in, *others(kind))
+
+    return Option(panel, flag=flag, tuning=tuning or False, metavar="|".join(built_in), names=every)
+
+
 Output = Annotated[PathLike | None, output()]
 MinIou = Annotated[float, min_iou()]
 

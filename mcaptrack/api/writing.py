@@ -18,10 +18,10 @@ from mcaptrack.api.rows import frames_of
 from mcaptrack.api.running import warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes, plane_at
+from mcaptrack.installed import distribution_of
 from mcaptrack.location import Location
 from mcaptrack.pipeline.views import WITH_VIEWS, make_views
 from mcaptrack.pipeline.write import Made, RunState, write
-from mcaptrack.registry import distribution_of, entry_points, package_of
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import has_classes
 from mcaptrack.schema.own import columns_in_metadata, name_for
@@ -117,6 +117,8 @@ def _program(by: str | None) -> str:
 
 def _running_program() -> str:
     """Return the name of the running program, with the version of its package."""
+    from importlib import metadata
+
     main = sys.modules.get("__main__")
     spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
     if spec is not None:
@@ -125,8 +127,8 @@ def _running_program() -> str:
     if not file:
         return "a notebook" if "ipykernel" in sys.modules else "Python"
     script = Path(file)
-    points = entry_points("console_scripts") if not script.suffix else []
-    package = next((package_of(point) for point in points if point.name == script.name), ())
+    points = [] if script.suffix else metadata.entry_points(group="console_scripts", name=script.name)
+    package = next(((point.dist.name, point.dist.version) for point in points if point.dist), ())
     plain = "".join(character if character.isprintable() else "?" for character in script.name)[:_LONGEST_NAME]
     return " ".join(filter(None, package)) or plain
 

@@ -20,6 +20,7 @@ from mcaptrack.cli.settings import may_be_set
 
 _MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
 _MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
+_OF_PACKAGES = "Of installed packages"
 
 
 class Listed(NamedTuple):
@@ -107,8 +108,40 @@ def make(entry: Listed, function: Any = None) -> Any:
     return get_command(app)
 
 
+class OfPackage(Listed):
+    """A command of an installed package, which is imported when the command is called."""
+
+    @property
+    def summary(self) -> str:
+        """Its line in the help: the package."""
+        return f"Of {self.place}."
+
+    @property
+    def command(self) -> Any:
+        """The class of the command."""
+        from mcaptrack.cli.installed import class_of
+
+        return class_of(self.name)
+
+
+def of_packages() -> dict[str, OfPackage]:
+    """The commands of installed packages by name. Imports none of them.
+
+    Those with a name of ours, or one that is no word, are left out.
+    """
+    from mcaptrack.installed import entry_points
+
+    points = sorted(entry_points("mcaptrack.commands"), key=lambda point: point.name)
+    named = {point.name: " ".join(point.package).strip() or point.value for point in points}
+    return {name: OfPackage(name, _OF_PACKAGES, place) for name, place in named.items() if _is_free(name)}
+
+
+def _is_free(name: str) -> bool:
+    return name not in ENTRIES and re.fullmatch(r"\w[\w-]*", name) is not None
+
+
 class Commands(Mapping[str, Any]):
-    """The commands by name; each is made when it is looked up."""
+    """The built-in commands by name, and that of a package which is called; each is made when it is looked up."""
 
     def __init__(self, made: dict[str, Any] | None = None, changed: Mapping[str, Any] | None = None) -> None:
         self._made, self._changed = {} if made is None else made, changed or {}
@@ -121,17 +154,17 @@ class Commands(Mapping[str, Any]):
         return self._made[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(ENTRIES)
+        return iter({**ENTRIES, **self._changed})
 
     def __len__(self) -> int:
-        return len(ENTRIES)
+        return len({**ENTRIES, **self._changed})
 
     def __contains__(self, name: object) -> bool:
-        return name in ENTRIES
+        return name in ENTRIES or name in self._changed
 
-    def changed(self, functions: Mapping[str, Any]) -> Commands:
-        """Return a copy of the table, with other functions for some commands."""
-        return Commands(self._made, {name: make(ENTRIES[name], function) for name, function in functions.items()})
+    def changed(self, commands: Mapping[str, Any]) -> Commands:
+        """Return a copy of the table, with others in the place of some commands, or with one more."""
+        return Commands(self._made, {**self._changed, **commands})
 
 
 class Group(TyperGroup):
@@ -145,13 +178,20 @@ class Group(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the names of all commands, without making them."""
-        return list(self.commands)
+        return [*self.commands, *of_packages()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command; one that shows no more than its line, while the commands are listed."""
-        if not self._lists or cmd_name not in self.commands:
-            return super().get_command(ctx, cmd_name) if cmd_name in self.commands else None
-        entry = ENTRIES[cmd_name]
+        """Return a command; one that shows no more than its line, while the commands are listed.
+
+        One of a package that can't be imported ends the program with one line.
+        """
+        entry = ENTRIES.get(cmd_name) or of_packages().get(cmd_name)
+        if entry is None:
+            return None
+        if not self._lists:
+            if cmd_name not in self.commands:
+                self.commands = self.commands.changed({cmd_name: _made_of_package(entry)})
+            return super().get_command(ctx, cmd_name)
         line: Any = typer.core.TyperCommand(cmd_name, help=entry.summary, rich_help_panel=entry.panel)
         return line
 
@@ -175,7 +215,8 @@ class Group(TyperGroup):
         """Parse the options before the command; refuse an unknown one in one line."""
         if not args:
             return super().parse_args(ctx, args)  # which prints the help
-        self.commands = self._own.changed(_with_plugins(self._own, args))
+        functions = _with_plugins(self._own, args)
+        self.commands = self._own.changed({name: make(ENTRIES[name], functions[name]) for name in functions})
         with usage_in_one_line():
             return super().parse_args(ctx, args)
 
@@ -183,6 +224,21 @@ class Group(TyperGroup):
         """Find the command; refuse an unknown one in one line."""
         with usage_in_one_line():
             return super().resolve_command(ctx, args)
+
+
+def _made_of_package(entry: Listed) -> Any:
+    """Make a command of a package; what it prints at its import goes to stderr. One that fails is said in one line."""
+    from mcaptrack.cli.common import REFUSED
+    from mcaptrack.cli.text import say, stdout_to_stderr
+    from mcaptrack.errors import McaptrackError
+    from mcaptrack.notices import listening
+
+    try:
+        with stdout_to_stderr(), listening(lambda notice: say(notice.message, "warning")):
+            return make(entry)
+    except McaptrackError as error:
+        say(str(error), "error")
+        raise typer.Exit(REFUSED) from None
 
 
 def _with_plugins(commands: Commands, arguments: list[str]) -> dict[str, Any]:

@@ -154,6 +154,8 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
         command = name.removeprefix(PREFIX).partition("_")[0].lower()
         own = commands[command].settings.values() if command in commands else ()
         setting = next((candidate for candidate in own if candidate.variable == name), None)
+        if setting is None and command not in commands and _is_of_package(command):
+            continue
         if setting is None:
             variables = [each.variable for command in commands for each in commands[command].settings.values()]
             refuse_usage(f"the environment variable {name} names no option{nearest(name, [*variables, *VARIABLES])}")
@@ -168,6 +170,8 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
 
 def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Setting, Given]]:
     for command, values in file.tables.items():
+        if command not in commands and _is_of_package(command):
+            continue
         if command not in commands:
             refuse_usage(f"{file.path}: there is no command {command}{nearest(command, commands)}")
         if not isinstance(values, dict):
@@ -190,6 +194,13 @@ def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Sett
                     f"--{name} or {own[name].variable}, or put it into {user_file()} or a file for --config"
                 )
             yield command, own[name], Given(taken, where, 2)
+
+
+def _is_of_package(command: str) -> bool:
+    """Whether a command is of an installed package; it isn't imported to check its options unless it is called."""
+    from mcaptrack.registry import others
+
+    return command in others("command")
 
 
 def found_of(command: str) -> dict[str, tuple[Setting, Given]]:

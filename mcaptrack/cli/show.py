@@ -70,9 +70,13 @@ class Export(EachLog["ExportResult"]):
 
     def suffix(self) -> str:
         """Return the end of the names of bags and files."""
+        from mcaptrack.api.exporting import exporter_of_package
         from mcaptrack.tables.exchange import ends_with
 
         form: str = self.values["form"]
+        of_package = exporter_of_package(form)
+        if of_package is not None:
+            return of_package.end
         return ".rosbag2" if form.startswith("rosbag2") else ends_with(form)
 
     def show(self, log: Location, done: ExportResult, talk: common.Talk) -> None:

@@ -1,10 +1,10 @@
-"""Find detectors, trackers, predictors, re-trackers and fusers by name: built-in ones and those of other packages.
+"""Find detectors, trackers, exporters and so on (``KINDS``) by name: built-in ones and those of other packages.
 
 There are three kinds of names, on the command line, in files for ``--config`` and in Python:
 
 * Built-in names, as in ``find("tracker", "sort")``.
 * Names of entry points. A package declares them in its ``pyproject.toml``, in the group of their kind
-  (``mcaptrack.detectors``, ``.trackers``, ``.predictors``, ``.retrackers``, ``.fusers``)::
+  (``mcaptrack.detectors``, ``mcaptrack.label_formats`` and so on)::
 
       [project.entry-points."mcaptrack.trackers"]
       nearest = "my_package.tracking:NearestTracker"
@@ -16,8 +16,8 @@ the module of the entry that it finds. ``entry_of`` is the inverse: from a class
 channel stores the fields of an ``Entry``: name, module and class, and the name and version of the distribution (the
 installed package).
 
-Interfaces are defined in ``mcaptrack.transforms.protocol`` and ``mcaptrack.predictors.forecast``. To add a built-in
-entry: a line in ``BUILT_IN``.
+Interfaces are defined in ``mcaptrack.transforms.protocol``, ``mcaptrack.predictors.forecast`` and
+``mcaptrack.contracts``. To add a built-in entry: a line in ``BUILT_IN``.
 """
 
 from __future__ import annotations
@@ -27,26 +27,36 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import lru_cache
-from importlib import import_module, metadata
-from importlib.metadata import Distribution, EntryPoint
+from importlib import import_module
 from pathlib import Path
 from traceback import extract_tb
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
-from mcaptrack import __version__
+from mcaptrack import _MODULES, __version__
 from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.installed import Point, declared, distribution_of, entry_points
 from mcaptrack.registry.guard import Guard, contained_import
 
-Kind = Literal["detector", "tracker", "predictor", "retracker", "fuser"]
+Kind = Literal[
+    "detector", "tracker", "predictor", "retracker", "fuser", "label_format", "message_reader", "exporter", "command"
+]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
 _FOLDER: Final = Path(__file__).parent.parent
 #: Exit codes of processes that end by a signal.
 _SIGNALLED: Final = frozenset(128 + number for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 1)))
 
-#: Module and class of the built-in entries, by kind and name; the first of a kind is its default.
+_LABELS: Final = "mcaptrack.sources.ingest.labels"
+_BOXES: Final = "mcaptrack.sources.foreign.boxes"
+#: Commands that a function of the library of this name declares.
+_COMMANDS: Final = (
+    "ingest demo run detect motion track sample predict retrack fuse models info view render report query export "
+    "evaluate events zones calibrate tune train check recover drop doctor"
+)
+#: Kinds that only entry points name.
+_BY_ENTRY_POINT: Final = ("message_reader", "command")
+#: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
         "detector": {
@@ -79,6 +89,47 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "fuser": {
             "feet": "mcaptrack.transforms.fuse:FootFuser",
         },
+        "label_format": {
+            "mot": f"{_LABELS}.formats:read_mot",
+            "kitti": f"{_LABELS}.formats:read_kitti",
+            "sdd": f"{_LABELS}.formats:read_sdd",
+            "trajnet": f"{_LABELS}.formats:read_trajnet",
+            "obsmat": f"{_LABELS}.formats:read_obsmat",
+            "coco": f"{_LABELS}.json_boxes:read_json",
+            "cvat": f"{_LABELS}.cvat:read_cvat",
+            "yolo": f"{_LABELS}.yolo:read_yolo",
+            "supervision": f"{_LABELS}.delimited:read_rows",
+            "csv": f"{_LABELS}.delimited:read_csv",
+            "kitti-3d": f"{_LABELS}.formats:read_kitti_3d",
+            "nuscenes": f"{_LABELS}.nuscenes:read_nuscenes",
+            "argoverse": f"{_LABELS}.argoverse:read_argoverse",
+        },
+        # By the name of the type of message, as in ROS 1 and Foxglove; the first is of boxes in pictures.
+        "message_reader": {
+            "vision_msgs/Detection2DArray": f"{_BOXES}:detections_2d",
+            "vision_msgs/Detection3DArray": f"{_BOXES}:detections_3d",
+            "foxglove.SceneUpdate": f"{_BOXES}:scene_cubes",
+            "visualization_msgs/MarkerArray": f"{_BOXES}:marker_cubes",
+            "visualization_msgs/Marker": f"{_BOXES}:marker_cubes",
+            "jsk_recognition_msgs/BoundingBoxArray": f"{_BOXES}:jsk_boxes",
+            "derived_object_msgs/ObjectArray": f"{_BOXES}:derived_objects",
+            "autoware_perception_msgs/DetectedObjects": f"{_BOXES}:autoware_objects",
+            "autoware_perception_msgs/TrackedObjects": f"{_BOXES}:autoware_objects",
+            "autoware_auto_perception_msgs/DetectedObjects": f"{_BOXES}:autoware_objects",
+            "autoware_auto_perception_msgs/TrackedObjects": f"{_BOXES}:autoware_objects",
+        },
+        "exporter": {
+            **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
+            **dict.fromkeys(("rosbag2", "rosbag2-sqlite3"), "mcaptrack.tables.rosbag2:write_bag"),
+            "mot": "mcaptrack.tables.exchange.text:mot",
+            "kitti": "mcaptrack.tables.exchange.text:kitti",
+            "coco": "mcaptrack.tables.exchange.coco:coco",
+            "cvat": "mcaptrack.tables.exchange.cvat:cvat",
+            "boxes-csv": "mcaptrack.tables.exchange.text:boxes_csv",
+            "rerun": "mcaptrack.tables.exchange.rerun_file:write_recording",
+        },
+        "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
+        | {"docs": "mcaptrack.cli.docs:documentation"},
     }
 )
 
@@ -94,7 +145,7 @@ class Entry:
     kind : str
         One of ``KINDS``.
     cls : type
-        The class; a predictor may be a function that returns one.
+        The class; a predictor may be a function that returns one, and a command is a function.
     module : str
         The module that defines the class.
     distribution, version : str
@@ -120,8 +171,26 @@ class Entry:
 
     def __str__(self) -> str:
         """Its name in messages: ``tracker nearest (my-package 1.0)``."""
-        package = f"{self.distribution} {self.version}".strip()
-        return f"{self.kind} {self.name}" + (f" ({package})" if package and not self.is_built_in else "")
+        return titled(self.kind, self.name, ("", "") if self.is_built_in else (self.distribution, self.version))
+
+    def made(self, *methods: str) -> Any:
+        """An object of the class, with these methods. Raises McaptrackError if it can't be made, or lacks one."""
+        with blamed(self, "could not be made"):
+            instance = self.cls()
+        for method in methods:
+            if not callable(getattr(instance, method, None)):
+                raise McaptrackError(f"{self} has no method {method}, so it is no {in_words(self.kind)}")
+        return instance
+
+
+def in_words(kind: str) -> str:
+    """A kind in messages: "label format"."""
+    return kind.replace("_", " ")
+
+
+def titled(kind: str, name: str, package: tuple[str, str] = ("", "")) -> str:
+    """An entry in messages: ``tracker nearest (my-package 1.0)``, by its kind, its name, and package and version."""
+    return f"{in_words(kind)} {name}" + (f" ({' '.join(package).strip()})" if any(package) else "")
 
 
 def _group(kind: str) -> str:
@@ -129,83 +198,14 @@ def _group(kind: str) -> str:
     return f"{_OWN}.{kind}s"
 
 
-# Installed packages: their entry points, and which of them a module is of.
-
-
-def distribution_of(module: str) -> tuple[str, str]:
-    """Name and version of the distribution of a module; "" and "" if unknown, as for those installed as editable."""
-    names = _owners(_places()).get(module.partition(".")[0])
-    return (names[0], metadata.version(names[0])) if names else ("", "")
-
-
-def entry_points(group: str, unreadable: list[str] | None = None) -> list[EntryPoint]:
-    """The entry points of a group.
-
-    Packages with entry points that can't be read are left out; their names are added to ``unreadable``.
-    """
-    points, failed = _declared(_places(), group)
-    if unreadable is not None:
-        unreadable += failed
-    return [point for point in points if ":" not in point.name]
-
-
-def package_of(point: EntryPoint) -> tuple[str, str]:
-    """Name and version of the distribution that declares an entry point."""
-    return _name_and_version(point.dist)
-
-
-def _places() -> tuple[tuple[str, int], ...]:
-    """The folders of ``sys.path`` and when each last changed: they tell whether something was installed."""
-    return tuple((place, _changed_ns(place)) for place in sys.path)
-
-
-def _changed_ns(place: str) -> int:
-    """The time when a folder of ``sys.path`` last gained or lost an entry; 0 if it is no folder."""
-    try:
-        return Path(place or ".").stat().st_mtime_ns
-    except OSError:
-        return 0
-
-
-@lru_cache(maxsize=4)
-def _owners(_places: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
-    """The distributions of each top-level module; kept until something is installed, for it reads all metadata."""
-    try:
-        return metadata.packages_distributions()
-    except Exception:  # metadata of another package that can't be read
-        return {}
-
-
-@lru_cache(maxsize=32)
-def _declared(_places: tuple[tuple[str, int], ...], group: str) -> tuple[list[EntryPoint], list[str]]:
-    """Entry points of a group, and packages with entry points that can't be read; kept until something is installed."""
-    try:
-        return list(metadata.entry_points(group=group)), []
-    except Exception:  # those of one package can't be read; the others count all the same
-        points: list[EntryPoint] = []
-        failed: list[str] = []
-    for distribution in metadata.distributions():
-        try:
-            points += [point for point in distribution.entry_points if point.group == group]
-        except Exception:
-            failed.append(_name_and_version(distribution)[0])
-    return points, failed
-
-
-def _name_and_version(distribution: Distribution | None) -> tuple[str, str]:
-    """Name and version of a distribution; "" for what its metadata lack."""
-    try:
-        fields = distribution.metadata if distribution is not None else None
-        # some versions of importlib raise an error at fields["Name"] where it is missing
-        name, version = (fields.get_all(name, [""])[0] if fields else "" for name in ("Name", "Version"))
-    except Exception:  # metadata that can't be read
-        return "", ""
-    return name or "", version or ""
-
-
 def names(kind: Kind) -> tuple[str, ...]:
     """All names of a kind: built-in ones, then those of entry points. Imports nothing."""
-    return (*BUILT_IN[kind], *sorted({point.name for point in entry_points(_group(kind))} - set(BUILT_IN[kind])))
+    return (*BUILT_IN[kind], *sorted({point.name for point in points(kind)}))
+
+
+def points(kind: Kind) -> list[Point]:
+    """The entry points of a kind; those with the name of a built-in entry don't count."""
+    return [point for point in entry_points(_group(kind)) if point.name not in BUILT_IN[kind]]
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:
@@ -235,21 +235,23 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     'mcaptrack.transforms.sort.ocsort:OcSort'
     """
     if name in BUILT_IN[kind]:
-        implementation = _load(f"{kind} {name}", BUILT_IN[kind][name])
+        implementation = _load(titled(kind, name), BUILT_IN[kind][name])
         return Entry(name, kind, implementation, implementation.__module__, _OWN, __version__)
     if ":" in name:
         with _working_folder():
-            implementation = _load(f"{kind} {name}", name)
+            implementation = _load(titled(kind, name), name)
         return Entry(name, kind, implementation, implementation.__module__, *distribution_of(implementation.__module__))
-    points = [point for point in entry_points(_group(kind)) if point.name == name]
-    if not points:
+    named = [point for point in points(kind) if point.name == name]
+    if not named:
         raise McaptrackError(_unknown(kind, name))
-    points = [point for point in points if package_of(point)[0] == distribution] or points
-    if len(points) > 1:
-        values = " and ".join(sorted(f"{point.value} ({' '.join(package_of(point))})" for point in points))
-        raise McaptrackError(f"several installed packages have a {kind} {name}: {values}; name one as module:Class")
-    package = package_of(points[0])
-    implementation = _load(f"{kind} {name} ({' '.join(package)})", points[0].value)
+    named = [point for point in named if point.package[0] == distribution] or named
+    if len(named) > 1:
+        values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))
+        what = titled(kind, name)
+        hint = "remove one of them" if kind in _BY_ENTRY_POINT else "name one as module:Class"
+        raise McaptrackError(f"several installed packages have a {what}: {values}; {hint}")
+    package = named[0].package
+    implementation = _load(titled(kind, name, package), named[0].value)
     return Entry(name, kind, implementation, implementation.__module__, *package)
 
 
@@ -266,8 +268,13 @@ def entry_of(kind: str, cls: type) -> Entry:
     for point in entry_points(_group(kind)):
         same_package = point.value.partition(":")[0].partition(".")[0] == top
         if same_package and point.name not in built_in and _is(point, cls):
-            return Entry(point.name, kind, cls, cls.__module__, *package_of(point))
+            return Entry(point.name, kind, cls, cls.__module__, *point.package)
     return Entry(f"{cls.__module__}:{cls.__qualname__}", kind, cls, cls.__module__, *distribution_of(cls.__module__))
+
+
+def others(kind: Kind) -> tuple[str, ...]:
+    """The names of the entry points of a kind. Imports nothing."""
+    return names(kind)[len(BUILT_IN[kind]) :]
 
 
 def is_installed(kind: Kind, name: str) -> bool:
@@ -316,13 +323,10 @@ def _words(error: BaseException) -> str:
         return type(error).__name__
 
 
-def _is(point: EntryPoint, cls: type) -> bool:
+def _is(point: Point, cls: type) -> bool:
     try:
-        with contained_import(f"the package of {point.name}"):
-            return point.load() is cls
-    except BaseException as error:  # an entry point that can't be imported is another class
-        if is_interruption(error):
-            raise
+        return _load(f"the package of {point.name}", point.value) is cls
+    except McaptrackError:  # an entry point that can't be imported is another class
         return False
 
 
@@ -361,11 +365,10 @@ def _working_folder() -> Iterator[None]:
 
 
 def _unknown(kind: Kind, name: str) -> str:
-    all_names, unreadable = names(kind), list[str]()
-    entry_points(_group(kind), unreadable)
-    choices = f"there are {', '.join(all_names)}" if all_names else f"no {kind} is built in or installed"
+    all_names, unreadable, what = names(kind), declared().unreadable, in_words(kind)
+    choices = f"there are {', '.join(all_names)}" if all_names else f"no {what} is built in or installed"
     return (
-        f"no {kind} is called {name}; {did_you_mean(name, all_names)}{choices}; an installed package gives more by its "
-        f"entry points in {_OWN}.{kind}s, and module:Class names any class"
+        f"no {what} is called {name:.80}; {did_you_mean(name, all_names)}{choices}; an installed package gives more by "
+        f"its entry points in {_OWN}.{kind}s, and module:Class names any class"
         + (f". The entry points of {', '.join(unreadable)} can't be read" if unreadable else "")
     )

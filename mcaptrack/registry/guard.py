@@ -20,6 +20,8 @@ from typing import Any, Final, NamedTuple, NoReturn
 
 from mcaptrack.notices import warn
 
+#: How the warning of a change ends.
+UNDONE: Final = "; this was undone"
 #: After so long the import of another package is said to take long.
 _LONG_S: Final = 10.0
 _SIGNALS: Final = tuple(
@@ -29,12 +31,14 @@ _Filters = tuple[Any, ...]
 
 
 class _Facet(NamedTuple):
-    """A part of the state of this process: its name, how to read and write it, and what of it counts as a change."""
+    """A part of the state of this process: its name, how to read and write it, and whether a change of it, from a value
+    to another, counts.
+    """
 
     name: str
     read: Callable[[], Any]
     write: Callable[[Any], object]
-    key: Callable[[Any], Any] = lambda value: value
+    differs: Callable[[Any, Any], bool] = lambda before, after: before != after
 
 
 def _read_folder() -> str:
@@ -73,6 +77,10 @@ def _write_numpy_random(state: Any) -> None:
     np.random.set_state(state)  # noqa: NPY002
 
 
+def _plain_state(state: Any) -> tuple[Any, ...]:
+    return (state[0], state[1].tobytes(), *state[2:])
+
+
 def _is_broad(entry: Any) -> bool:
     """Whether a filter concerns Python's own warnings, of all texts and modules: others only serve their package."""
     return entry[1] is None and entry[3] is None and entry[2].__module__ == "builtins"
@@ -92,7 +100,24 @@ def _write_handlers(handlers: dict[signal.Signals, Any]) -> None:
             signal.signal(number, handler)
 
 
+def _read_path() -> list[Any]:
+    places: Any = sys.path
+    if not isinstance(places, list):
+        sys.path = []
+    return list(sys.path)
+
+
+def _write_path(places: list[Any]) -> None:
+    """Restore the places; those that others have added stay, since their later imports may need them."""
+    sys.path[:] = [*places, *(place for place in _read_path() if place not in places)]
+
+
+def _lacks_some(before: list[Any], after: list[Any]) -> bool:
+    return before != [place for place in after if place in before]
+
+
 _FACETS: Final = (
+    _Facet("sys.path", _read_path, _write_path, _lacks_some),
     _Facet("the working folder", _read_folder, _write_folder),
     *(
         _Facet(
@@ -108,7 +133,7 @@ _FACETS: Final = (
         "the filters of warnings",
         lambda: tuple(warnings.filters),
         _write_filters,
-        lambda filters: [entry for entry in filters if _is_broad(entry)],
+        lambda before, after: list(filter(_is_broad, before)) != list(filter(_is_broad, after)),
     ),
     _Facet("the locale", lambda: locale.setlocale(locale.LC_ALL), lambda name: locale.setlocale(locale.LC_ALL, name)),
 )
@@ -119,7 +144,7 @@ _RANDOM: Final = (
         "the random state of NumPy",
         _read_numpy_random,
         _write_numpy_random,
-        lambda state: (state[0], state[1].tobytes(), *state[2:]),
+        lambda before, after: _plain_state(before) != _plain_state(after),
     ),
 )
 
@@ -187,7 +212,7 @@ class Guard:
         for facet in facets:
             before, after = self._ours.pop(facet), facet.read()
             self._theirs.pop(facet, None)
-            if facet.key(after) != facet.key(before):
+            if facet.differs(before, after):
                 self._theirs[facet] = after
                 facet.write(before)
                 self.changed += [facet.name] if facet.name not in self.changed else []
@@ -197,7 +222,7 @@ class Guard:
         self._end(_RANDOM if _RANDOM[0] in self._ours else ())
         if names := self.changed[self._warned :]:
             self._warned = len(self.changed)
-            warn(f"{self.name} changed {' and '.join(names)}; this was undone")
+            warn(f"{self.name} changed {' and '.join(names)}{UNDONE}")
 
 
 @contextmanager

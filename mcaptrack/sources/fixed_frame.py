@@ -19,6 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mcaptrack import log
+from mcaptrack.contracts import Box3d
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
@@ -38,7 +39,7 @@ from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
 from mcaptrack.schema.classes import UNKNOWN
 from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.foreign.boxes import Box3d, Classes, Message3d
+from mcaptrack.sources.foreign.boxes import Classes, Message3d
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
 

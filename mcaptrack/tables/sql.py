@@ -274,7 +274,7 @@ class Database:
             name = missing.group(1)
             names = [*TABLES, *sorted(self._loaded - set(TABLES))]
             channels = self.channels if "/" in name else ()
-            question = did_you_mean(name, [*names, *channels]) or did_you_mean(name.lower(), names)
+            question = did_you_mean(name, [*names, *channels])
             nearest = f" ({question.rstrip()})" if question else ""
             more = f"the channels {', '.join(channels)}" if channels else "channels in double quotes"
             return f"there is no table {name}{nearest}; there are {', '.join(names)}, and {more}"

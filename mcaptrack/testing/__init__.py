@@ -1,4 +1,4 @@
-"""Test a transform, or a predictor, against the laws that hold for every one.
+"""Test a transform, a predictor, a format or a command against the laws that hold for every one of its kind.
 
 from mcaptrack.testing import check_predictor, check_transform
 
@@ -10,13 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from mcaptrack.notices import collected
 from mcaptrack.predictors import AnyPredictor, PeopleSeen, predict_among
 from mcaptrack.predictors.onnx import are_covariances
-from mcaptrack.registry.guard import Guard
-from mcaptrack.testing.transforms import LAWS, LawError, check_transform, sample_frames
+from mcaptrack.testing.formats import check_command, check_exporter, check_label_format, check_message_reader
+from mcaptrack.testing.transforms import LAWS, LawError, check_transform, same_process, sample_frames
 
-__all__ = ["LAWS", "LawError", "check_predictor", "check_transform", "sample_frames"]
+__all__ = [
+    "LAWS",
+    "LawError",
+    "check_command",
+    "check_exporter",
+    "check_label_format",
+    "check_message_reader",
+    "check_predictor",
+    "check_transform",
+    "sample_frames",
+]
 
 
 # The laws that hold for every predictor.
@@ -63,13 +72,8 @@ def check_predictor(predictor: AnyPredictor, *, rotates: bool = False, seed: int
         mean, cov = predict_among(predictor, people.xy_m[people.row], people.valid[people.row], people)
         return np.asarray(mean), np.asarray(cov)
 
-    guard = Guard("")
-    with guard.step():
+    with same_process(type(predictor).__name__):
         mean, cov = ask(people)
-    with collected():
-        guard.end()
-    if guard.changed:
-        raise LawError(f"process: it changes {' and '.join(guard.changed)} of the process that it runs in")
     shapes = ((5, predictor.steps, 2), (5, predictor.steps, 2, 2))
     if (mean.shape, cov.shape) != shapes:
         raise LawError(f"forecasts: shapes are {mean.shape} and {cov.shape}, not {shapes[0]} and {shapes[1]}")

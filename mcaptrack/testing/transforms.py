@@ -6,7 +6,8 @@ Letters: N rows, H and W pixels.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, fields, is_dataclass
 from typing import Any, Final
 
@@ -17,14 +18,14 @@ from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.notices import collected
 from mcaptrack.registry import Entry
-from mcaptrack.registry.guard import Guard
+from mcaptrack.registry.guard import UNDONE, Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, latency_of, traits_of
 
 
 class LawError(AssertionError):
-    """A transform or a predictor breaks a law; the message says which one, and where."""
+    """A transform, a predictor, a format or so on breaks a law; the message says which one, and where."""
 
 
 def check_transform(transform: Transform, frames: Sequence[Frame] | None = None, *, seed: int = 0) -> None:
@@ -62,16 +63,26 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     inputs = list(sample)
     if not inputs:
         raise LawError("there are no frames to check the transform with")
-    guard = Guard(type(transform).__name__)
-    try:
-        with guard.step():
-            for law in LAWS.values():
-                law(transform, [frame._replace(rows=frame.rows.copy()) for frame in inputs], seed)
-    finally:
-        with collected():
+    with same_process(type(transform).__name__):
+        for law in LAWS.values():
+            law(transform, [frame._replace(rows=frame.rows.copy()) for frame in inputs], seed)
+
+
+@contextmanager
+def same_process(name: str) -> Iterator[None]:
+    """Check that this block leaves the process as it was; what it changes is undone. Raises LawError if it doesn't."""
+    guard = Guard(name)
+    with collected() as said:
+        try:
+            with guard.step():
+                yield
+        finally:
             guard.end()
     if guard.changed:
         raise LawError(f"process: it changes {' and '.join(guard.changed)} of the process that it runs in")
+    for notice in said:  # of guards within
+        if notice.message.endswith(UNDONE):
+            raise LawError(f"process: {notice.message.removesuffix(UNDONE)} of the process that it runs in")
 
 
 def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Colour = "grey") -> list[Frame]:

@@ -22,7 +22,6 @@ from mcaptrack.location import sibling
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.ingest import label_frames
-from mcaptrack.sources.ingest.labels.content import OTHERS
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.walks import walks
@@ -91,7 +90,7 @@ def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scen
     fps = options.fps
     if fps is None and labels.format == "sdd":
         fps = _SDD_FPS
-    if fps is None and labels.format in ("mot", *OTHERS):
+    if fps is None and (labels.format == "mot" or not labels.is_of_data_set):
         raise McaptrackError(f"{path}: how many frames a second? Say it with `fps=`")
     if fps is None:  # annotated at the rate of prediction
         fps = Fraction(labels.step / step_s).limit_denominator(1000)

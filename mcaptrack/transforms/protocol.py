@@ -19,8 +19,8 @@ All transforms obey these laws; ``mcaptrack.testing.check_transform`` tests them
 * Purity: the same input gives the same output, also for two runs at the same time.
 * Order: another order of the rows of a frame changes nothing but track ids.
 * Empty frames: frames without rows are accepted anywhere.
-* Process: the working folder, the handling of signals and warnings, NumPy's handling of errors, the recursion limit,
-  the locale and the random states are as before (``mcaptrack.registry.guard`` undoes such changes, with a warning).
+* Process: the working folder, sys.path, the handling of signals and warnings, NumPy's handling of errors, the recursion
+  limit, the locale and the random states are as before (``mcaptrack.registry.guard`` undoes changes, with a warning).
 """
 
 from __future__ import annotations

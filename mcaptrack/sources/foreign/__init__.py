@@ -18,7 +18,14 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.foreign.boxes import BOXES_3D_READ, DETECTIONS_READ, DRAWINGS, Message3d, boxes_3d_decoder
+from mcaptrack.sources.foreign.boxes import (
+    BOXES_3D_READ,
+    DETECTIONS_READ,
+    DRAWINGS,
+    Message3d,
+    boxes_3d_decoder,
+    reader_of,
+)
 from mcaptrack.sources.foreign.boxes import Classes as Classes
 from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
 from mcaptrack.sources.foreign.decoding import MessageType as MessageType
@@ -79,15 +86,28 @@ def is_compressed(schema_name: str) -> bool:
     return plain_name(schema_name) in _COMPRESSED
 
 
+def _has_boxes(channel: log.Channel, in_space: bool) -> bool:
+    """Whether a channel's messages are boxes in space, or in pictures, by the name of their schema.
+
+    A warning names a package that reads them and can't be imported.
+    """
+    try:
+        reader = reader_of(channel.schema_name)
+    except McaptrackError as error:
+        warn(f"{error}; messages of {channel.topic} are not read", "other")
+        return False
+    return reader is not None and reader.in_space == in_space
+
+
 def holds_detections(channel: log.Channel) -> bool:
     """Whether a channel's messages are boxes in pictures of another detector, by the name of their schema."""
-    return plain_name(channel.schema_name) in DETECTIONS_READ
+    return _has_boxes(channel, in_space=False)
 
 
 def may_hold_boxes_3d(channel: log.Channel) -> bool:
     """Whether a channel's messages may be 3D boxes of other software, by the name of their schema."""
     is_recorded = Provenance.from_metadata(channel.metadata) is None  # views of mcaptrack are drawings, too
-    return is_recorded and plain_name(channel.schema_name) in BOXES_3D_READ
+    return is_recorded and _has_boxes(channel, in_space=True)
 
 
 def is_drawing(channel: log.Channel) -> bool:

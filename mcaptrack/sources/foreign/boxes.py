@@ -16,7 +16,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.contracts import UNKNOWN_VECTOR, Box, Box3d, Quaternion, Vector, is_in_space
 from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
+from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import DETECTIONS, Rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.sources.foreign.decoding import (
@@ -30,8 +33,9 @@ from mcaptrack.sources.foreign.decoding import (
     to_bytes,
 )
 
-#: Schemas of boxes of other software.
-DETECTIONS_READ: Final = ("vision_msgs/Detection2DArray",)
+_KIND: Final = "message_reader"
+#: Schemas of boxes of other software in pictures.
+DETECTIONS_READ: Final = tuple(BUILT_IN[_KIND])[:1]
 
 _NUMBER: Final = re.compile(r"[0-9]{1,10}")
 _NAME: Final = re.compile(r"[^\W\d_]")
@@ -93,34 +97,46 @@ def boxes_decoder(kind: MessageType, classes: Classes) -> Callable[[bytes], Rows
 
     ``classes`` collects the class names.
     """
-    if plain_name(kind.name) not in DETECTIONS_READ:
+    reader = reader_of(kind.name)
+    if reader is None or reader.in_space:
         raise McaptrackError(
             f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} is read"
         )
-    return decoder_with_errors(kind, lambda message: _boxes(message, classes))
+    return decoder_with_errors(kind, lambda message: rows_of(reader.read(message), classes))
 
 
-def _boxes(message: Any, classes: Classes) -> Rows:
-    rows = [_box(detection, classes) for detection in message.detections]
-    *numbers, class_id = np.array(rows, float).reshape(-1, 6).T
+def rows_of(boxes: Sequence[Box], classes: Classes) -> Rows:
+    """Rows of detections of boxes."""
+    *numbers, _ = zip(*boxes, strict=True) if boxes else ((),) * 6
     columns = dict(zip(("x_px", "y_px", "w_px", "h_px", "score"), numbers, strict=True))
-    return DETECTIONS.rows(class_id=class_id.astype(np.uint32), **columns)
+    ids = [classes.class_id(box.class_name) if box.class_name else UNKNOWN for box in boxes]
+    return DETECTIONS.rows(class_id=np.array(ids, np.uint32), **columns)
 
 
-def _box(detection: Any, classes: Classes) -> tuple[float, float, float, float, float, int]:
-    """Left, top, width and height of the upright box around a detection, its best score, and its class id."""
+def detections_2d(message: Any) -> list[Box]:
+    """The boxes of a message of vision_msgs."""
+    return [_box(detection) for detection in message.detections]
+
+
+def _box(detection: Any) -> Box:
+    """The upright box around a detection, with its best score."""
     centre = detection.bbox.center
     place = getattr(centre, "position", centre)  # a Point2D in vision_msgs 4, a Pose2D in version 3
     x, y, theta, w, h = (
         float(value)
         for value in (place.x, place.y, getattr(centre, "theta", 0.0), detection.bbox.size_x, detection.bbox.size_y)
     )
-    if not all(isfinite(value) for value in (x, y, theta, w, h)) or w < 0 or h < 0:
-        raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")
+    _check_box(x, y, w, h, theta)
     if theta:
         w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
     name, score = best_hypothesis(detection.results)
-    return x - w / 2, y - h / 2, w, h, score, UNKNOWN if name is None else classes.class_id(name)
+    return Box(x - w / 2, y - h / 2, w, h, score, name or "")
+
+
+def _check_box(x: float, y: float, w: float, h: float, theta: float = 0.0) -> None:
+    """Raise ValueError for a box that can't be."""
+    if not all(isfinite(value) for value in (x, y, theta, w, h)) or w < 0 or h < 0:
+        raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")
 
 
 def best_hypothesis(results: Any) -> tuple[str | None, float]:
@@ -143,38 +159,13 @@ def best_hypothesis(results: Any) -> tuple[str | None, float]:
 # of a channel.
 
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-
 _ORIGIN: Final[Vector] = (0.0, 0.0, 0.0)
-#: A velocity or size that isn't stated.
-UNKNOWN_VECTOR: Final[Vector] = (nan, nan, nan)
 #: A quaternion of zeros: the orientation isn't stated.
 UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
 _WORD: Final = re.compile(r"[^\W\d_][\w-]*")
 _PERCENT: Final = re.compile(r"(?<![\w.])(\d{1,3}(?:\.\d+)?)\s*%")
 #: A number from 0 to 1 that isn't a distance, speed or angle.
 _SHARE: Final = re.compile(r"(?<![\w.-])(?:0?\.\d+|1\.0+|[01]\.)(?![\w.])(?!\s*(?:c?m|km|m?s|deg|rad|kph)\b|\s*°)")
-
-
-class Box3d(NamedTuple):
-    """A box in a frame: its centre, size along its own axes in metres, and orientation (x, y, z, w).
-
-    ``stamp_ns`` is 0 and ``frame_id`` "" where the message states none. ``source_id`` is a number or a text, None where
-    there is none. ``velocity`` is along the axes of the frame in m/s. ``has_heading`` is false where the message says
-    that the orientation is not known.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    centre: Vector
-    orientation: Quaternion
-    size: Vector
-    class_name: str = ""
-    score: float = nan
-    source_id: int | str | None = None
-    velocity: Vector = UNKNOWN_VECTOR
-    has_heading: bool = True
 
 
 @dataclass
@@ -278,7 +269,7 @@ def words_of(said: str) -> tuple[str, float]:
 # vision_msgs/Detection3DArray, in its forms before ROS 2 Humble and since.
 
 
-def _detections(message: Any) -> Message3d:
+def detections_3d(message: Any) -> Message3d:
     """The boxes of a message."""
     head = head_of(message)
     return Message3d(*head, [_detection(detection, head) for detection in message.detections])
@@ -318,7 +309,7 @@ _ID_KEYS: Final = ("trackid", "trackingid", "objectid", "instanceid")
 _OTHERS: Final = ("arrows", "spheres", "cylinders", "lines", "triangles", "texts", "models")
 
 
-def _scene_cubes(message: Any) -> Message3d:
+def scene_cubes(message: Any) -> Message3d:
     """The cubes of a message."""
     entities, deletions = list(part(message, "entities") or ()), list(part(message, "deletions") or ())
     first = next(iter([*entities, *deletions]), None)
@@ -387,7 +378,7 @@ _GENERIC: Final = re.compile(
 )
 
 
-def _marker_cubes(message: Any) -> Message3d:
+def marker_cubes(message: Any) -> Message3d:
     """The cubes of a message."""
     markers = list(message.markers) if hasattr(message, "markers") else [message]
     out = Message3d(*(head_of(markers[0]) if markers else (0, "")))
@@ -443,7 +434,7 @@ def _marker_class(marker: Any) -> tuple[str, float]:
 # jsk_recognition_msgs/BoundingBoxArray.
 
 
-def _jsk_boxes(message: Any) -> Message3d:
+def jsk_boxes(message: Any) -> Message3d:
     """The boxes of a message."""
     head = head_of(message)
     return Message3d(*head, [_jsk_box(box, head) for box in message.boxes])
@@ -477,7 +468,7 @@ _TRACKED: Final = 1
 _BOX, _SPHERE, _CYLINDER, _CONE = 1, 2, 3, 4
 
 
-def _derived_objects(message: Any) -> Message3d:
+def derived_objects(message: Any) -> Message3d:
     """The objects of a message. Those without a shape, as of radars, have the size of their polygon, or none."""
     head = head_of(message)
     return Message3d(*head, [_object_box(seen, head) for seen in message.objects])
@@ -528,7 +519,7 @@ _AUTOWARE_CYLINDER, _AUTOWARE_POLYGON = 1, 2
 _HEADING_UNKNOWN: Final = 0
 
 
-def _autoware_objects(message: Any) -> Message3d:
+def autoware_objects(message: Any) -> Message3d:
     """The objects of a message."""
     head = head_of(message)
     return Message3d(*head, [_autoware_box(item, head) for item in message.objects])
@@ -585,27 +576,87 @@ def _uuid(item: Any) -> str | None:
     return None if uuid is None else to_bytes(uuid.uuid).hex()
 
 
-_FAMILIES: Final[Mapping[str, Callable[[Any], Message3d]]] = {
-    "vision_msgs/Detection3DArray": _detections,
-    "foxglove.SceneUpdate": _scene_cubes,
-    "visualization_msgs/MarkerArray": _marker_cubes,
-    "visualization_msgs/Marker": _marker_cubes,
-    "jsk_recognition_msgs/BoundingBoxArray": _jsk_boxes,
-    "derived_object_msgs/ObjectArray": _derived_objects,
-} | {
-    f"{package}/{name}": _autoware_objects
-    for package in ("autoware_perception_msgs", "autoware_auto_perception_msgs")
-    for name in ("DetectedObjects", "TrackedObjects")
-}
 #: Schemas of 3D boxes, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
-BOXES_3D_READ: Final = tuple(_FAMILIES)
+BOXES_3D_READ: Final = tuple(BUILT_IN[_KIND])[1:]
 #: Those that are drawings: a channel with such messages need not hold boxes.
 DRAWINGS: Final = ("foxglove.SceneUpdate", "visualization_msgs/MarkerArray", "visualization_msgs/Marker")
 
 
 def boxes_3d_decoder(kind: MessageType) -> Callable[[bytes], Message3d]:
     """A function that decodes payloads of a channel to 3D boxes; raises as ``picture_decoder`` does."""
-    family = _FAMILIES.get(plain_name(kind.name))
-    if family is None:
+    reader = reader_of(kind.name)
+    if reader is None or not reader.in_space:
         raise McaptrackError(f"it holds {kind.name or 'no schema'}, not 3D boxes; {', '.join(BOXES_3D_READ)} are read")
-    return decoder_with_errors(kind, family)
+    return decoder_with_errors(kind, reader.read)
+
+
+# Readers by the type of messages: built-in ones, and those of other packages.
+
+
+class BoxReader(NamedTuple):
+    """A reader of the messages of a type: a function that gives a list of ``Box``, or of boxes in space a
+    ``Message3d``.
+    """
+
+    in_space: bool
+    read: Callable[[Any], Any]
+
+
+def reader_of(schema_name: str) -> BoxReader | None:
+    """The reader of a type of messages; None if there is none.
+
+    Raises McaptrackError if that of another package can't be imported. Packages that aren't needed are not imported.
+    """
+    name = plain_name(schema_name)
+    if name in BUILT_IN[_KIND]:
+        return BoxReader(name not in DETECTIONS_READ, find(_KIND, name).cls)
+    named = next((other for other in others(_KIND) if plain_name(other) == name), "")
+    return _of_package(find(_KIND, named)) if named else None
+
+
+@lru_cache(maxsize=64)
+def _of_package(entry: Entry) -> BoxReader:
+    reader, guard = entry.made("read"), Guard(str(entry))
+    in_space = is_in_space(entry, reader)
+
+    def read(message: Any) -> list[Box] | Message3d:
+        with blamed(entry, "failed", guard):
+            boxes = list(reader.read(message))
+        return checked_message_3d(entry, message, boxes) if in_space else checked_boxes(entry, boxes)
+
+    return BoxReader(in_space, read)
+
+
+def checked_boxes(entry: Entry, boxes: list[Any]) -> list[Box]:
+    """The boxes in a picture that a reader gave, as numbers of Python. Raises McaptrackError for what is none."""
+    with blamed(entry, "gave what is no Box"):
+        out = [Box(float(x), float(y), float(w), float(h), number(s), text(name)) for x, y, w, h, s, name in boxes]
+        for x, y, w, h, *_ in out:
+            _check_box(x, y, w, h)
+    return out
+
+
+def checked_message_3d(entry: Entry, message: Any, boxes: list[Any]) -> Message3d:
+    """The boxes in space that a reader gave, with the header of their message, if it has one."""
+    try:
+        head = head_of(message)
+    except (AttributeError, ValueError):
+        head = (0, "")
+    with blamed(entry, "gave what is no Box3d"):
+        return Message3d(*head, [_checked_box_3d(box, head) for box in boxes])
+
+
+def _checked_box_3d(box: Any, head: tuple[int, str]) -> Box3d:
+    vectors = [tuple(map(float, values)) for values in (box.centre, box.size, box.velocity, box.orientation)]
+    if [len(values) for values in vectors] != [3, 3, 3, 4]:
+        raise ValueError("a centre, size and velocity are three numbers, and an orientation is four")
+    centre, size, velocity, orientation = vectors
+    if not all(map(isfinite, (*centre, *orientation))) or any(side < 0 for side in size):
+        raise ValueError(f"a box can't be at {centre}, turned by {orientation}, with the size {size}")
+    if box.source_id is not None and not isinstance(box.source_id, str):
+        integer(box.source_id)
+    stamp, frame = (integer(box.stamp_ns), text(box.frame_id))
+    return box._replace(  # type: ignore[no-any-return]
+        stamp_ns=stamp or head[0], frame_id=frame or head[1], centre=centre, size=size, velocity=velocity,
+        orientation=orientation, class_name=text(box.class_name), score=float(box.score),
+    )  # fmt: skip

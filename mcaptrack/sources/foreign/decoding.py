@@ -13,6 +13,7 @@ from collections.abc import Callable
 from copy import copy
 from datetime import UTC, datetime
 from functools import lru_cache
+from graphlib import TopologicalSorter
 from math import nan
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
@@ -31,6 +32,7 @@ Unpack = Callable[[bytes], Any]
 ENCODINGS: Final = (MessageEncoding.Protobuf, MessageEncoding.JSON, MessageEncoding.ROS1, MessageEncoding.CDR)
 #: Longer definitions are refused, because parsing them takes long.
 _MAX_DEFINITION: Final = 2**20
+_MAX_DESCRIPTOR: Final = 4 * 2**20
 _ROS_NAME: Final = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)", re.ASCII)
 _IDL_HEAD: Final = re.compile(r"^=+\r?\nIDL: .*\r?\n", re.MULTILINE)
 
@@ -82,6 +84,8 @@ def unpacker(kind: MessageType) -> Unpack:
     """A function that decodes messages of this type. Raises McaptrackError if the type is not supported."""
     if kind.encoding == MessageEncoding.Protobuf and kind.name.startswith("foxglove."):
         return lambda payload: foxglove.unpack(kind.name, payload)
+    if kind.encoding == MessageEncoding.Protobuf:
+        return protobuf_unpacker(kind)
     if kind.encoding == MessageEncoding.JSON:
         return lambda payload: json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
     if kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR):
@@ -89,6 +93,32 @@ def unpacker(kind: MessageType) -> Unpack:
     raise McaptrackError(
         f"{kind.name} in the encoding {kind.encoding or 'unknown'!r} is not read; {', '.join(ENCODINGS)} are"
     )
+
+
+def protobuf_unpacker(kind: MessageType) -> Unpack:
+    """A decoder for protobuf, by the definition in the log."""
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.descriptor_pool import DescriptorPool
+    from google.protobuf.message_factory import GetMessageClass
+
+    try:
+        if len(kind.schema) > _MAX_DESCRIPTOR:
+            raise ValueError(f"it has {len(kind.schema)} bytes")
+        listed = FileDescriptorSet.FromString(kind.schema).file
+        files = {file.name: file for file in listed}
+        if len(files) < len(listed):
+            raise ValueError("it has two files of the same name")
+        imports = {name: [other for other in file.dependency if other in files] for name, file in files.items()}
+        pool = DescriptorPool()
+        for name in TopologicalSorter(imports).static_order():  # the order of the files in a log is free
+            pool.Add(files[name])
+        message_class: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
+    except Exception as error:  # a third-party parser that raises various exceptions
+        why = " ".join(str(error).split())[:120] or type(error).__name__
+        raise McaptrackError(
+            f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
+        ) from None
+    return message_class.FromString  # type: ignore[no-any-return]
 
 
 def _ros_unpacker(kind: MessageType) -> Unpack:

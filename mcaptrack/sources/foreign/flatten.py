@@ -9,22 +9,19 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from graphlib import TopologicalSorter
 from typing import Any, Final
 
 import numpy as np
 from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, unpacker
+from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, protobuf_unpacker, unpacker
 
 Path = tuple[str, ...]
 Value = bool | int | float | str | bytes | list[Any] | None
 
 _MAX_DEPTH: Final = 32
-_MAX_DESCRIPTOR: Final = 4 * 2**20
 #: The field names of times in ROS 1, ROS 2, JSON of bridges, and protobuf.
 _TIMES: Final = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos"))
 
@@ -71,34 +68,8 @@ def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
     if kind.encoding == MessageEncoding.JSON:
         return json.loads
     if kind.encoding == MessageEncoding.Protobuf:
-        return _protobuf(kind)
+        return protobuf_unpacker(kind)
     return unpacker(kind)
-
-
-def _protobuf(kind: MessageType) -> Callable[[bytes], Any]:
-    """A decoder for protobuf, by the definition in the log."""
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-    from google.protobuf.descriptor_pool import DescriptorPool
-    from google.protobuf.message_factory import GetMessageClass
-
-    try:
-        if len(kind.schema) > _MAX_DESCRIPTOR:
-            raise ValueError(f"it has {len(kind.schema)} bytes")
-        listed = FileDescriptorSet.FromString(kind.schema).file
-        files = {file.name: file for file in listed}
-        if len(files) < len(listed):
-            raise ValueError("it has two files of the same name")
-        imports = {name: [other for other in file.dependency if other in files] for name, file in files.items()}
-        pool = DescriptorPool()
-        for name in TopologicalSorter(imports).static_order():  # the order of the files in a log is free
-            pool.Add(files[name])
-        message_class: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
-    except Exception as error:  # a third-party parser that raises various exceptions
-        why = " ".join(str(error).split())[:120] or type(error).__name__
-        raise McaptrackError(
-            f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
-        ) from None
-    return message_class.FromString  # type: ignore[no-any-return]
 
 
 def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Value]]:

@@ -41,9 +41,10 @@ from mcaptrack.sources.ingest.job import (
     Progress,
 )
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
-from mcaptrack.sources.ingest.labels.content import OTHERS, Format
+from mcaptrack.sources.ingest.labels.content import Format
 from mcaptrack.sources.ingest.labels.cvat import is_cvat
-from mcaptrack.sources.ingest.labels.reading import is_3d
+from mcaptrack.sources.ingest.labels.of_packages import format_of_package
+from mcaptrack.sources.ingest.labels.reading import chosen_format, is_3d
 from mcaptrack.sources.ingest.labels.timeline import (
     Timeline,
     boxes_extent,
@@ -244,7 +245,7 @@ def _warn_unused(job: IngestJob, options: IngestOptions) -> None:
     uses: dict[str, tuple[object, *tuple[str, ...]]] = {
         "there is no label file": (job.has_labels, "label_format", "columns"),
         "no label file is of a detector's format": (
-            is_sized or any(labels.format in OTHERS for labels in job.labels.values()), "size",
+            is_sized or not all(labels.is_of_data_set for labels in job.labels.values()), "size",
         ),
         "there are no tracks and no ground truth": (job.roles - {"detections"}, "classes"),
         "there are no 3D boxes": (isinstance(job, Boxes3DJob), "frame_id"),
@@ -573,17 +574,25 @@ def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log
     role = options.role
     if role == "calibration" or (role is None and is_calibration(source)):
         return CalibrationJob(source, options, into)
-    if role != MOTION and is_3d(source, options.label_format, options.columns):
+    label_format = chosen_format(source, options.label_format, options.columns)
+    if role != MOTION and is_3d(source, label_format, options.columns):
         return Boxes3DJob([(role, source)], options, into)
+    of_package = format_of_package(label_format)
+    is_text = of_package is not None and not _is_video(source)  # or bytes, as its format has it
+    if role != MOTION and of_package and is_text and (not source.is_dir() or role or of_package.recognises(source)):
+        return LabelJob([(role, source)], options, into)
     if source.is_dir() and role != MOTION and (role or is_label_folder(source)):
         return LabelJob([(role, source)], options, into)
     is_zip = role != MOTION and source.suffix.lower() == ".zip" and is_cvat(source)
-    is_video = source.is_dir() or source.suffix.lower() in VIDEO_SUFFIXES or (not is_zip and _is_binary(source))
-    if is_video:
+    if source.is_dir() or _is_video(source) or (not is_zip and _is_binary(source)):
         return VideoJob(source, options, progress, into)
     if role == MOTION:
         return MotionJob(source, options, into)
     return LabelJob([(role, source)], options, into)
+
+
+def _is_video(source: Path) -> bool:
+    return source.suffix.lower() in VIDEO_SUFFIXES
 
 
 def _is_binary(source: Path) -> bool:

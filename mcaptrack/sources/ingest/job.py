@@ -34,7 +34,6 @@ from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
 from mcaptrack.sources.ingest.labels.content import (
     ONLY_PEOPLE,
-    OTHERS,
     BoxTable,
     Format,
     Labels,
@@ -43,7 +42,7 @@ from mcaptrack.sources.ingest.labels.content import (
     describe_classes,
     lines_of,
 )
-from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import chosen_format, is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
 from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
@@ -227,12 +226,13 @@ class IngestJob:
         """Read a label file with the format options."""
         options = self.options
         wanted = options.classes or (WantedClasses("all") if role == "corrections" else ONLY_PEOPLE)
-        if is_3d(path, options.label_format, options.columns):
+        label_format = chosen_format(path, options.label_format, options.columns)
+        if is_3d(path, label_format, options.columns):
             raise McaptrackError(
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        given = (options.label_format, role, options.first_frame, options.columns, wanted)
+        given = (label_format, role, options.first_frame, options.columns, wanted)
         return read_labels(path, *given, in_parts=True)
 
     @property
@@ -263,7 +263,7 @@ class IngestJob:
         """
         stated = self.options.size
         paths = [labels.path for labels in self.labels.values() if labels.is_normalised]
-        if not any(labels.format in OTHERS for labels in self.labels.values()):
+        if all(labels.is_of_data_set for labels in self.labels.values()):
             return
         actual = size() if size else stated
         if stated and actual and actual != stated:
@@ -279,7 +279,7 @@ class IngestJob:
         if actual is None:
             return
         for labels in self.labels.values():
-            if labels.format in OTHERS:
+            if not labels.is_of_data_set:
                 labels.fit(actual)
 
     def check_labels(self) -> None:
@@ -423,7 +423,7 @@ class IngestJob:
                 placed = placed.between(int(labels.labelled[0]), int(labels.labelled[-1]))
             parameters = {"file": labels.path.name, "format": labels.format} | self.label_parameters(role, labels)
             frames = self.frames(role, plane, placed)
-            self.write_rows(writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels.classes)
+            self.write_rows(writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels)
 
     def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
         """Write the motion of the camera, if it was given; pictures have this width and height."""
@@ -444,7 +444,7 @@ class IngestJob:
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
         if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
-        if self.options.size and labels.format in OTHERS:
+        if self.options.size and not labels.is_of_data_set:
             out["size"] = "{}x{}".format(*self.options.size)
         return out
 
@@ -459,11 +459,11 @@ class IngestJob:
         schema: Schema,
         frames: Frames,
         parameters: Mapping[str, Any],
-        classes: Mapping[int, str] = {},
+        labels: BoxTable | None = None,
         frame_id: str = "",
     ) -> None:
-        """Write a channel of the camera; ``parameters`` are those in its provenance, ``classes`` its class names, and
-        ``frame_id`` the frame of reference of its positions.
+        """Write a channel of the camera; ``parameters`` are those in its provenance, ``labels`` the file that it is of,
+        and ``frame_id`` the frame of reference of its positions.
 
         Frames are generated several times, for the digest and for the channel, so that they are never all in memory.
         """
@@ -473,11 +473,14 @@ class IngestJob:
             without = (frame._replace(rows=without_class(frame.rows)) for frame in frames())
             return encoded(schema, without if only else frames(), PROTOBUF)
 
+        classes = {} if labels is None else labels.classes
         names, class_id = {str(number): name for number, name in sorted(classes.items())}, str(only) if only else ""
+        plugins = {"label_format": labels.plugin} if labels is not None and labels.plugin else {}
         of_rows = digest(messages(), classes_beside_rows(class_id, names))
         provenance = Provenance(
-            INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id
-        )
+            INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id,
+            plugins=plugins,
+        )  # fmt: skip
         topic, record = f"{self.prefix}/{suffix}", record_of(schema, self.encoding)
         channel = writer.add_channel(topic, record, self.encoding, provenance.to_metadata())
         count = 0

@@ -34,7 +34,7 @@ from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, tran
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
-from mcaptrack.sources.ingest.labels.reading import read_boxes_3d
+from mcaptrack.sources.ingest.labels.reading import chosen_format, read_boxes_3d
 from mcaptrack.sources.ingest.labels.timeline import (
     MAX_FRAMES,
     ExistingLabels,
@@ -446,7 +446,8 @@ class Boxes3DJob(IngestJob):
         for stated, path in (*inputs, *options.labels.items()):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
-            rows = read_boxes_3d(path, stated or "detections", options.label_format, options.columns, options.scene)
+            label_format = chosen_format(path, options.label_format, options.columns)
+            rows = read_boxes_3d(path, stated or "detections", label_format, options.columns, options.scene)
             role = stated or ("tracks" if rows.has_ids else "detections")
             if role != "detections":
                 rows.check(role)
@@ -549,7 +550,7 @@ class Boxes3DJob(IngestJob):
         for role, rows in self.boxes.items():
             parameters: dict[str, Any] = {"file": rows.path.name, "format": rows.format} | self._parameters(role)
             frames = partial(iter, self.all_frames(role))
-            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, rows.classes, rows.frame_id)
+            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, rows, rows.frame_id)
 
     def _parameters(self, role: Role) -> dict[str, Any]:
         options = self.options

@@ -15,9 +15,10 @@ from mcaptrack.choices import ExchangeFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_stream, refuse_overwrite
 from mcaptrack.location import Location, local_name
+from mcaptrack.registry import find
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources.cameras import cameras
-from mcaptrack.tables.exchange import coco, cvat, text
+from mcaptrack.tables.exchange import cvat, text
 from mcaptrack.tables.exchange.boxes import ExportedBoxes, read_boxes
 from mcaptrack.tables.exchange.rerun_file import write_recording
 
@@ -28,19 +29,18 @@ Progress = Callable[[str, int, int], None]
 
 
 class _Format(NamedTuple):
-    """The end of the name of a file, how it is written, and what it holds beside frames, boxes and ids."""
+    """The end of the name of a file, and what it holds beside frames, boxes and ids. The registry says what writes."""
 
     end: str
-    write: Callable[[ExportedBoxes], Iterator[bytes]] | None = None
     holds: frozenset[str] = frozenset()
 
 
 _FORMATS: Final[Mapping[str, _Format]] = {
-    "mot": _Format(".mot.txt", text.mot, frozenset({"scores"})),
-    "kitti": _Format(".kitti.txt", text.kitti, frozenset({"scores", "names"})),
-    "coco": _Format(".coco.json", coco.coco, frozenset({"scores", "names", "observed"})),
-    "cvat": _Format(".cvat.xml", cvat.cvat, frozenset({"names", "observed"})),
-    "boxes-csv": _Format(".boxes.csv", text.boxes_csv, frozenset({"scores", "names", "observed", "metres"})),
+    "mot": _Format(".mot.txt", frozenset({"scores"})),
+    "kitti": _Format(".kitti.txt", frozenset({"scores", "names"})),
+    "coco": _Format(".coco.json", frozenset({"scores", "names", "observed"})),
+    "cvat": _Format(".cvat.xml", frozenset({"names", "observed"})),
+    "boxes-csv": _Format(".boxes.csv", frozenset({"scores", "names", "observed", "metres"})),
     "rerun": _Format(".rrd"),
 }
 
@@ -139,20 +139,20 @@ def write_boxes(
     """
     refuse_overwrite(output, force)
     chosen = boxes_topic(opened, topic)
-    written = _FORMATS[form]
-    if written.write is None:
+    write: Callable[[ExportedBoxes], Iterator[bytes]] = find("exporter", form).cls
+    if form == "rerun":
         rows, notes = write_recording(opened, output, chosen, progress)
         return WrittenBoxes(chosen, rows, tuple(notes))
     boxes = read_boxes(opened, chosen)
     done = 0
     with publish_stream(output) as stream:
         progress("export", 0, len(boxes.frame))
-        for part in written.write(boxes):
+        for part in write(boxes):
             stream.write(part)
             done = min(done + 1, len(boxes.frame))
             progress("export", done, len(boxes.frame))
         progress("export", len(boxes.frame), len(boxes.frame))
-    lost = [boxes.left_out(form, written.holds)]
+    lost = [boxes.left_out(form, _FORMATS[form].holds)]
     lost += [text.describe_mot_numbers(boxes.classes)] if form == "mot" else []
     lost += [text.describe_merged(form, boxes.classes)] if form in ("mot", "kitti") else []
     lost += [cvat.describe_classes(boxes)] if form == "cvat" else []

@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import heapq
-import shutil
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,11 +21,12 @@ import numpy as np
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish_folder
 from mcaptrack.foxglove.views import ground
 from mcaptrack.foxglove.views.people import base_heights, bodies_of
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.location import Location, local_name, shortened
+from mcaptrack.location import Location, local_name
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import class_name, class_names
 from mcaptrack.schema.encodings import CDR, encoded, ros_definition, ros_name
@@ -63,7 +63,6 @@ class _Stream(NamedTuple):
 
 
 #: How much of a name the name of a temporary folder begins with, in bytes; files in it have longer ones.
-_PART_BYTES: Final = 200
 
 
 def default_folder(path: Location) -> Path:
@@ -109,19 +108,11 @@ def write_bag(
     if not streams:
         raise McaptrackError(f"{opened.path} has no detections, tracks or predictions to write as ROS messages")
     streams += job.transforms()
-    part = folder.with_name(shortened(f".{folder.name}", _PART_BYTES) + ".part")
-    shutil.rmtree(part, ignore_errors=True)
     try:
-        part.mkdir(parents=True)
-        # The file of messages has the name of its folder.
-        _write(part / folder.name, streams, storage, done, lambda count: progress("export", count, job.total))
-        if folder.exists():
-            folder.rename(part / "before")  # removed in one step: half of a bag would be taken for no bag
-        (part / folder.name).rename(folder)
-    except (OSError, sqlite3.Error) as error:
-        raise McaptrackError(f"{folder} can't be written: {getattr(error, 'strerror', None) or error}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        with publish_folder(folder) as part:  # the file of messages has the name of its folder
+            _write(part, streams, storage, done, lambda count: progress("export", count, job.total))
+    except sqlite3.Error as error:
+        raise McaptrackError(f"{folder} can't be written: {error}") from error
     return done
 
 

@@ -27,12 +27,14 @@ from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.geometry.oriented_boxes import COLUMNS
 from mcaptrack.notices import Code
 from mcaptrack.schema.classes import PEOPLE, PERSON, UNKNOWN, is_person
+from mcaptrack.schema.provenance import Plugin
 
-Format = LabelFormat
+#: The name of a format: a built-in one, or of another package.
+Format = LabelFormat | str
 #: Formats that hold 3D boxes alone; tables ("csv") may hold either.
 FORMATS_3D: Final[tuple[str, ...]] = ("kitti-3d", "nuscenes", "argoverse")
-#: Formats of other detectors and annotation tools.
-OTHERS: Final[tuple[Format, ...]] = ("coco", "cvat", "yolo", "supervision", "csv")
+#: Formats of data sets: their boxes suit the pictures. Those of other formats are checked against the pictures.
+DATA_SETS: Final = ("mot", "kitti", "sdd", "trajnet", "obsmat")
 ClassIds = NDArray[np.uint32]
 
 #: The id of a row without a track, and the class of a row that states none.
@@ -197,7 +199,7 @@ class BoxTable(CheckedRows):
     class as the file has it (``NO_CLASS``: none), and as the schema of detections has it once the rows are settled.
     ``classes`` are then names by class id. ``labelled`` (F,) are the frames that the file describes, with or without
     boxes. ``left_out`` describes the rows that were left out. ``remarks`` and ``doubts`` (warnings and their codes) say
-    how the file was understood.
+    how the file was understood. ``plugin`` is the format, if it is of another package.
     """
 
     path: Path
@@ -213,6 +215,7 @@ class BoxTable(CheckedRows):
     labelled: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     remarks: list[str] = field(default_factory=list)
     doubts: list[tuple[str, Code]] = field(default_factory=list)
+    plugin: Plugin | None = None
 
     #: The fields with a value for each row.
     COLUMNS: ClassVar[tuple[str, ...]] = ("frame", "id", "boxes", "score", "class_id")
@@ -221,6 +224,11 @@ class BoxTable(CheckedRows):
     def has_ids(self) -> bool:
         """Whether any row has a track id."""
         return bool((self.id != NO_ID).any())
+
+    @property
+    def is_of_data_set(self) -> bool:
+        """Whether the format is that of a data set, and not of a detector or annotation tool."""
+        return self.format in DATA_SETS
 
     def take(self, rows: Ints | Bools | slice) -> Self:
         """Select or reorder rows; facts about the file stay."""
@@ -401,6 +409,11 @@ class Labels(BoxTable):
         parts += [f"{int(half.sum())} lie outside of their pictures by more than half"] if half.any() else []
         if parts:
             self.doubt(f": of {len(self.boxes)} boxes {' and '.join(parts)}; they stay as they are")
+
+    def refuse_repeated_ids(self) -> None:
+        """Raise McaptrackError if an id appears twice in a frame."""
+        if self.has_ids and (row := self.repeated_id()) >= 0:
+            raise McaptrackError(f"{self.path}: id {self.id[row]} appears twice in frame {self.frame[row]}")
 
     def fit(self, size: tuple[int, int]) -> None:
         """Fit boxes to pictures of a size in pixels: shares of it become pixels, and boxes outside of it a doubt."""

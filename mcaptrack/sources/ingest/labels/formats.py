@@ -18,8 +18,7 @@ Letters: N rows, F frames.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -287,10 +286,12 @@ def _positions(
     return Labels(path, name, table.at, frame, track_id, None, none, people, labelled=np.unique(frame), xy_m=xy_m)
 
 
-READERS: Final[Mapping[str, Callable[[Path, Lines, Role, WantedClasses], Labels]]] = {
-    "mot": read_mot,
-    "kitti": read_kitti,
-    "sdd": read_sdd,
-    "trajnet": partial(_positions, "trajnet", "TrajNet (frame id x y)", 4, slice(2, 4)),
-    "obsmat": partial(_positions, "obsmat", "an ETH obsmat (frame id x z y vx vz vy)", 8, slice(2, 5, 2)),
-}
+def read_trajnet(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
+    """TrajNet."""
+    return _positions("trajnet", "TrajNet (frame id x y)", 4, slice(2, 4), path, lines, role, wanted)
+
+
+def read_obsmat(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Labels:
+    """Matrices of observations of ETH."""
+    what = "an ETH obsmat (frame id x z y vx vz vy)"
+    return _positions("obsmat", what, 8, slice(2, 5, 2), path, lines, role, wanted)

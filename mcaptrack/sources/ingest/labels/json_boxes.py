@@ -60,21 +60,35 @@ def read_json(path: Path, label_format: Format, role: Role, chosen: Mapping[str,
     return labels
 
 
+def holds_boxes(path: Path) -> bool:
+    """Whether JSON is of COCO or of supervision, by its keys. Raises McaptrackError for what is no JSON."""
+    return bool(_kind_of(files.read_json(path, "JSON", _MAX_BYTES)))
+
+
+def _kind_of(content: Any) -> str:
+    """The content of JSON: annotations, results or rows; "" for anything else."""
+    if isinstance(content, dict):
+        return "annotations" if isinstance(content.get("annotations"), list) else ""
+    first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
+    return "results" if "bbox" in first and "image_id" in first else "rows" if "x_min" in first else ""
+
+
 def _read_content(path: Path, content: Any, role: Role, chosen: Mapping[str, str], wanted: WantedClasses) -> Labels:
     if isinstance(content, list) and not content:
         raise McaptrackError(f"{path} holds no boxes")
-    if chosen and not (isinstance(content, list) and isinstance(content[0], dict) and "x_min" in content[0]):
+    kind = _kind_of(content)
+    if chosen and kind != "rows":
         raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for COCO")
     first = content[0] if isinstance(content, list) and isinstance(content[0], dict) else {}
-    if isinstance(content, dict) and isinstance(content.get("annotations"), list):
+    if kind == "annotations":
         return _annotations(path, content).settled(role, wanted, _categories(path, content.get("categories")))
-    if "bbox" in first and "image_id" in first:
+    if kind == "results":
         return _results(path, content).settled(role, wanted)
-    if "x_min" in first:
+    if kind == "rows":
         return read_rows(path, content, role, chosen, wanted)
-    kind = f"an object with {', '.join(content) or 'nothing'}"[:100] if isinstance(content, dict) else "a list"
+    text = f"an object with {', '.join(content) or 'nothing'}"[:100] if isinstance(content, dict) else "a list"
     raise McaptrackError(
-        f"{path} is JSON ({kind}{' of ' + ', '.join(first) if first else ''}"[:300]
+        f"{path} is JSON ({text}{' of ' + ', '.join(first) if first else ''}"[:300]
         + "), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, "
         "score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.registry import BUILT_IN, find, others
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.ingest.labels.argoverse import is_argoverse, read_argoverse
 from mcaptrack.sources.ingest.labels.content import (
@@ -25,6 +26,7 @@ from mcaptrack.sources.ingest.labels.content import (
     ClassIds,
     Format,
     Labels,
+    Lines,
     WantedClasses,
     lines_of,
     split,
@@ -40,13 +42,34 @@ from mcaptrack.sources.ingest.labels.delimited import (
     read_csv,
     read_table_3d,
 )
-from mcaptrack.sources.ingest.labels.formats import READERS, read_kitti_3d
-from mcaptrack.sources.ingest.labels.json_boxes import is_json, read_json
+from mcaptrack.sources.ingest.labels.formats import read_kitti_3d
+from mcaptrack.sources.ingest.labels.json_boxes import holds_boxes, is_json, read_json
 from mcaptrack.sources.ingest.labels.nuscenes import read_nuscenes, tables_folder
+from mcaptrack.sources.ingest.labels.of_packages import format_of_package, recognised
 from mcaptrack.sources.ingest.labels.yolo import read_yolo
 
 _MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}
-FORMATS: Final = tuple(name for name in get_args(Format) if name not in ("auto", *FORMATS_3D))
+FORMATS: Final = tuple(name for name in BUILT_IN["label_format"] if name not in FORMATS_3D)
+
+
+def chosen_format(path: Path, label_format: Format, columns: Mapping[str, str] | None = None) -> Format:
+    """The format of a file: the one that is given, or for "auto" that of another package that recognises the file, if
+    it is of no built-in one.
+    """
+    if label_format != "auto" or columns or not path.is_file() or not others("label_format") or _is_built_in(path):
+        return label_format
+    of_package = recognised(path)
+    return label_format if of_package is None else of_package.entry.name
+
+
+def _is_built_in(path: Path) -> bool:
+    """Whether a file is of a built-in format, by its beginning; JSON by its content."""
+    try:
+        if is_argoverse(path) or is_cvat(path):
+            return True
+        return holds_boxes(path) if is_json(path) else bool(text_format(path))
+    except McaptrackError:
+        return False
 
 
 def read_labels(
@@ -96,8 +119,8 @@ def read_labels(
         labels = _read_in_parts(path, label_format, role, wanted) if label_format in _FORMATS else None
     if labels is None:
         labels = _read(path, label_format, role, columns or {}, wanted)
-        if labels.has_ids and role != "detections":
-            refuse_repeated_ids(labels)
+        if role != "detections":
+            labels.refuse_repeated_ids()
         labels = in_order(labels, labels.has_ids)
     if first_frame is not None:
         labels.first_frame = first_frame
@@ -114,6 +137,11 @@ def in_order(labels: Labels, has_ids: bool) -> Labels:
 
 def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, str], wanted: WantedClasses) -> Labels:
     refuse_special(path)
+    of_package = format_of_package(chosen_format(path, label_format, columns))
+    if of_package is not None:
+        if columns:
+            raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for {label_format}")
+        return of_package.labels(path, role, wanted)
     if path.is_dir():
         if label_format not in ("auto", "yolo"):
             raise McaptrackError(f"{path} is a folder, and {label_format} labels are a file")
@@ -136,7 +164,12 @@ def _read(path: Path, label_format: Format, role: Role, columns: Mapping[str, st
         return read_yolo(path, role, wanted)
     if label_format in ("csv", "supervision"):
         return read_csv(path, role, columns, label_format, wanted)
-    return READERS[label_format](path, lines_of(path), role, wanted)
+    return _text_reader(label_format)(path, lines_of(path), role, wanted)
+
+
+def _text_reader(label_format: Format) -> Callable[[Path, Lines, Role, WantedClasses], Labels]:
+    """The function that reads a text in which each line is a box, or a position."""
+    return find("label_format", label_format).cls  # type: ignore[no-any-return]
 
 
 def text_format(path: Path) -> Format:
@@ -174,12 +207,6 @@ def _has_other_columns(path: Path, number: int, line: str) -> bool:
     except McaptrackError:
         return False
     return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
-
-
-def refuse_repeated_ids(labels: Labels) -> None:
-    """Raise McaptrackError if an id appears twice in a frame."""
-    if (row := labels.repeated_id()) >= 0:
-        raise McaptrackError(f"{labels.path}: id {labels.id[row]} appears twice in frame {labels.frame[row]}")
 
 
 def read_homography(path: Path) -> tuple[float, ...]:
@@ -270,7 +297,7 @@ def _read_in_parts(path: Path, name: Format, role: Role, wanted: WantedClasses) 
     corner, has_ids, left_out, first_frame = np.full(2, -np.inf), False, list[str](), 1
     rest: Labels | None = None  # the last frame, which may go on
     while (line := next(lines, None)) is not None:
-        read = READERS[name](path, chain([line], islice(lines, _PART_ROWS - 1)), role, wanted)
+        read = _text_reader(name)(path, chain([line], islice(lines, _PART_ROWS - 1)), role, wanted)
         if rest is not None and read.frame.min() < rest.frame[0]:
             return None
         frames.append(read.frame_counts())
@@ -294,7 +321,7 @@ def _read_in_parts(path: Path, name: Format, role: Role, wanted: WantedClasses) 
     )  # fmt: skip
     if has_ids and role != "detections":
         for part in out.parts:
-            refuse_repeated_ids(part())
+            part().refuse_repeated_ids()
     return out
 
 
@@ -335,7 +362,8 @@ def is_3d(path: Path, label_format: Format = "auto", columns: Mapping[str, str] 
     if label_format in FORMATS_3D:
         return True
     if label_format not in ("auto", "csv") or not path.exists():
-        return False
+        of_package = format_of_package(label_format)
+        return of_package is not None and of_package.in_space
     if path.is_dir():
         return tables_folder(path) is not None or is_argoverse(path)
     if is_argoverse(path):
@@ -390,6 +418,7 @@ def read_boxes_3d(
         With the place in the file, if it doesn't have this format, or if it can't be boxes in metres with z up.
     """
     refuse_special(path)
+    of_package = format_of_package(label_format)
     if label_format == "auto" and path.is_dir():
         label_format = "argoverse" if is_argoverse(path) else "nuscenes"
     elif label_format == "auto":
@@ -400,6 +429,8 @@ def read_boxes_3d(
         raise McaptrackError(f"{path}: `scene=` is for nuScenes, not for {label_format}")
     if path.is_dir() and label_format in ("csv", "kitti-3d"):
         raise McaptrackError(f"{path} is a folder, and {label_format} labels are a file")
+    if of_package is not None:
+        return of_package.rows_3d(path, role)
     if label_format == "nuscenes":
         rows = read_nuscenes(path, scene)
     elif label_format == "argoverse":

@@ -1,0 +1,140 @@
+"""Commands of installed packages: functions that ``mcaptrack.api.declared`` declares, by their entry points."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mcaptrack.api.declared import OneOfMany, Parameter, arguments_of, options_of
+from mcaptrack.cli import common
+from mcaptrack.cli.declared import Called, OfAll, Once, Printed, parameters_of
+from mcaptrack.cli.many import EachLog
+from mcaptrack.cli.text import show
+from mcaptrack.errors import McaptrackError
+from mcaptrack.location import Location
+from mcaptrack.registry import blamed, find
+
+
+@dataclass(frozen=True)
+class Function:
+    """The function of a command. Workers get it by its name; its errors name the package."""
+
+    name: str
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        return inspect.signature(find("command", self.name).cls)
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """Call the function."""
+        entry = find("command", self.name)
+        with blamed(entry, "failed"):
+            return entry.cls(*arguments, **options)
+
+
+class FromPackage(Called[Any]):
+    """A command of a package, however often it calls its function."""
+
+    @classmethod
+    def declaration(cls, name: str) -> Callable[..., Any]:
+        """Return the function of the package."""
+        function: Callable[..., Any] = find("command", name).cls
+        return function
+
+    @classmethod
+    def options(cls) -> list[Parameter]:
+        """Return the options that the function has no use for: also where to print to."""
+        return [*parameters_of(Printed), *super().options()]
+
+    @property
+    def function(self) -> Callable[..., Any]:
+        """The function, with its name in errors."""
+        return Function(self.name)
+
+    def data(self, done: Any) -> dict[str, Any]:
+        """Return a result as values of JSON."""
+        return {"result": plain(done)}
+
+
+class OnceOfPackage(FromPackage, Once[Any]):
+    """A command that calls its function once."""
+
+    def print_result(self, done: Any, talk: common.Talk) -> None:
+        """Print the result."""
+        with common.printed_to(self.values["output"], self.values["force"]):
+            super().print_result(done, talk)
+
+    def show(self, done: Any, talk: common.Talk) -> None:
+        """Print the result for people."""
+        if lines := list(lines_of(done)):
+            show(*lines)
+
+
+class EachLogOfPackage(FromPackage, EachLog[Any]):
+    """A command that calls its function with each log."""
+
+    writes = False
+    prints_results = True
+
+    def run(self, names: Mapping[str, str]) -> None:
+        """Run the command; what it prints goes to a file, if one is named."""
+        with common.printed_to(self.values["output"], self.values["force"]):
+            super().run(names)
+
+    def show(self, log: Location, done: Any, talk: common.Talk) -> None:
+        """Print the result of a log for people, below its name if there are several."""
+        if not self.values["json"]:
+            named = [f"{log}:"] if len(self.inputs) > 1 else []
+            if lines := [*named, *lines_of(done)]:
+                show(*lines)
+
+
+def class_of(name: str) -> type[FromPackage]:
+    """The class of a command: one that takes a log can take many. Raises McaptrackError for what is no command."""
+    entry = find("command", name)
+    if not hasattr(entry.cls, "most_used"):
+        raise McaptrackError(f"{entry} is not declared; `@declared()` of mcaptrack.api.declared makes it a command")
+    with blamed(entry, "can't be a command"):
+        each = any(isinstance(about, OneOfMany) for about in arguments_of(entry.cls).values())
+        kind = EachLogOfPackage if each else OnceOfPackage
+        own = {option.name for option in options_of(entry.cls)}
+        if taken := sorted(own & {option.name for option in (*kind.options(), *parameters_of(OfAll))}):
+            raise McaptrackError(f"a parameter can't have the name of the option {', '.join(taken)}")
+        kind.function_of(name)
+    return kind
+
+
+def plain(value: Any) -> Any:
+    """A result as values of JSON: numbers that are not finite are None."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = dataclasses.asdict(value)
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(member) for key, member in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(member) for member in value]
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def lines_of(value: Any) -> Iterator[str]:
+    """A result as lines of text: of a mapping name and value, of a sequence each member."""
+    value = plain(value)
+    if isinstance(value, dict):
+        width = max(map(len, value), default=0)
+        yield from (f"{name:<{width}}  {_text(member)}" for name, member in value.items())
+    elif isinstance(value, list):
+        yield from map(_text, value)
+    elif value is not None:
+        yield from _text(value).splitlines()
+
+
+def _text(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,150 @@
+"""Installed packages: the entry points that they declare, and the package that a module is of.
+
+Entry points are read from the files that pip writes. ``importlib.metadata`` reads them, too, but its import takes
+longer than all else that lists the commands.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, NamedTuple
+
+_OWN: Final = "mcaptrack."
+#: A folder with what pip says of a package, and the name of the package in it.
+_INFO: Final = re.compile(r"(.+?)(-.*)?\.(dist|egg)-info")
+_FILES: Final = ("METADATA", "PKG-INFO")
+_HEADERS: Final = ("Name", "Version")
+
+
+class Point(NamedTuple):
+    """An entry point of an installed package: ``info`` is the folder with what pip says of the package."""
+
+    group: str
+    name: str
+    value: str
+    info: Path
+
+    @property
+    def package(self) -> tuple[str, str]:
+        """Name and version of the package; "" for what its metadata lack."""
+        return _name_and_version(self.info)
+
+
+class Declared(NamedTuple):
+    """The entry points of all packages for mcaptrack, and the names of packages where they can't be read."""
+
+    points: tuple[Point, ...]
+    unreadable: tuple[str, ...]
+
+
+def entry_points(group: str) -> list[Point]:
+    """The entry points of a group, by package. Names with a colon, or that can't be printed, are left out."""
+    points = [point for point in declared().points if point.group == group]
+    return [point for point in points if ":" not in point.name and point.name.isprintable()]
+
+
+def declared() -> Declared:
+    """The entry points of all packages; kept until something is installed."""
+    return _declared(_places())
+
+
+def distribution_of(module: str) -> tuple[str, str]:
+    """Name and version of the package of a module; "" and "" if unknown, as for those installed as editable."""
+    from importlib import metadata
+
+    names = _owners(_places()).get(module.partition(".")[0])
+    return (names[0], metadata.version(names[0])) if names else ("", "")
+
+
+def _places() -> tuple[tuple[str, int], ...]:
+    """The folders of ``sys.path`` and when each last changed: they tell whether something was installed."""
+    return tuple((place, _changed_ns(place)) for place in sys.path)
+
+
+def _changed_ns(place: str) -> int:
+    """The time when a folder of ``sys.path`` last gained or lost an entry; 0 if it is no folder."""
+    try:
+        return os.stat(place or ".").st_mtime_ns
+    except OSError:
+        return 0
+
+
+@lru_cache(maxsize=4)
+def _owners(_places: tuple[tuple[str, int], ...]) -> Mapping[str, list[str]]:
+    """The packages of each top-level module; kept until something is installed, for it reads all metadata."""
+    from importlib import metadata
+
+    try:
+        return metadata.packages_distributions()
+    except Exception:  # metadata of another package that can't be read
+        return {}
+
+
+@lru_cache(maxsize=4)
+def _declared(places: tuple[tuple[str, int], ...]) -> Declared:
+    points: list[Point] = []
+    unreadable: list[str] = []
+    for info in _packages(place for place, _ in places):
+        try:
+            data = (info / "entry_points.txt").read_bytes()
+        except OSError:
+            continue  # most packages have none
+        if _OWN.encode() not in data:
+            continue
+        try:
+            points += [Point(*entry, info) for entry in _entries(data.decode()) if entry[0].startswith(_OWN)]
+        except ValueError:
+            unreadable.append(_name_and_version(info)[0])
+    return Declared(tuple(points), tuple(unreadable))
+
+
+def _packages(places: Iterator[str]) -> Iterator[Path]:
+    """The folders with what pip says of each package. Of two packages of one name the first counts, as for imports."""
+    names: set[str] = set()
+    for place in places:
+        try:
+            entries = sorted(os.listdir(place or "."))
+        except OSError:
+            continue
+        for entry in entries:
+            match = _INFO.fullmatch(entry)
+            name = re.sub(r"[-_.]+", "-", match[1]).lower() if match else ""
+            if match and name not in names:
+                names.add(name)
+                yield Path(place, entry)
+
+
+def _entries(text: str) -> Iterator[tuple[str, str, str]]:
+    """Group, name and value of each line. Raises ValueError for a line that is none."""
+    group = ""
+    for line in map(str.strip, text.splitlines()):
+        if line.startswith("[") and line.endswith("]"):
+            group = line[1:-1].strip()
+        elif line and not line.startswith(("#", ";")):
+            name, equals, value = line.partition("=")
+            if not (group and equals and name.strip()):
+                raise ValueError(line)
+            yield group, name.strip(), value.strip()
+
+
+@lru_cache(maxsize=256)
+def _name_and_version(info: Path) -> tuple[str, str]:
+    """Name and version in the metadata of a package; "" for what they lack."""
+    headers: dict[str, str] = {}
+    for file in _FILES:
+        try:
+            text = (info / file).read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            continue
+        for line in text.splitlines():
+            if not line.strip():
+                break  # the description follows
+            name, _, value = line.partition(":")
+            headers.setdefault(name.strip(), value.strip())
+        break
+    return headers.get(_HEADERS[0], ""), headers.get(_HEADERS[1], "")

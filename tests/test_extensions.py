@@ -1,0 +1,793 @@
+"""Label formats, readers of messages, exporters and commands of other packages: the examples of docs/extend.md, installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.message_factory import GetMessages
+from mcap.writer import Writer
+
+import mcaptrack
+from mcaptrack import log, testing
+from mcaptrack.api.declared import declared
+from mcaptrack.choices import BagFormat, ExchangeFormat, LabelFormat, TableFormat
+from mcaptrack.contracts import Box, Box3d, LabelBoxes
+from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import BUILT_IN, KINDS
+from mcaptrack.schema import DETECTIONS, TRACKS
+from mcaptrack.schema.provenance import Plugin, Provenance
+from mcaptrack.sources import foreign
+from mcaptrack.testing import LawError
+from tests.commands import call, done
+from tools import pages
+
+PAGE = pages.blocks(pages.ROOT / "docs" / "extend.md")
+FILES = {block.marks["file"]: block.text for block in PAGE if "file" in block.marks}
+BOXES = "0;a;person;10;20;30;60\n1;b;dog;90;50;40;30\n1;a;person;12;20;30;60\n"
+#: The same as a table that mcaptrack reads itself.
+TABLE = "frame,id,class,x,y,w,h\n0,1,person,10,20,30,60\n1,2,dog,90,50,40,30\n1,1,person,12,20,30,60\n"
+
+
+def install(folder: Path, points: dict[str, dict[str, str]], name: str = "my-trackers", version: str = "1.0") -> None:
+    """What pip leaves of a package with these entry points."""
+    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    lines = [line for group, own in points.items() for line in (f"[{group}]", *(f"{k} = {v}" for k, v in own.items()))]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    modules = {value.partition(":")[0] for own in points.values() for value in own.values()}
+    (info / "top_level.txt").write_text("\n".join(sorted(modules)) + "\n")
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch) -> Iterator[Path]:
+    """A folder that stands for installed packages, with that of the page; the working folder is another one."""
+    folder = tmp_path / "site"
+    install(folder, tomllib.loads(FILES["pyproject.toml"])["project"]["entry-points"])
+    for name, text in FILES.items():
+        (folder / name).write_text(text)
+    monkeypatch.syspath_prepend(str(folder))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    yield folder
+    for name in [
+        name for name, module in sys.modules.items() if str(folder) in (getattr(module, "__file__", "") or "")
+    ]:
+        del sys.modules[name]
+
+
+def add(site: Path, kind: str, name: str, code: str) -> None:
+    """Another package, with one entry point."""
+    (site / "another.py").write_text(code)
+    install(site, {f"mcaptrack.{kind}s": {name: "another:Part"}}, "another", "2.0")
+
+
+def is_imported(module: str) -> bool:
+    return module in sys.modules
+
+
+def rows_of(path: str, topic: str) -> Any:
+    with log.read(Path(path)) as opened:
+        frames = list(opened.frames(topic, TRACKS if "detections" not in topic else DETECTIONS))
+    return [str((frame.t_ns, frame.index, frame.rows.tolist())) for frame in frames]  # NaN is not equal to itself
+
+
+def provenance_of(path: str, topic: str) -> Provenance:
+    with log.read(Path(path)) as opened:
+        found = Provenance.from_metadata(opened.channel(topic).metadata)
+    assert found is not None
+    return found
+
+
+def one_line(*words: str, code: int = 1) -> str:
+    outcome = call(*words)
+    assert outcome.code == code, outcome.err
+    errors = [line for line in outcome.err.splitlines() if line.startswith("mcaptrack: ")]
+    assert len(errors) == 1, outcome.err
+    return errors[0]
+
+
+# What there is
+
+
+def test_every_kind_stands_on_the_page_with_an_example_of_at_most_40_lines():
+    text = (pages.ROOT / "docs" / "extend.md").read_text()
+    assert all(f"`mcaptrack.{kind}s`" in text for kind in KINDS)
+    assert all(len(code.splitlines()) <= 40 for code in FILES.values())
+    assert {
+        f"check_{name}" for name in ("transform", "predictor", "label_format", "message_reader", "exporter", "command")
+    } == {name for name in testing.__all__ if name.startswith("check_")}
+
+
+def test_the_names_of_options_are_those_of_the_registry():
+    from typing import get_args
+
+    assert get_args(LabelFormat) == ("auto", *BUILT_IN["label_format"])
+    exporters = (*get_args(TableFormat), *get_args(BagFormat), *get_args(ExchangeFormat))
+    assert exporters == tuple(BUILT_IN["exporter"])
+    assert set(BUILT_IN["command"]) == set(__import__("mcaptrack.cli.group", fromlist=["ENTRIES"]).ENTRIES)
+
+
+def test_doctor_lists_what_packages_bring_and_what_of_it_fails(site):
+    add(site, "command", "gone", "raise OSError('no\\nlicence')")
+    found = json.loads(done("doctor", "--json").out)["plugins"]
+    assert found["command longest (my-trackers 1.0)"] == ""
+    assert {"label format semicolons (my-trackers 1.0)", "exporter speeds (my-trackers 1.0)"} <= found.keys()
+    assert found["message reader my_msgs/Things (my-trackers 1.0)"] == ""
+    assert found["command gone (another 2.0)"].endswith("can't be imported: OSError: no licence")
+
+
+# Label formats
+
+
+@pytest.mark.parametrize("words", [("--format", "semicolons"), (), ("--format", "semicolons:Semicolons")])
+def test_a_label_format_gives_what_a_table_gives(site, words):
+    Path("a.boxes").write_text(BOXES)
+    Path("b.csv").write_text(TABLE)
+    done("ingest", "a.boxes", *words, "--fps", "10", "--classes", "all", "-o", "a.mcap")
+    done("ingest", "b.csv", "--fps", "10", "--classes", "all", "-o", "b.mcap")
+    assert rows_of("a.mcap", "/camera/tracks") == rows_of("b.mcap", "/camera/tracks")
+    made, table = provenance_of("a.mcap", "/camera/tracks"), provenance_of("b.mcap", "/camera/tracks")
+    assert (made.digest, made.classes) == (table.digest, table.classes)
+    name = words[1] if words else "semicolons"
+    assert made.parameters["format"] == name
+    assert made.plugins == {"label_format": Plugin(name, "semicolons:Semicolons", "my-trackers", "1.0")}
+    assert "(my-trackers 1.0)" in done("info", "a.mcap").out
+
+
+def test_labels_of_built_in_formats_import_no_package_and_stay_as_they_are(site):
+    Path("a.boxes").write_text("1,1,10,20,30,60,1\n")  # MOTChallenge, whatever its name
+    done("ingest", "a.boxes", "--fps", "10", "-o", "a.mcap")
+    assert provenance_of("a.mcap", "/camera/tracks").parameters["format"] == "mot"
+    assert not is_imported("semicolons")
+
+
+def test_a_label_file_of_several_formats_is_refused_and_a_broken_one_is_named(site):
+    Path("a.boxes").write_text(BOXES)
+    code = "class Part:\n    def recognises(self, path):\n        return True\n    def read(self, path): ...\n"
+    add(site, "label_format", "also", code)
+    said = one_line("ingest", "a.boxes", "--fps", "10", "-o", "a.mcap")
+    assert (
+        "label format also (another 2.0) and label format semicolons (my-trackers 1.0); choose one with --format"
+        in said
+    )
+    (site / "another.py").write_text("raise ValueError")
+    sys.modules.pop("another")
+    assert (
+        "label format also (another 2.0) can't be imported"
+        in done("ingest", "a.boxes", "--fps", "10", "-o", "a.mcap").err
+    )
+
+
+def labels(**columns: Any) -> LabelBoxes:
+    usual = {"frame": [0, 1], "track_id": [1, 1], "boxes": [[1, 2, 3, 4], [2, 2, 3, 4]]}
+    return LabelBoxes(**{**usual, **columns})
+
+
+NAN, INF = float("nan"), float("inf")
+#: What a format gives, and what is said of it.
+WRONG: list[tuple[Any, str]] = [
+    (None, "gave a NoneType"),
+    ([], "gave a list"),
+    (labels(boxes=[[1, 2, 3]] * 2), r"boxes of shape \(2, 3\)"),
+    (labels(boxes=[[1, 2, 3, NAN]] * 2), "box 1: a number of the box is missing"),
+    (labels(boxes=[[1, 2, -3, 4]] * 2), "box 1: a box can't be -3 wide"),
+    (labels(boxes=[[1, 2, 3, 1e300]] * 2), "a coordinate can't be 1e.300"),
+    (labels(boxes="no"), "gave what are no boxes"),
+    (labels(boxes=[], frame=[], track_id=[]), "holds no boxes"),
+    (labels(frame=[0]), "frame of shape"),
+    (labels(frame=[0, NAN]), "frame with nan"),
+    (labels(frame=[0, 0.5]), "frame with 0.5"),
+    (labels(frame=[0, -1]), "frame with -1, which is no number"),
+    (labels(frame=[0, 1e30]), "frame with 1e.30, which is no number"),
+    (labels(frame=None), "frame and t_s"),
+    (labels(t_s=[0, 1]), "frame and t_s"),
+    (labels(frame=None, t_s=[0, -1]), "t_s with -1, which is no second"),
+    (labels(frame=None, t_s=[0, INF]), "t_s with inf"),
+    (labels(frame=None, t_s=["a", "b"]), "could not convert"),
+    (labels(track_id=[1]), "track_id of shape"),
+    (labels(track_id=[1.5, 2]), "ids are whole numbers or texts"),
+    (labels(track_id=[-5, 1]), "the id has to be"),
+    (labels(frame=[1, 1]), "id 1 appears twice"),
+    (labels(class_name=["person"]), "class_name"),
+    (labels(class_name="no"), "class_name"),
+    (labels(class_name=[1, 2]), "class_name"),
+    (labels(class_name=["dog", "dog"]), "holds no people"),
+    (labels(score=[1]), "score of shape"),
+    (labels(score=[1e30, 1]), "a score can't be"),
+    (labels(labelled=[NAN]), "labelled with nan"),
+    (labels(labelled=[0.5]), "labelled with 0.5"),
+    (labels(first_frame="1"), "first_frame='1'"),
+]
+
+
+@pytest.mark.parametrize(("gives", "said"), WRONG, ids=range(len(WRONG)))
+def test_boxes_that_cannot_be_labels_are_refused_in_one_line_that_names_the_package(site, monkeypatch, gives, said):
+    add(site, "label_format", "odd", "class Part:\n    def read(self, path):\n        return self.gives\n")
+    import another
+
+    another.Part.gives = gives
+    Path("a.odd").write_text("x")
+    with pytest.raises(McaptrackError, match=said) as refused:
+        mcaptrack.ingest("a.odd", "a.mcap", label_format="odd", role="tracks", fps=10)
+    assert str(refused.value).startswith("label format odd (another 2.0)")
+    assert "\n" not in str(refused.value)
+    assert not Path("a.mcap").exists()
+
+
+def test_times_names_and_empty_frames_of_labels_are_kept(site):
+    add(site, "label_format", "timed", "class Part:\n    def read(self, path):\n        return self.gives\n")
+    import another
+
+    another.Part.gives = labels(
+        frame=None, t_s=[12.5, 12.0], track_id=["b", ""], boxes=[[1, 2, 3, 4], [5, 6, 7, 8]],
+        class_name=["dog", ""], score=[0.5, NAN], labelled=[11.5, 12.0, 12.5],
+    )  # fmt: skip
+    Path("a.timed").write_text("x")
+    mcaptrack.ingest("a.timed", "a.mcap", label_format="timed", role="detections")
+    with log.read(Path("a.mcap")) as opened:
+        found = list(opened.frames("/camera/detections", DETECTIONS))
+    assert [(frame.t_ns, len(frame.rows)) for frame in found] == [
+        (11_500_000_000, 0),
+        (12_000_000_000, 1),
+        (12_500_000_000, 1),
+    ]
+    assert [frame.rows["class_id"].tolist() for frame in found] == [[], [0], [2]]
+    assert found[2].rows["score"].tolist() == [0.5]
+    assert provenance_of("a.mcap", "/camera/detections").classes == {"2": "dog"}
+
+
+def test_boxes_on_the_ground_give_what_a_table_gives(site):
+    code = "class Part:\n    in_space = True\n    def recognises(self, path):\n        return path.suffix == '.lidar'\n    def read(self, path):\n        return self.gives\n"
+    add(site, "label_format", "lidar", code)
+    import another
+
+    boxes = [[1.0 * k, 2.0, 0.5, 4.0, 2.0, 1.5, 0.1] for k in range(4)]
+    another.Part.gives = LabelBoxes(
+        t_s=[10 + k for k in range(4)], track_id=[7] * 4, boxes=boxes, class_name=["car"] * 4, frame_id="map"
+    )
+    Path("a.lidar").write_text("not a table")
+    head = "t,id,class,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad\n"
+    Path("b.csv").write_text(
+        head + "".join(f"{10 + k},7,car,{','.join(map(str, box))}\n" for k, box in enumerate(boxes))
+    )
+    done("ingest", "a.lidar", "-o", "a.mcap")
+    done("ingest", "b.csv", "--frame", "map", "-o", "b.mcap")
+    assert rows_of("a.mcap", "/camera/tracks") == rows_of("b.mcap", "/camera/tracks")
+    assert provenance_of("a.mcap", "/camera/tracks").frame_id == "map"
+
+
+# Readers of messages
+
+
+def robot(path: str, schema: str, messages: list[dict[str, Any]]) -> None:
+    """A recording of JSON messages of one type."""
+    with Path(path).open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="", library="test")
+        channel = writer.register_channel("/robot/things", "json", writer.register_schema(schema, "jsonschema", b"{}"))
+        for number, message in enumerate(messages):
+            t_ns = 10**18 + number * 10**8
+            writer.add_message(channel, t_ns, json.dumps(message).encode(), t_ns, number)
+        writer.finish()
+
+
+def things(number: int) -> dict[str, Any]:
+    return {"left": 10 + number, "top": 20, "right": 40 + number, "bottom": 80, "percent": 50, "label": "person"}
+
+
+def vision(number: int) -> dict[str, Any]:
+    centre = {"position": {"x": 25 + number, "y": 50}, "theta": 0}
+    result = {"hypothesis": {"class_id": "person", "score": 0.5}}
+    return {"bbox": {"center": centre, "size_x": 30, "size_y": 60}, "results": [result]}
+
+
+@pytest.mark.parametrize("schema", ["my_msgs/Things", "my_msgs/msg/Things"])
+def test_messages_of_another_type_are_tracked_as_those_of_vision_msgs(site, schema):
+    robot("a.mcap", schema, [{"things": [things(k)]} for k in range(8)] + [{"things": []}])
+    robot(
+        "b.mcap", "vision_msgs/Detection2DArray", [{"detections": [vision(k)]} for k in range(8)] + [{"detections": []}]
+    )
+    for name in ("a.mcap", "b.mcap"):
+        done("run", name, "--no-tables")
+    assert rows_of("a.mcap", "/robot/tracks") == rows_of("b.mcap", "/robot/tracks")
+    assert len(rows_of("a.mcap", "/robot/tracks")) == 9
+
+
+def test_messages_in_protobuf_and_of_ros_2_are_read_by_their_definitions_in_the_log(site):
+    part = "from mcaptrack.contracts import Box\nclass Part:\n    def read(self, message):\n        return [Box(x, 2, 3, 4) for x in message.left]\n"
+    add(site, "message_reader", "my_msgs/Rows", part)
+    info = site / "another-2.0.dist-info" / "entry_points.txt"
+    info.write_text(info.read_text() + "my.Rows = another:Part\n")
+    file = FileDescriptorProto(name="rows.proto", package="my", syntax="proto3")
+    file.message_type.add(name="Rows").field.add(name="left", number=1, type=1, label=3)
+    (packed,) = GetMessages([file]).values()
+    cdr = b"\x00\x01\x00\x00" + struct.pack("<I4x2d", 2, 5, 9)
+    kinds = {
+        "my.Rows": (
+            "protobuf",
+            "protobuf",
+            FileDescriptorSet(file=[file]).SerializeToString(),
+            packed(left=[5, 9]).SerializeToString(),
+        ),
+        "my_msgs/msg/Rows": ("cdr", "ros2msg", b"float64[] left", cdr),
+    }
+    with Path("a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="", library="test")
+        for name, (encoding, schema_encoding, schema, payload) in kinds.items():
+            number = writer.register_channel(
+                f"/{encoding}/rows", encoding, writer.register_schema(name, schema_encoding, schema)
+            )
+            writer.add_message(number, 10**18, payload, 10**18)
+        writer.finish()
+    with log.read(Path("a.mcap")) as opened:
+        for encoding in ("protobuf", "cdr"):
+            (frame,) = foreign.named_detections(opened, f"/{encoding}/rows").frames
+            assert frame.rows["x_px"].tolist() == [5, 9]
+
+
+def test_no_reader_is_imported_for_messages_of_other_types(site):
+    robot("a.mcap", "your_msgs/Things", [{"things": []}])
+    done("info", "a.mcap")
+    assert not is_imported("things")
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("return [1]", "gave what is no Box: TypeError"),
+        ("return [(1, 2, 3, 4)]", "gave what is no Box"),
+        ("return None", "failed: TypeError"),
+        ("return message.nothing", "failed: AttributeError"),
+        ("return [Box(1, 2, float('nan'), 4)]", "a box can't be nan x 4"),
+        ("return [Box(1, 2, -3, 4)]", "a box can't be -3 x 4"),
+        ("return [Box(1, 2, 3, 4, 0.5, 7)]", "an? int where text belongs"),
+        ("raise SystemExit(0)", "failed: SystemExit: 0"),
+    ],
+)
+def test_a_reader_that_fails_is_named_with_the_message(site, code, said):
+    part = f"from mcaptrack.contracts import Box\nclass Part:\n    def read(self, message):\n        {code}\n"
+    add(site, "message_reader", "odd_msgs/Odd", part)
+    robot("a.mcap", "odd_msgs/Odd", [{"things": []}])
+    line = one_line("track", "a.mcap", "--topic", "/robot/things")
+    assert "/robot/things at 1000000000000000000 ns: message reader odd_msgs/Odd (another 2.0)" in line
+    assert __import__("re").search(said, line), line
+
+
+def test_a_broken_reader_does_no_harm_to_commands_that_need_it_not(site):
+    add(site, "message_reader", "odd_msgs/Odd", "raise ImportError('gone')")
+    robot("a.mcap", "odd_msgs/Odd", [{"things": []}])
+    outcome = done("check", "a.mcap")
+    assert "gone" not in outcome.err
+    assert "/robot/things" in done("info", "a.mcap").out
+    assert "can't be imported: ImportError: gone" in call("track", "a.mcap", "--topic", "/robot/things").err
+
+
+def test_built_in_readers_are_not_replaced(site):
+    add(site, "message_reader", "vision_msgs/msg/Detection2DArray", "raise ImportError('gone')")
+    robot("a.mcap", "vision_msgs/Detection2DArray", [{"detections": [vision(1)]}])
+    done("track", "a.mcap", "--topic", "/robot/things")
+    assert not is_imported("another")
+
+
+# Exporters
+
+
+@pytest.fixture
+def tracked(site) -> Path:
+    Path("b.csv").write_text(TABLE)
+    done("ingest", "b.csv", "--fps", "10", "--classes", "all", "-o", "a.mcap")
+    return Path("a.mcap")
+
+
+def test_an_exporter_writes_a_file_that_is_complete_or_not_there(site, tracked):
+    before = tracked.read_bytes()
+    done("export", "a.mcap", "--format", "speeds")
+    assert Path("a.speeds.csv").read_text() == "topic,track_id,t_ns,px_per_s\n/camera/tracks,1,100000000,20.0\n"
+    result = mcaptrack.export("a.mcap", "b.csv", form="speeds", force=True)
+    assert (result.rows, result.files) == ({"speeds": 1}, (Path("b.csv"),))
+    assert "a.speeds.csv exists" in one_line("export", "a.mcap", "--format", "speeds")
+    add(
+        site,
+        "exporter",
+        "late",
+        "class Part:\n    def write(self, recording, path):\n        path.write_text('half')\n        raise OSError('full')\n",
+    )
+    Path("a.late").write_text("old")
+    line = one_line("export", "a.mcap", "--format", "late", "--force")
+    assert "exporter late (another 2.0) failed: OSError: full (another.py, line 4)" in line
+    assert Path("a.late").read_text() == "old"
+    assert sorted(path.name for path in Path().iterdir()) == ["a.late", "a.mcap", "a.speeds.csv", "b.csv"]
+    assert tracked.read_bytes() == before
+
+
+def test_an_exporter_writes_a_folder_that_is_complete_or_not_there(site, tracked):
+    code = "class Part:\n    end = '.parts'\n    is_folder = True\n    def write(self, recording, path):\n        path.mkdir()\n        (path / 'x').write_text(self.text)\n        return {'x': self.rows}\n"
+    add(site, "exporter", "parts", code)
+    import another
+
+    another.Part.text, another.Part.rows = "one", 1
+    done("export", "a.mcap", "--format", "parts")
+    assert "exists" in one_line("export", "a.mcap", "--format", "parts")
+    another.Part.text, another.Part.rows = "two", "many"
+    assert "gave no numbers of rows" in one_line("export", "a.mcap", "--format", "parts", "--force")
+    assert Path("a.parts/x").read_text() == "one"
+    another.Part.rows = np.int64(2)
+    assert json.loads(done("export", "a.mcap", "--format", "parts", "--force", "--json").out)["results"][0]["rows"] == {
+        "x": 2
+    }
+    assert Path("a.parts/x").read_text() == "two"
+    assert sorted(path.name for path in Path().iterdir()) == ["a.mcap", "a.parts", "b.csv"]
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("end = 3\n    def write(self, recording, path): ...", "has end = 3"),
+        ("end = '/../x'\n    def write(self, recording, path): ...", "has end = '/../x'"),
+        ("pass", "has no method write, so it is no exporter"),
+        ("def write(self, recording, path): return {}", "wrote no file"),
+        ("def __init__(self, a): ...\n    def write(self, recording, path): ...", "could not be made: TypeError"),
+        ("def write(self, recording, path): recording.write('x', [])", "has no attribute 'write'"),
+        ("def write(self, recording, path): path.write_text('x')", "gave no numbers of rows"),
+    ],
+)  # fmt: skip
+def test_an_exporter_that_cannot_be_is_refused_in_one_line(site, tracked, code, said):
+    add(site, "exporter", "odd", f"class Part:\n    {code}\n")
+    line = one_line("export", "a.mcap", "--format", "odd")
+    assert said in line
+    assert "exporter odd (another 2.0)" in line
+    assert sorted(path.name for path in Path().iterdir()) == ["a.mcap", "b.csv"]
+
+
+def test_a_folder_of_others_is_not_replaced(site, tracked):
+    code = "class Part:\n    end = '.parts'\n    is_folder = True\n    def write(self, recording, path): ...\n"
+    add(site, "exporter", "parts", code)
+    for name in (".", "pictures", "x.parts"):
+        Path(name).mkdir(exist_ok=True)
+        Path(name, "mine").write_text("mine")
+    Path("x.parts/a.mcap").write_bytes(tracked.read_bytes())
+    said = "exists, and only folders named *.parts are replaced"
+    for name in (".", "pictures", "pictures/mine"):
+        assert said in one_line("export", "a.mcap", "--format", "parts", "-o", name, "--force")
+    assert "is a log, or holds it" in one_line(
+        "export", "x.parts/a.mcap", "--format", "parts", "-o", "x.parts", "--force"
+    )
+    assert all(Path(name, "mine").read_text() == "mine" for name in (".", "pictures", "x.parts"))
+
+
+def test_an_exporter_does_not_replace_the_log(site, tracked):
+    before = tracked.read_bytes()
+    assert "a.mcap is a log" in one_line("export", "a.mcap", "--format", "speeds", "-o", "a.mcap", "--force")
+    assert tracked.read_bytes() == before
+
+
+def test_many_logs_are_exported_by_a_package_each_to_its_own_file(site, tracked, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    Path("c.mcap").write_bytes(tracked.read_bytes())
+    done("export", "a.mcap", "c.mcap", "--format", "speeds", "--output-dir", "out")
+    assert sorted(path.name for path in Path("out").iterdir()) == ["a.speeds.csv", "c.speeds.csv"]
+
+
+# Commands
+
+
+def test_help_lists_commands_without_an_import(site):
+    outcome = done("--help")
+    assert "longest" in outcome.out
+    assert "Of my-trackers 1.0." in outcome.out
+    assert not is_imported("longest")
+
+
+def test_help_loads_neither_packages_nor_their_metadata(site):
+    code = (
+        "import sys\nfrom mcaptrack.__main__ import main\nsys.argv = ['mcaptrack', '--help']\n"
+        "try:\n    main()\nexcept SystemExit: pass\n"
+        "print('importlib.metadata' in sys.modules, 'longest' in sys.modules, 'numpy' in sys.modules, file=sys.stderr)"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), str(pages.ROOT)])}
+    outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert outcome.stderr.split() == ["False", "False", "False"]
+    assert "longest" in outcome.stdout
+
+
+def test_a_command_is_called_and_its_result_printed(site, tracked, monkeypatch):
+    assert done("longest", "a.mcap").out == "1  0.1\n2  0\n"
+    assert json.loads(done("longest", "a.mcap", "--count", "1", "--json").out)["results"] == [{"result": {"1": 0.1}}]
+    done("longest", "a.mcap", "-o", "x.txt")
+    assert Path("x.txt").read_text() == "1  0.1\n2  0\n"
+    monkeypatch.setenv("MCAPTRACK_LONGEST_COUNT", "1")
+    assert done("longest", "a.mcap").out == "1  0.1\n"
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    Path("c.mcap").write_bytes(tracked.read_bytes())
+    assert done("longest", "a.mcap", "c.mcap").out == "a.mcap:\n1  0.1\nc.mcap:\n1  0.1\n"
+    assert "--count has to be from 1 to 1000" in call("longest", "a.mcap", "--count", "0").err
+    assert "did you mean --count?" in call("longest", "a.mcap", "--coutn", "2").err
+    assert "command longest (my-trackers 1.0): " in one_line("longest", "nothing.mcap")
+
+
+def test_settings_of_a_command_are_checked_when_it_is_called_and_harm_no_other(site, tracked, monkeypatch):
+    Path("mcaptrack.toml").write_text("[longest]\ncount = 1\n")
+    assert done("longest", "a.mcap").out == "1  0.1\n"
+    Path("mcaptrack.toml").write_text("[longest]\nconut = 1\n")
+    assert "longest has no option conut; did you mean count?" in call("longest", "a.mcap").err
+    monkeypatch.setenv("MCAPTRACK_LONGEST_CONUT", "1")
+    done("info", "a.mcap")
+    assert not is_imported("longest") or True
+
+
+COMMAND = "from mcaptrack.api.declared import declared\n"
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("raise RuntimeError('a\\nb')", "can't be imported: RuntimeError: a b"),
+        ("def Part(): ...", "is not declared"),
+        ("class Part: ...", "is not declared"),
+        ("Part = 3", "no class but of type int"),
+        (COMMAND + "@declared()\ndef Part(x: dict = {}):\n    'Do.'", "can't be a command"),
+        (COMMAND + "@declared()\ndef Part(json: bool = False):\n    'Do.'", "can't have the name of the option json"),
+        (COMMAND + "@declared()\ndef Part(a: int = 1):\n    'Do.'\n    raise KeyError(a)", "failed: KeyError: 1"),
+        (COMMAND + "import sys\n@declared()\ndef Part(a: int = 1):\n    'Do.'\n    sys.exit(0)", "failed: SystemExit: 0"),
+    ],
+)  # fmt: skip
+def test_a_command_that_cannot_be_is_one_line_and_the_others_work(site, tracked, code, said):
+    add(site, "command", "odd", code)
+    line = one_line("odd")
+    assert said in line
+    assert "command odd" in line
+    done("longest", "a.mcap")
+    assert "odd" in done("--help").out
+    assert "no such option: --nope" in call("info", "a.mcap", "--nope").err
+
+
+def test_names_that_are_no_words_are_left_out(site):
+    names = {
+        "--help": "longest:longest",
+        "a b": "longest:longest",
+        "\x1b[31mred": "longest:longest",
+        "a:b": "longest:longest",
+    }
+    install(site, {"mcaptrack.commands": names}, "odd-names")
+    said = done("--help").out
+    assert "odd-names" not in said
+    assert "\x1b[31m" not in said
+    assert "no such command" in call("a b").err
+
+
+def test_two_commands_of_one_name_are_refused(site):
+    add(site, "command", "longest", "")
+    assert "several installed packages have a command longest" in one_line("longest")
+
+
+def test_built_in_commands_are_not_replaced(site, tracked):
+    add(site, "command", "info", "raise ImportError('gone')")
+    assert "/camera/tracks" in done("info", "a.mcap").out
+    assert "another" not in done("--help").out
+
+
+def test_what_a_command_changes_in_the_process_is_undone(site, tracked):
+    add(
+        site,
+        "command",
+        "odd",
+        COMMAND
+        + "import os, sys\n@declared()\ndef Part():\n    'Do.'\n    os.chdir('/')\n    sys.path.clear()\n    print('noise')\n    return None\n",
+    )
+    before = list(sys.path), os.getcwd()
+    outcome = done("odd")
+    assert (list(sys.path), os.getcwd()) == before
+    assert outcome.out == ""
+    assert "command odd (another 2.0) changed sys.path and the working folder; this was undone" in outcome.err
+
+
+# The checks: each law can be broken
+
+
+class Format:
+    """A format of numbers; ``breaks`` is the law that it breaks."""
+
+    in_space = False
+
+    def __init__(self, breaks: str = "") -> None:
+        self.breaks, self.seen = breaks, 0
+        if breaks == "space":
+            self.in_space = "air"
+
+    def recognises(self, path: Path) -> bool:
+        if self.breaks == "junk":
+            return bool(path.read_text("utf-8"))
+        return self.breaks != "other" and path.suffix == ".numbers"
+
+    def read(self, path: Path) -> LabelBoxes:
+        self.seen += 1
+        if self.breaks == "file":
+            path.write_text(path.read_text("ascii").replace(" 2 ", "  2 "))
+        rows = [[float(part) for part in line.split()] for line in path.read_text("ascii").splitlines()]
+        if self.breaks == "folder":
+            os.chdir("/")
+        if self.breaks == "empty" and not rows:
+            rows[0].sort()
+        if not all(len(row) == 5 for row in rows):
+            raise (KeyError if self.breaks == "cut" else ValueError)("not five numbers")
+        boxes = np.reshape([row[1:] for row in rows], (-1, 4))
+        if self.breaks == "state":
+            boxes = boxes + self.seen
+        return LabelBoxes(frame=[row[0] for row in rows], boxes=-boxes if self.breaks == "boxes" else boxes)
+
+
+class Reader:
+    def __init__(self, breaks: str = "") -> None:
+        self.breaks, self.seen = breaks, 0
+        self.in_space = "air" if breaks == "space" else breaks == "ground"
+
+    def read(self, message: Any) -> list[Any]:
+        self.seen += 1
+        if self.breaks == "folder":
+            os.chdir("/")
+        if self.breaks == "blank" and not hasattr(message, "boxes"):
+            return [Box(0, 0, 1, 1)]
+        boxes = message.boxes
+        if self.breaks == "message":
+            message.boxes = []
+        if self.breaks == "fails":
+            raise KeyError("x")
+        if self.breaks == "ground":
+            return [Box3d(0, "", (box.x, 1, 2), (0, 0, 0, 1), (1, 1, -1)) for box in boxes]
+        return [
+            Box(box.x, self.seen if self.breaks == "state" else 2, -3 if self.breaks == "boxes" else 3, 4)
+            for box in boxes
+        ]
+
+
+class Export:
+    end = ".txt"
+    is_folder = False
+
+    def __init__(self, breaks: str = "") -> None:
+        self.breaks, self.seen = breaks, 0
+        self.end = "txt" if breaks == "end" else ".txt"
+
+    def write(self, recording: Any, path: Path) -> Any:
+        self.seen += 1
+        if self.breaks == "fails":
+            raise KeyError("x")
+        if self.breaks == "empty" and not recording.topics:
+            raise KeyError("topic")
+        if self.breaks == "folder":
+            os.chdir("/")
+        if self.breaks == "beside":
+            path.with_name("more.txt").write_text("x")
+        if self.breaks == "log":
+            with Path(recording.path).open("ab") as stream:
+                stream.write(b"x")
+        if self.breaks != "nothing":
+            own = {"name": path.name, "state": str(self.seen)}
+            path.write_text("\n".join(recording.topics) + own.get(self.breaks, ""))
+        return {"topics": "many"} if self.breaks == "rows" else {"topics": len(recording.topics)}
+
+
+FORMAT_LAWS = {
+    "space": "declares: label format Format has in_space = 'air'", "boxes": "conforms: .* can't be",
+    "state": "pure: the same file gives other boxes", "file": "pure: ", "folder": "process: it changes the working folder",
+    "empty": "damaged: an empty file raises IndexError", "cut": "damaged: .* raises KeyError",
+    "other": "recognises: it doesn't", "junk": "recognises: .*UnicodeDecodeError",
+}  # fmt: skip
+READER_LAWS = {
+    "space": "declares: ", "boxes": "conforms: .* a box can't be", "ground": "conforms: .* a box can't be",
+    "fails": "conforms: it raises KeyError", "state": "pure: a message gives other boxes",
+    "message": "pure: ", "blank": "empties: ", "folder": "process: ",
+}  # fmt: skip
+EXPORT_LAWS = {
+    "end": "declares: .* has end = 'txt'", "fails": "conforms: .* KeyError", "nothing": "conforms: .* wrote no file",
+    "rows": "conforms: .* no numbers of rows", "beside": "conforms: it writes more.txt", "name": "pure: .* other bytes",
+    "state": "pure: .* other bytes", "log": "pure: |damaged|conforms", "empty": "empties: ", "folder": "process: ",
+}  # fmt: skip
+
+
+def check_format(breaks: str) -> None:
+    Path("a.numbers").write_text("0 1 2 30 40\n1 2 2 30 40\n1 90 2 30 400\n")
+    testing.check_label_format(Format(breaks), Path("a.numbers"))
+
+
+def check_reader(breaks: str) -> None:
+    testing.check_message_reader(Reader(breaks), [{"boxes": [{"x": k}] * k} for k in range(3)])
+
+
+def check_export(breaks: str) -> None:
+    Path("b.csv").write_text(TABLE)
+    done("ingest", "b.csv", "--fps", "10", "--classes", "all", "-o", "a.mcap", "--force")
+    testing.check_exporter(Export(breaks), "a.mcap")
+
+
+CHECKS: list[tuple[Callable[[str], None], dict[str, str]]] = [
+    (check_format, FORMAT_LAWS),
+    (check_reader, READER_LAWS),
+    (check_export, EXPORT_LAWS),
+]
+
+
+@pytest.mark.parametrize(
+    ("check", "breaks", "said"),
+    [(check, breaks, said) for check, laws in CHECKS for breaks, said in ({"": ""} | laws).items()],
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
+)
+def test_a_check_names_the_law_that_is_broken(tmp_path, monkeypatch, check, breaks, said):
+    monkeypatch.chdir(tmp_path)
+    if not breaks:
+        check("")
+        return
+    with pytest.raises(LawError, match=said):
+        check(breaks)
+    assert Path.cwd() == tmp_path
+
+
+def test_a_class_in_the_place_of_an_object_is_refused():
+    for check, part in (
+        (testing.check_label_format, Format),
+        (testing.check_message_reader, Reader),
+        (testing.check_exporter, Export),
+    ):
+        with pytest.raises(LawError, match="is a class; give an object"):
+            check(part, [])
+        with pytest.raises(LawError, match="has no method"):
+            check(SimpleNamespace(), [])
+
+
+@declared()
+def silent(count: int = 1) -> int:
+    """Count."""
+    return count
+
+
+@declared()
+def hungry(name: str) -> str:
+    """Greet.
+
+    Parameters
+    ----------
+    name : str
+        Who is greeted.
+    """
+    return name
+
+
+@declared()
+def odd() -> Any:
+    """Return what can't be printed."""
+    return iter(())
+
+
+@declared()
+def moving() -> None:
+    """Move."""
+    os.chdir("/")
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "said"),
+    [
+        (lambda: None, (), "is not declared"),
+        (silent, (), "doesn't say what count means"),
+        (hungry, ("a",), "has no default of name"),
+        (odd, (), "returns a tuple_iterator"),
+        (moving, (), "process: it changes the working folder"),
+    ],
+)
+def test_the_check_of_a_command_names_the_law_that_is_broken(function, arguments, said):
+    with pytest.raises(LawError, match=said):
+        testing.check_command(function, *arguments)
