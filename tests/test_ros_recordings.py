@@ -230,7 +230,7 @@ def test_recordings_are_told_by_profile_and_by_the_metadata_beside_them(
     link.parent.mkdir()
     link.symlink_to(path)
     with log.read(link, sidecar=False) as opened:
-        from mcaptrack.sources.ingest.sidecar import recording_of
+        from mcaptrack.sources.sidecar import recording_of
 
         assert bool(recording_of(opened)) == is_beside
 

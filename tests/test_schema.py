@@ -86,6 +86,8 @@ def test_a_channel_is_its_messages_laid_end_to_end(data):
     schema = data.draw(ALL)
     parts = [schema.rows(**data.draw(columns(schema))) for _ in range(data.draw(st.integers(0, 4)))]
     payloads = [schema.codec.encode(part) for part in parts]
+    ends = np.cumsum([0, *(len(part) for part in parts)])
+    assert [*schema.codec.encode_each(np.concatenate([schema.empty(), *parts]), ends)] == payloads
     rows, counts = schema.codec.decode_all(payloads)
     assert counts.tolist() == [len(part) for part in parts]
     assert same(rows, np.concatenate([schema.empty(), *parts]))

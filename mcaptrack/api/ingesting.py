@@ -302,7 +302,7 @@ def _add_to(log: Path, sidecar: bool | None, make: Callable[..., IngestReport]) 
     """Add what is made of an input to a log, or to the results beside it, and say where it is."""
     from mcaptrack import log as logs
     from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
-    from mcaptrack.sources.ingest.sidecar import SidecarChoice
+    from mcaptrack.sources.sidecar import SidecarChoice
 
     place = SidecarChoice(sidecar)
     with logs.read(log, sidecar=place) as opened:

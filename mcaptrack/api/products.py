@@ -10,16 +10,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.options import Progress
-from mcaptrack.files import publish_bytes, sweep
+from mcaptrack.files import follow_links, publish_bytes, sweep
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
-from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
-from mcaptrack.tables.export import default_folder, export, main_file, refuse_tables_of_another
+from mcaptrack.sources.sidecar import METADATA
+
+if TYPE_CHECKING:
+    from mcaptrack.sources.fixed_frame import BoxesRead
 
 
 @dataclass
@@ -36,6 +38,8 @@ class Products:
 
 def refuse_foreign_products(opened: logs.Log, target: Location) -> None:
     """Raise McaptrackError if the tables of the log at ``target``, made from ``opened``, would replace another's."""
+    from mcaptrack.tables.export import default_folder, refuse_tables_of_another
+
     if isinstance(target, Path):
         refuse_tables_of_another(opened, target, default_folder(target))
 
@@ -57,7 +61,9 @@ def write_products(
     if not isinstance(log, Path):
         return done
     with logs.read(log) as opened:
-        if opened.results is None:
+        if opened.results is None and any(file.with_name(METADATA).exists() for file in (log, follow_links(log))):
+            from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
+
             update_metadata(log)
         for path, content in _layouts(opened, log):
             done.owed.append(path)
@@ -66,6 +72,8 @@ def write_products(
                 publish_bytes(path, content)
                 done.layouts.append(path)
         if tables:
+            from mcaptrack.tables.export import default_folder, export, main_file
+
             exported = export(opened, default_folder(log), progress, force=force, boxes=boxes)
             done.owed.append(main_file(log, default_folder(log)))
             done.rows, done.tables = exported.rows, exported.written

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,15 +19,18 @@ from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.api.products import Products, refuse_foreign_products, write_products
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call, did_you_mean
-from mcaptrack.evaluation.zones import ZoneTotals
 from mcaptrack.files import is_same_file, refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
-from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice, Summary, Watch, ZoneWatch
+from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice
 from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say, refuse_failed, together
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.sources.ingest.sidecar import SidecarChoice
+from mcaptrack.sources.sidecar import SidecarChoice
 from mcaptrack.transforms import FUSION, STAGES, Transform
+
+if TYPE_CHECKING:
+    from mcaptrack.evaluation.zones import ZoneTotals
+    from mcaptrack.pipeline import Summary, Watch, ZoneWatch
 
 
 @dataclass(frozen=True)

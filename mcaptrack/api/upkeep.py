@@ -259,7 +259,7 @@ def drop(
 def _refuse_for_ros_tools(opened: logs.Log, dropped: set[str]) -> None:
     """Raise McaptrackError if ROS tools may have to read recorded channels among those to remove."""
     from mcaptrack.schema.provenance import Provenance
-    from mcaptrack.sources.ingest.sidecar import recording_of
+    from mcaptrack.sources.sidecar import recording_of
 
     own = [channel for channel in opened.parts[0].recorded if channel.topic in dropped]
     recorded = sorted({channel.topic for channel in own if Provenance.from_metadata(channel.metadata) is None})

@@ -22,8 +22,8 @@ from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources.cameras import USUAL
-from mcaptrack.sources.ingest.sidecar import SidecarChoice
 from mcaptrack.sources.own_rows import UNNUMBERED, checked_names
+from mcaptrack.sources.sidecar import SidecarChoice
 
 #: What channels usually hold, by the end of their topic.
 _HOLDS: Final[Mapping[str, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}

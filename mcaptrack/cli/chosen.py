@@ -171,10 +171,11 @@ def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Tr
     """
     out: dict[str, Transform] = {}
     for stage in STAGES.values():
-        settings = settings_of(stage.name)
-        own = {option for kind in stage.built_in().values() for option in options_of(kind)}
-        settings |= {kind: name for kind, name in chosen.items() if kind == stage.option}
+        settings = settings_of(stage.name) | {kind: name for kind, name in chosen.items() if kind == stage.option}
         wanted = {option: value for option, value in settings.items() if value is not None}
+        if not wanted:
+            continue
+        own = {option for kind in stage.built_in().values() for option in options_of(kind)}
         chosen_plugin = settings.get(stage.kind) if stage.kind else None
         kinds = dict(stage.built_in()) | ({chosen_plugin: stage.find(chosen_plugin).cls} if chosen_plugin else {})
         wanted |= values_set(stage.name, wanted.pop("set", None), kinds)

@@ -288,7 +288,9 @@ def converted(context: Any, command: str) -> dict[str, Any]:
 def settings_of(command: str) -> dict[str, Any]:
     """Return the values that environment and files set for another command (a stage that the running one runs)."""
     context: Any = RUNNING.get()
-    values, set_values = converted(context, command), found_of(command)
+    if not (set_values := found_of(command)):
+        return {}
+    values = converted(context, command)
     other: Command = context.parent.command.commands[command]
     for setting in other.settings.values():
         place = set_values[setting.parameter][1].where if setting.parameter in set_values else ""

@@ -43,7 +43,7 @@ from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import Camera, camera_at, corrected_plane, given_plane, provenance_of, scenes_of
 from mcaptrack.sources.cameras import cameras as cameras_of
-from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
+from mcaptrack.sources.sidecar import check_topics, encoding_for
 from mcaptrack.transforms.fuse import FootFuser, Places, group, means
 
 #: Cameras are compared by at most so many frames.

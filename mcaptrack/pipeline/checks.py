@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call, list_names
-from mcaptrack.foxglove import views
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.schema.provenance import INGEST, VIEW, Provenance, frame_id_of
+from mcaptrack.schema.provenance import INGEST, SCENE_SUFFIX, VIEW, VIEW_SUFFIX, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, Camera, chain_of, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -167,7 +166,7 @@ def _check_outputs(opened: log.Log, prefix: str, job: Job) -> None:
                 "another channel with `to=`"
             )
     for topic in sorted(job.kept()):
-        maker = {topic: job.stage} | {topic + suffix: VIEW for suffix in views.SUFFIXES}
+        maker = {topic: job.stage} | {topic + suffix: VIEW for suffix in (VIEW_SUFFIX, SCENE_SUFFIX)}
         for name, transform in maker.items():
             if not may_replace(opened, name, transform):
                 raise McaptrackError(

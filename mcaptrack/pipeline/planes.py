@@ -191,9 +191,11 @@ def make_plane(
             plane, parameters = fit.plane, {"person_height_m": person_m, "fit": fit.to_json()}
         except McaptrackError as error:
             parameters["refused"] = str(error)
-    parameters |= {_UNCALIBRATED: uncalibrated} if uncalibrated else {}
+    if uncalibrated:
+        parameters[_UNCALIBRATED] = uncalibrated
     transform = _ASSUME if plane is None else _ESTIMATE
-    plane = plane or assumed_plane(seen.heights(), width, height, person_m)
+    if plane is None:
+        plane = assumed_plane(seen.heights(), width, height, person_m)
     start = frames[0].t_ns
     made = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], Provenance(transform, parameters, *source))
     return [(start, plane)], made

@@ -14,7 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.predictors import entry_of as predictor_entry
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.registry import Entry, find, is_installed
+from mcaptrack.registry import BUILT_IN, Entry, find, is_installed
 from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import FUSION, Stage, Transform
 from mcaptrack.transforms.protocol import member_type
@@ -129,10 +129,12 @@ def _class_of(
     name = str(parameters.pop(stage.kind, "")) if stage.kind else ""
     plugin = provenance.plugins.get("transform")
     if plugin is None:
-        built_in = stage.built_in()
-        if name and name not in built_in:
+        if not name:
+            return stage.default
+        if stage.kind is None or name not in BUILT_IN[stage.kind]:
             raise McaptrackError(f"{stage.kind} {name} made it, which this version does not have")
-        return built_in[name] if name else stage.default
+        made_by: type[Transform] = stage.find(name).cls
+        return made_by
     users = named_by_user.get(stage.name)
     if users is not None and stage.entry(type(users)).implementation == plugin.implementation:
         _compare_versions(stage.entry(type(users)), plugin)

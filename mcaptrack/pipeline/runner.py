@@ -252,9 +252,10 @@ def run(
             planes = _add_results(Work(state, job, source, planes, plane, before, progress), report)
             del source
             release_memory()
+        own_planes = planes or ()
         for step in finishing:
             with part(step.name):
-                made = step.make(state, planes or (), stamps)
+                made = step.make(state, own_planes, stamps)
             report.add(step.name, made)
             results |= made
         gone = _gone(opened, jobs, results)
@@ -263,12 +264,12 @@ def run(
             from mcaptrack.pipeline.views import STAGE, make_views
 
             with part(STAGE):
-                drawn = make_views(state, planes or (), stamps, boxes.in_space(), gone, is_written=output is not None)
+                drawn = make_views(state, own_planes, stamps, boxes.in_space(), gone, is_written=output is not None)
             report.stages += [STAGE] if drawn and drawn.topics else []
         with part("write"):
             report.is_written = write(state, output, drawn, gone)
         provenances = {topic: channel.provenance for topic, channel in results.items()}
-        warn_findings(opened, prefix, provenances, planes or (), is_all=bool(finishing) or not jobs)
+        warn_findings(opened, prefix, provenances, own_planes, is_all=bool(finishing) or not jobs)
     late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
     report.stale = [topic for topic in late if topic not in gone]
     report.warnings = list(dict.fromkeys(warnings))

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
@@ -13,12 +14,15 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
-from mcaptrack.pipeline import SCENE, Report, Summary
+from mcaptrack.pipeline.runner import Report
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.sources.ingest.sidecar import SidecarChoice
+from mcaptrack.sources.sidecar import SidecarChoice
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.protocol import traits_of
+
+if TYPE_CHECKING:
+    from mcaptrack.pipeline.summary import Summary
 
 #: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
 Progress = Callable[[str, float, float | None], None]
@@ -130,7 +134,7 @@ class EveryCamera:
                 if joined and why:
                     steps.say(f"not in the scene: {why}")
         if joined:
-            scenes, name = (SCENE,), SCENE[1:]
+            scenes, name = (pipeline.SCENE,), pipeline.SCENE[1:]
             if not steps.take(name, self.fuse_to(name, joined, _named(steps.progress, name)), is_scene=True):
                 self.not_fused = steps.done.pop().failure
                 scenes = ()

@@ -15,10 +15,10 @@ from mcaptrack.schema import TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names, classes_beside_rows, has_classes, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.framing import frame_numbers, joined_parts
 from mcaptrack.schema.provenance import VIEW, Provenance, digest
 from mcaptrack.sources.cameras import provenance_of
-from mcaptrack.sources.ingest.sidecar import check_topics, encoding_for
+from mcaptrack.sources.sidecar import check_topics, encoding_for
 
 #: Log time in ns, channel number, sequence number and payload of a message.
 Numbered = tuple[int, int, int, bytes]
@@ -57,10 +57,13 @@ class Made(NamedTuple):
         """Yield time in ns, sequence number and payload of each message, one by one: all of them take much memory."""
         if self.encoded is not None:
             return iter(self.encoded)
-        encode = self.schema.codec.encode
-        if self.provenance.class_id:  # it stands in the metadata instead
-            return ((frame.t_ns, frame.index, encode(without_class(frame.rows))) for frame in self.frames)
-        return ((frame.t_ns, frame.index, encode(frame.rows)) for frame in self.frames)
+        return self._encoded()
+
+    def _encoded(self) -> Iterator[tuple[int, int, bytes]]:
+        for low, high, joined in joined_parts(self.schema, self.frames):
+            rows = without_class(joined.rows) if self.provenance.class_id else joined.rows  # it is in the metadata
+            numbers = frame_numbers(self.frames[low:high]).tolist()
+            yield from zip(joined.t_ns.tolist(), numbers, self.schema.codec.encode_each(rows, joined.ends), strict=True)
 
     def record_in(self, encoding: Encoding) -> tuple[str, str, bytes]:
         """Return the schema record of the channel for messages in this encoding."""

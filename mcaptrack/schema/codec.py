@@ -13,7 +13,7 @@ Letters: N rows, M messages.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -118,21 +118,38 @@ class RowCodec:
 
     def encode(self, rows: Rows) -> bytes:
         """Encode N rows as one payload. ``rows`` must have the columns of the schema, in any memory layout."""
-        if rows.dtype == self.dtype:
-            whole = self._layouts[-1]
-            raw = np.ascontiguousarray(rows).view(np.uint8).reshape(-1, whole.size)
-            for layout, later in zip(self._layouts, self._later, strict=False):
-                tail = slice(whole.head + layout.size - layout.head, None)
-                is_short = (raw[:, tail] == self._blank[tail]).all()  # tells most; but there are several NaNs
-                if is_short or all(_is_missing(column, rows) for column in later):
-                    values = np.empty((len(raw), layout.size), np.uint8)
-                    values[:, layout.head :] = raw[:, whole.head : whole.head + layout.size - layout.head]
-                    return layout.filled(values)
-            return whole.filled(raw)
-        wire = np.empty(len(rows), self.dtype)
-        for name in self.dtype.names or ():
-            wire[name] = rows[name]
-        return self.encode(wire)
+        return b"".join(self.encode_each(rows, np.array([0, len(rows)])))
+
+    def encode_each(self, rows: Rows, ends: Ints) -> Iterator[bytes]:
+        """Encode rows as several payloads, one up to each of ``ends`` (M + 1,) after the first, which is 0.
+
+        A payload has the columns up to the last group of which any row of it has a value.
+        """
+        if rows.dtype != self.dtype:
+            wire = np.empty(len(rows), self.dtype)
+            for name in self.dtype.names or ():
+                wire[name] = rows[name]
+            rows = wire
+        whole = self._layouts[-1]
+        raw = np.ascontiguousarray(rows).view(np.uint8).reshape(-1, whole.size)
+        counts = np.diff(ends)
+        chosen = np.full(len(counts), len(self._later))
+        for number, later in reversed([*enumerate(self._later)]):
+            states = np.zeros(len(rows), bool)
+            for column in later:
+                states |= ~_are_missing(column, rows)
+            chosen[np.diff(np.concatenate([[0], np.cumsum(states)])[ends]) == 0] = number
+        payloads = {}
+        for number in np.unique(chosen[counts > 0]).tolist():
+            layout = self._layouts[number]
+            values = raw
+            if layout is not whole:
+                values = np.empty((len(raw), layout.size), np.uint8)
+                values[:, layout.head :] = raw[:, whole.head : whole.head + layout.size - layout.head]
+            payloads[number] = layout.filled(values), layout.size
+        for number, low, high in zip(chosen.tolist(), ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+            payload, size = payloads[number] if high > low else (b"", 0)
+            yield payload[low * size : high * size]
 
     def decode(self, payload: bytes) -> Rows:
         """Decode one payload to N read-only rows; a view of ``payload`` if it has this codec's layout.
@@ -248,7 +265,7 @@ class RowCodec:
         return message_class  # type: ignore[no-any-return]
 
 
-def _is_missing(column: Column, rows: Rows) -> bool:
-    """Whether a column is missing in all rows, or 0 if it can't be."""
+def _are_missing(column: Column, rows: Rows) -> Bools:
+    """Whether a column is missing in each row, or 0 if it can't be."""
     values = rows[column.name]
-    return bool((np.isnan(values) if column.is_nullable else values == column.missing).all())
+    return np.isnan(values) if column.is_nullable else np.asarray(values == column.missing)

@@ -18,6 +18,9 @@ T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
 #: ``transform`` of channels that were ingested, of views, of scenes, and of corrected ground planes.
 INGEST, VIEW, FUSE, REFINE = "ingest", "view", "fuse", "calibrate"
+#: Ends of the topics of views: on pictures, and on the ground.
+VIEW_SUFFIX: Final = "/view/image"
+SCENE_SUFFIX: Final = "/view/scene"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
 #: Beginnings of older versions: their results are read, but not made again with the same parameters.

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.foxglove.views import MovingCamera
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.pinhole import Lens, ground_homography
@@ -24,6 +23,9 @@ from mcaptrack.sources.fixed_frame import poses_at, transforms_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import picture_size
+
+if TYPE_CHECKING:
+    from mcaptrack.foxglove.views import MovingCamera
 
 #: Schemas of calibrations, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
 CALIBRATIONS_READ: Final = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
@@ -158,6 +160,8 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
 
     Raises McaptrackError if no calibration fits the pictures, or if no transforms connect the camera with the frame.
     """
+    from mcaptrack.foxglove.views import MovingCamera
+
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
     source = find_calibration(opened, topic, frame_id)
     calibrations = read_calibrations(opened, source, is_rectified_topic(topic))

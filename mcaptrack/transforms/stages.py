@@ -184,8 +184,12 @@ class Stage:
         return self.entry(type(transform)).name + (f":{file}" if file else "") if self.kind else ""
 
     def is_built_in(self, cls: type[Transform]) -> bool:
-        """Whether a class is a built-in transform of this stage."""
-        return _base(cls) in self.built_in().values()
+        """Whether a class is a built-in transform of this stage. Only those of its name are imported."""
+        base = _base(cls)
+        if self.kind is None:
+            return base is self.default
+        names = (name for name, where in BUILT_IN[self.kind].items() if where.endswith(f":{base.__qualname__}"))
+        return any(find(self.kind, name).cls is base for name in names)
 
     def make(self, chosen: str = "", /, **parameters: Any) -> Transform:
         """Make a transform of this stage.

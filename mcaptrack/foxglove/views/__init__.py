@@ -19,13 +19,13 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema.provenance import SCENE_SUFFIX, VIEW_SUFFIX
 
 __all__ = ["DRAWN", "SCENE_SUFFIX", "SUFFIX", "SUFFIXES", "Drawing", "MovingCamera", "View", "ground"]
 
 
-#: Suffixes of the topics of views: on the pictures, and on the ground.
-SUFFIX: Final = "/view/image"
-SCENE_SUFFIX: Final = "/view/scene"
+#: Ends of the topics of views.
+SUFFIX: Final = VIEW_SUFFIX
 SUFFIXES: Final = (SUFFIX, SCENE_SUFFIX)
 #: The schemas of rows that can be drawn.
 DRAWN: Final = (DETECTIONS, TRACKS, PREDICTIONS)

@@ -55,8 +55,8 @@ from mcaptrack.sources.ingest.labels.timeline import (
     timeline_of,
 )
 from mcaptrack.sources.ingest.labels.yolo import is_label_folder
-from mcaptrack.sources.ingest.sidecar import encoding_for
 from mcaptrack.sources.pictures import size_of
+from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import IMAGE_SUFFIXES, EncodedPicture, Video, open_video
 
 __all__ = ["Format", "IngestOptions", "IngestReport", "ingest", "label_frames"]

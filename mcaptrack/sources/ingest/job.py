@@ -45,7 +45,7 @@ from mcaptrack.sources.ingest.labels.content import (
 )
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
-from mcaptrack.sources.ingest.sidecar import encoding_for
+from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
 
 Progress = Callable[[str, int, int], None]

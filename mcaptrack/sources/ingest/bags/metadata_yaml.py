@@ -16,8 +16,8 @@ from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.bags.plain_yaml import Fields, Scalar, UnsupportedYamlError
+from mcaptrack.sources.sidecar import METADATA
 
-METADATA: Final = "metadata.yaml"
 ROOT: Final = "rosbag2_bagfile_information"
 
 

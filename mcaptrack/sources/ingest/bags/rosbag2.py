@@ -20,10 +20,11 @@ from mcaptrack.files import follow_links, read_beginning, refuse_special, tempor
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest.bags import decompression
-from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, Bag, holds_metadata, read_metadata
+from mcaptrack.sources.ingest.bags.metadata_yaml import Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
+from mcaptrack.sources.sidecar import METADATA
 from mcaptrack.sources.video import IMAGE_SUFFIXES
 
 _MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"

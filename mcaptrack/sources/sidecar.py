@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -18,8 +18,9 @@ from mcaptrack.location import Location, Url
 from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR, PROTOBUF, Encoding, is_ros_topic
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bags.metadata_yaml import METADATA, is_packed, names_file
 
+#: The file beside the logs of a rosbag2 folder that counts their messages.
+METADATA: Final = "metadata.yaml"
 #: The profiles of the MCAP registry that ROS tools read, and their names in messages.
 _PROFILES: Final = {"ros1": "ROS 1", "ros2": "ROS 2"}
 
@@ -113,7 +114,7 @@ def encoding_for(opened: log.Log) -> Encoding:
     if opened.results is not None or not recording_of(opened):
         return PROTOBUF
     for path in (opened.path, opened.real_path):
-        if isinstance(path, Path) and is_packed(path.with_name(METADATA), path.name):
+        if isinstance(path, Path) and _stands_in_metadata(path, "is_packed"):
             raise McaptrackError(
                 f"{path.with_name(METADATA)} says that messages are compressed one by one; results in {path.name} "
                 "would not be, and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
@@ -139,10 +140,20 @@ def recording_of(opened: log.Log) -> str:
     for path in (opened.path, opened.real_path):
         if isinstance(path, Url):
             continue
-        metadata = path.with_name(METADATA)
-        if names_file(metadata, path.name):
-            return f"named in {metadata}"
+        if _stands_in_metadata(path, "names_file"):
+            return f"named in {path.with_name(METADATA)}"
     profile, library = log.header(opened)
     if profile in _PROFILES and not library.startswith(log.LIBRARY):
         return f"a {_PROFILES[profile]} recording"
     return ""
+
+
+def _stands_in_metadata(path: Path, question: Literal["is_packed", "names_file"]) -> bool:
+    """Answer a question about a log by the metadata.yaml beside it; False without one."""
+    metadata = path.with_name(METADATA)
+    if not metadata.exists():
+        return False
+    from mcaptrack.sources.ingest.bags import metadata_yaml
+
+    answer = metadata_yaml.is_packed if question == "is_packed" else metadata_yaml.names_file
+    return answer(metadata, path.name)
