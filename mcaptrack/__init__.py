@@ -1,5 +1,7 @@
 """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results."""
 
+from collections.abc import Callable, Mapping
+
 __version__ = "0.3.0.dev0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
 SCHEMA_VERSION = 1
@@ -14,12 +16,13 @@ _PARTS = {
     "fusing": ["fuse"],
     "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
+    "messages": ["DecodedMessage"],
     "notebook": ["Player"],
     "outputs": ["ReportResult", "report"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["Recording", "open"],
     "rendering": ["RenderResult", "render"],
-    "rows": ["detections"],
+    "rows": ["detections", "schema_of"],
     "run": ["run"],
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],
@@ -41,13 +44,20 @@ _MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() 
 __all__ = sorted(_MODULES)  # noqa: PLE0605  # __init__.pyi lists them for tools
 
 
-def __getattr__(name: str) -> object:
-    """Import a name of the package when it is first used: ``import mcaptrack`` stays light."""
-    if name not in _MODULES:
-        raise AttributeError(f"module 'mcaptrack' has no attribute {name!r}")
-    from importlib import import_module
+def _lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], object]:
+    """Return the ``__getattr__`` of a package: it imports a name from its module when the name is first used."""
 
-    return getattr(import_module(_MODULES[name]), name)
+    def imported(name: str) -> object:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        from importlib import import_module
+
+        return getattr(import_module(modules[name]), name)
+
+    return imported
+
+
+__getattr__ = _lazily(__name__, _MODULES)  # `import mcaptrack` stays light
 
 
 def __dir__() -> list[str]:

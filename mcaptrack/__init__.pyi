@@ -1,3 +1,5 @@
+import collections.abc
+
 from mcaptrack.api.calibrating import CalibrateResult as CalibrateResult
 from mcaptrack.api.calibrating import CameraCorrection as CameraCorrection
 from mcaptrack.api.calibrating import calibrate as calibrate
@@ -18,6 +20,7 @@ from mcaptrack.api.health import DoctorResult as DoctorResult
 from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
+from mcaptrack.api.messages import DecodedMessage as DecodedMessage
 from mcaptrack.api.notebook import Player as Player
 from mcaptrack.api.outputs import ReportResult as ReportResult
 from mcaptrack.api.outputs import report as report
@@ -32,6 +35,7 @@ from mcaptrack.api.recording import open as open  # noqa: A004
 from mcaptrack.api.rendering import RenderResult as RenderResult
 from mcaptrack.api.rendering import render as render
 from mcaptrack.api.rows import detections as detections
+from mcaptrack.api.rows import schema_of as schema_of
 from mcaptrack.api.run import run as run
 from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
@@ -61,11 +65,15 @@ from mcaptrack.notices import Notice as Notice
 from mcaptrack.training.result import TrainResult as TrainResult
 
 _MODULES: dict[str, str]
+
+def _lazily(package: str, modules: collections.abc.Mapping[str, str]) -> collections.abc.Callable[[str], object]: ...
+
 __all__ = [
     "CalibrateResult",
     "CameraCorrection",
     "ChannelInfo",
     "ColumnInfo",
+    "DecodedMessage",
     "DemoResult",
     "DoctorResult",
     "DropResult",
@@ -118,6 +126,7 @@ __all__ = [
     "retrack",
     "run",
     "sample",
+    "schema_of",
     "track",
     "train",
     "tune",

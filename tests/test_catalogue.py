@@ -12,11 +12,12 @@ import pyarrow.parquet as pq
 
 import mcaptrack
 from mcaptrack import log
+from mcaptrack.schema import SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables import catalogue
-from mcaptrack.tables.export.contents import about_channels, best_tracks, worst_score
+from mcaptrack.tables.export.contents import best_tracks, worst_score
 from mcaptrack.tables.fields import TABLES
-from tests.logs import some_log
+from tests.logs import some_log, write_channels
 
 CAMERA = SimpleNamespace(prefix="/c")
 
@@ -53,19 +54,50 @@ def test_the_worst_camera_stands_for_the_scores_of_a_log():
     assert worst_score(["/e"], [*space[:1], score("/e", 0.2, ("metres", 2.0))])["gate"] == 1.0
 
 
-def test_warnings_and_versions_of_channels_are_named_once():
-    def channel(version: str, *warnings: tuple[str, str]) -> SimpleNamespace:
-        made = Provenance("track", {}, "/x", version=version, warnings=warnings)
-        return SimpleNamespace(metadata=made.to_metadata())
+def test_warnings_and_versions_of_channels_are_named_once(tmp_path):
+    def channel(version: str, *warnings: tuple[str, str]) -> tuple[object, ...]:
+        return TRACKS, Provenance("track", {}, version=version, warnings=warnings), [Frame(0, 0, TRACKS.empty())]
 
     both = ("lost", "a é"), ("other", "b")
-    channels = {"/b": channel("0.2", both[1], both[0]), "/a": channel("0.1", both[0]), "/c": channel("0.2")}
-    found = about_channels(SimpleNamespace(channels=channels | {"/imu": SimpleNamespace(metadata={})}))
+    channels = {
+        "/e/b": channel("0.2", both[1], both[0]), "/e/a": channel("0.1", both[0]), "/f/a": channel("0.2", both[0]),
+    }  # fmt: skip
+    with mcaptrack.open(write_channels(tmp_path / "a.mcap", channels)) as opened:
+        (row,) = opened.table("recordings").to_pylist()
+        warnings = opened.table("warnings").to_pylist()
     texts = [{"code": code, "message": message} for code, message in both]
-    assert found == {"warnings": 2, "warning_texts": json.dumps(texts, ensure_ascii=False), "versions": "0.1, 0.2"}
-    assert "é" in found["warning_texts"]
-    none = about_channels(SimpleNamespace(channels={}))
-    assert none == {"warnings": 0, "warning_texts": None, "versions": None}
+    wanted = {"warnings": 2, "warning_texts": json.dumps(texts, ensure_ascii=False), "versions": "0.1, 0.2"}
+    assert {name: row[name] for name in wanted} == wanted
+    assert "é" in row["warning_texts"]
+    assert [tuple(warning.values()) for warning in warnings] == [
+        ("/e/a", "e", *both[0], "a"), ("/e/b", "e", *both[1], "a"), ("/f/a", "f", *both[0], "a"),
+    ]  # fmt: skip
+    with mcaptrack.open(write_channels(tmp_path / "b.mcap", {})) as opened:
+        (row,) = opened.table("recordings").to_pylist()
+        assert opened.table("warnings").num_rows == 0
+    assert {name: row[name] for name in wanted} == {"warnings": 0, "warning_texts": None, "versions": None}
+
+
+def test_metadata_that_no_table_can_hold_harms_no_table(tmp_path):
+    half, of_tracks = "\ud800", "mcaptrack.Tracks"
+    made = {"mcaptrack.transform": "retrack", "mcaptrack.version": "0.3"}
+    odd = {
+        "warnings": [["x", half], ["y"], 7], "plugins": {"transform": {"name": half}, "predictor": 5},
+        "zones": {"0": half, "x": "y"}, "classes": {"1": half},
+        "parameters": {"cameras": [half, [], None], "poor_scale": [1], "retracker": 5, half: half},
+    }  # fmt: skip
+    with log.create(tmp_path / "a.mcap") as writer:
+        for schema in SCHEMAS.values():
+            topic = f"/camera/{schema.name.partition('.')[2].lower()}"
+            record = (schema.name, "protobuf", schema.descriptor)
+            metadata = made | {f"mcaptrack.{name}": json.dumps(value) for name, value in odd.items()}
+            number = writer.add_channel(topic, record, "protobuf", metadata if schema.name != of_tracks else made)
+            writer.add_message(number, 0, 0, schema.codec.encode(schema.empty(1)))
+    mcaptrack.export(tmp_path / "a.mcap", tmp_path / "tables")
+    with mcaptrack.open(tmp_path / "a.mcap") as opened:
+        assert ("x", r"\ud800") in {(row["code"], row["message"]) for row in opened.table("warnings").to_pylist()}
+        assert opened.table("sightings")["camera_name"].to_pylist() == [r"\ud800"]
+        assert opened.table("zone_visits")["zone"].to_pylist() == [r"\ud800"]
 
 
 def test_a_log_has_a_row(tmp_path):

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import heapq
 import struct
+from dataclasses import replace
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.records import ChunkIndex
 
 from mcaptrack import log
 from mcaptrack.log.index import ChunkList
-from mcaptrack.log.records import ChunkIndexRecord
+from mcaptrack.log.records import chunk_index
 
 NUMBERS = st.integers(0, 2**64 - 1)
 CHANNELS = st.dictionaries(st.one_of(st.integers(0, 3), st.just(2**16 - 1)), NUMBERS, max_size=3)
+PLACES = st.one_of(st.integers(0, 9), NUMBERS)
 ENTRIES = st.builds(
-    ChunkIndexRecord, NUMBERS, NUMBERS, st.one_of(st.integers(0, 9), NUMBERS), st.one_of(st.integers(0, 9), NUMBERS),
-    CHANNELS, NUMBERS, st.sampled_from(["", "zstd", "lz4", "other"]), NUMBERS, NUMBERS,
+    ChunkIndex, message_start_time=NUMBERS, message_end_time=NUMBERS, chunk_start_offset=PLACES, chunk_length=PLACES,
+    message_index_offsets=CHANNELS, message_index_length=NUMBERS,
+    compression=st.sampled_from(["", "zstd", "lz4", "other"]), compressed_size=NUMBERS, uncompressed_size=NUMBERS,
 )  # fmt: skip
 
 
@@ -28,26 +32,30 @@ def test_columns_hold_what_a_list_of_records_holds(plain, wanted):
     assert [made[number] for number in range(-len(plain), len(plain))] == plain + plain
     assert list(made.with_channels(wanted)) == [one for one in plain if wanted & set(one.message_index_offsets)]
     assert made.channels == {channel for one in plain for channel in one.message_index_offsets}
-    assert made.offsets.tolist() == [one.offset for one in plain]
+    assert made.offsets.tolist() == [one.chunk_start_offset for one in plain]
     assert made.are_all_indexed == all(one.message_index_offsets for one in plain)
     assert made.listed == sum(one.message_index_length - 15 * len(one.message_index_offsets) for one in plain)
     full = [one for one in plain if one.message_index_offsets]
-    spans = (min(one.start_ns for one in full), max(one.end_ns for one in full)) if full else None
+    spans = (min(one.message_start_time for one in full), max(one.message_end_time for one in full)) if full else None
     assert made.times() == spans
-    ends = [0, *(one.offset + one.length for one in plain)]
-    starts = [*(one.offset for one in plain), 30]
+    ends = [0, *(one.chunk_start_offset + one.chunk_length for one in plain)]
+    starts = [*(one.chunk_start_offset for one in plain), 30]
     assert made.are_apart(0, 30) == all(end <= start for end, start in zip(ends, starts, strict=True))
     made.sort_by_offset()
-    ordered = sorted(plain, key=lambda one: one.offset)
+    ordered = sorted(plain, key=lambda one: one.chunk_start_offset)
     assert list(made) == ordered
     for end in (0, 5, 2**64):
-        part, kept = made.before(end), [one for one in ordered if one.offset < end]
-        part.append(plain[0] if plain else ChunkIndexRecord(0, 0, 0, 0, {1: 2}, 0, "new", 0, 0))
+        part, kept = made.before(end), [one for one in ordered if one.chunk_start_offset < end]
+        part.append(plain[0] if plain else chunk_index((0, 0), (0, 0), {1: 2}, 0, ("new", 0, 0)))
         assert list(part)[:-1] == kept
     assert list(made) == ordered  # what is added to a part isn't added here
     for one in ordered:
-        assert made.at(one.offset) == next(other for other in ordered if other.offset == one.offset)
-        assert (made.at(one.offset + 1) is None) == all(other.offset != one.offset + 1 for other in ordered)
+        assert made.at(one.chunk_start_offset) == next(
+            other for other in ordered if other.chunk_start_offset == one.chunk_start_offset
+        )
+        assert (made.at(one.chunk_start_offset + 1) is None) == all(
+            other.chunk_start_offset != one.chunk_start_offset + 1 for other in ordered
+        )
 
 
 @settings(max_examples=60, deadline=None)
@@ -56,9 +64,9 @@ def test_columns_are_equal_if_the_lists_are(one, other, change):
     assert ChunkList(one) == ChunkList(one)
     assert (ChunkList(one) == ChunkList(other)) == (one == other)
     for number, entry in enumerate(one):
-        value = entry[change]
+        name, value = list(vars(entry).items())[change]
         new = {7: 8} if isinstance(value, dict) else "x" if isinstance(value, str) else value ^ 1
-        changed = entry._replace(**{entry._fields[change]: new})
+        changed = replace(entry, **{name: new})
         assert ChunkList([*one[:number], changed, *one[number + 1 :]]) != ChunkList(one)
 
 

@@ -19,6 +19,7 @@ from mcaptrack.fleet import find_logs
 from mcaptrack.location import parse
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call, done
+from tests.logs import some_log
 
 
 def _tracks(frames: int = 150, each: int = 8) -> list[Frame]:
@@ -109,7 +110,9 @@ def test_stages_write_the_same_results_beside_an_object_as_beside_a_file(store, 
     with mcaptrack.open(url) as opened:
         rows = mcaptrack.detections([[9, 20, 17, 28]], t_ns=0, box_format="xyxy")
         assert opened.write("/mine/detections", [rows]) == 1
+        assert opened.write("/mine/speed", np.array([(5, 1.5)], [("t_ns", "i8"), ("speed_m_per_s", "f8")])) == 1
         assert "/mine/detections" in opened.topics
+        assert opened.array("/mine/speed")["speed_m_per_s"].tolist() == [1.5]
     assert store.get("night/b.mcap") == bare.read_bytes()
     assert sorted(store.names()) == ["night/b.mcap", "night/b.results.mcap"]
 
@@ -264,3 +267,48 @@ def test_a_log_in_a_store_is_recovered_to_a_file(store, template):
     done("recover", url)
     with mcaptrack.open("a.recovered.mcap") as opened:
         assert "/camera/tracks" in opened.topics
+
+
+def test_messages_of_an_object_are_those_of_the_file_in_few_requests(store, large):
+    url = store.put("large.mcap", large)
+    with mcaptrack.open(url) as remote, mcaptrack.open(large) as local:
+        assert list(remote.messages(decode=False)) == list(local.messages(decode=False))
+        period = {"start": 10**9, "end": 2 * 10**9, "reverse": True, "decode": False}
+        assert list(remote.messages(**period)) == list(local.messages(**period))
+    with mcaptrack.open(url) as remote, store.counted() as requests:
+        assert len(list(remote.messages("/camera/tracks"))) == 150
+    assert [request.method for request in requests].count("GET") <= 2
+    assert sum(request.bytes for request in requests) < 2**20
+
+
+def test_a_recording_in_a_store_is_never_stale(store, large, tmp_path):
+    content = {name: some_log(tmp_path / f"{name}.mcap", **{name: (TRACKS, [])}) for name in ("/one", "/other")}
+    url = store.put("a.mcap", large)
+    with mcaptrack.open(url) as opened:
+        begun = opened.messages(decode=False)
+        store.put("a.mcap", content["/one"])
+        assert "/one" in opened.topics
+        with pytest.raises(McaptrackError, match=r"a.mcap was replaced by another version while it was being read"):
+            list(begun)
+        begun = opened.messages(decode=False)  # of an object that is small enough to be kept whole
+        wanted = list(opened.messages(decode=False))
+        store.put("a.mcap", content["/other"])
+        assert "/other" in opened.topics
+        assert list(begun) == wanted
+        for change, there in (
+            (lambda: mcaptrack.track(url, tracker="sort", force=True), True), (lambda: store.client.delete_object(
+                Bucket="bucket", Key="a.results.mcap"), False),
+        ):  # fmt: skip
+            change()
+            assert any(c["part"] == "results" for c in mcaptrack.info(url).to_json()["channels"]) == there
+            with mcaptrack.open(url) as fresh:
+                assert opened.table("channels").equals(fresh.table("channels"))
+
+
+def test_a_process_that_was_forked_from_one_that_has_used_a_store_says_so(store, large, monkeypatch):
+    url = store.put("large.mcap", large)
+    with mcaptrack.open(url) as opened:
+        monkeypatch.setattr(os, "getpid", lambda: -1)
+        for work in (lambda: opened.topics, lambda: mcaptrack.open(url)):
+            with pytest.raises(McaptrackError, match=r"can't be reached: this process was forked .* by spawning"):
+                work()

@@ -98,28 +98,31 @@ def _damages(path: Path) -> dict[str, tuple[bytes, set[str]]]:
     with log.read(path) as opened:
         chunk, other = opened.index.chunks[1:3]
         summary = opened.index.data_end + 13
-        at_index = chunk.offset + chunk.length
+        at_index = chunk.chunk_start_offset + chunk.chunk_length
         attachment = opened.index.attachments[0].offset
 
     def put(at: int, data: bytes) -> bytes:
         return whole[:at] + data + whole[at + len(data) :]
 
-    twice = whole[chunk.offset : other.offset]
+    twice = whole[chunk.chunk_start_offset : other.chunk_start_offset]
     return {
         "not an MCAP file": (b"x" + whole[1:], {"magic"}),
-        "cut off in a chunk": (whole[: chunk.offset + 100], {"cut-off", "structure"}),
+        "cut off in a chunk": (whole[: chunk.chunk_start_offset + 100], {"cut-off", "structure"}),
         "cut off in the summary": (whole[: summary + 30], {"cut-off"}),
-        "a chunk's data": (put(chunk.offset + 80, bytes(8)), {"bad-chunk", "data-checksum"}),
-        "a chunk's times": (put(chunk.offset + 9, bytes(8)), {"chunk-times", "data-checksum"}),
-        "a chunk's declared size": (put(chunk.offset + 25, b"\xff" * 8), {"bad-chunk"}),
+        "a chunk's data": (put(chunk.chunk_start_offset + 80, bytes(8)), {"bad-chunk", "data-checksum"}),
+        "a chunk's times": (put(chunk.chunk_start_offset + 9, bytes(8)), {"chunk-times", "data-checksum"}),
+        "a chunk's declared size": (put(chunk.chunk_start_offset + 25, b"\xff" * 8), {"bad-chunk"}),
         "a message index": (put(at_index + 15, b"\xff" * 8), {"wrong-index"}),
         "a message index of another channel": (put(at_index + 9, b"\x09"), {"wrong-index", "chunk-index"}),
         "an attachment": (whole.replace(b"hello", b"hallo"), {"attachment-checksum", "data-checksum"}),
         "an attachment's length": (put(attachment + 1, b"\xff" * 8), {"structure"}),
-        "a record of another kind": (put(chunk.offset, b"\x02"), {"misplaced", "stray-index"}),
+        "a record of another kind": (put(chunk.chunk_start_offset, b"\x02"), {"misplaced", "stray-index"}),
         "the summary": (put(summary + 40, b"\xff"), {"summary-checksum"}),
         "where the summary is": (put(len(whole) - 8 - 20, b"\x00\x01"), {"footer"}),
-        "a chunk twice": (whole[: other.offset] + twice + whole[other.offset :], {"data-checksum", "footer"}),
+        "a chunk twice": (
+            whole[: other.chunk_start_offset] + twice + whole[other.chunk_start_offset :],
+            {"data-checksum", "footer"},
+        ),
     }
 
 
@@ -155,7 +158,10 @@ def test_a_log_that_is_cut_off_keeps_every_chunk_that_is_complete(chunked, tmp_p
     path, saved = tmp_path / "cut.mcap", tmp_path / "saved.mcap"
     whole = chunked.read_bytes()
     with log.read(chunked) as opened:
-        chunks = [(c.offset + c.length, c.start_ns, c.end_ns) for c in opened.index.chunks]
+        chunks = [
+            (c.chunk_start_offset + c.chunk_length, c.message_start_time, c.message_end_time)
+            for c in opened.index.chunks
+        ]
         data_end = opened.index.data_end + 13
     for percent in range(1, 100):
         path.write_bytes(whole[: len(whole) * percent // 100])

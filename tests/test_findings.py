@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mcaptrack
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.planes import AS_BEFORE, make_plane
@@ -44,6 +45,14 @@ def written(path: Path, **tracks: list[Frame]) -> Path:
     """Write a log with only these channels of tracks of a camera, by name."""
     made = {name: Provenance("retrack" if name == "retracks" else "track", {}) for name in tracks}
     return write_channels(path, {f"/camera/{name}": (TRACKS, made[name], frames) for name, frames in tracks.items()})
+
+
+def kept(path: Path) -> list[tuple[str, str]]:
+    """Return topics and codes of the warnings in the tables of a log."""
+    with mcaptrack.open(path) as opened:
+        rows = opened.table("warnings").to_pylist()
+        assert opened.table("recordings")["warnings"].to_pylist() == [len({row["message"] for row in rows})]
+    return [(row["topic"], row["code"]) for row in rows]
 
 
 # The summary
@@ -83,6 +92,7 @@ def test_summary_scores_samples_and_retracks_and_warns_of_a_loss(tmp_path, is_wo
     assert (scores.idf1, scores.switches) == (((1.0, 0.5), (0, 2)) if is_worse else ((0.5, 1.0), (2, 0)))
     words = "re-tracking made it worse: IDF1 100.0% before, 50.0% after, against /camera/truth, within 1 m"
     assert [(notice.message, notice.code) for notice in said] == [(words, "worse")] * is_worse
+    assert kept(path) == [("/camera/retracks", "worse")] * is_worse
 
 
 def test_every_run_repeats_the_warnings_even_with_quiet(path):
@@ -101,6 +111,7 @@ def test_every_run_repeats_the_warnings_even_with_quiet(path):
     assert f"{len(codes)}, see above: {', '.join(codes)}" in lines
     assert "the scale of the ground, from the heights of boxes" in lines
     assert made_by(Path("b.mcap"), "/camera/tracks").warnings == []
+    assert {code for _, code in kept(Path("b.mcap"))} == set(codes)
 
 
 def test_run_warns_of_too_little_memory(path, monkeypatch):
@@ -181,11 +192,12 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     path = ingested(tmp_path / "a.mcap", side_by_side())
     data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
     assert {"held-back", "assumed-ground-plane"} <= {one["code"] for one in data["warnings"]}
+    assert sorted(code for _, code in kept(path)) == sorted(one["code"] for one in data["warnings"])
     with log.read(path) as opened:
         samples, retracks = (opened.rows(f"/camera/{name}", TRACKS).rows for name in ("samples", "retracks"))
     assert_same_rows(retracks, samples)
     insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
-    assert "held-back" not in {one["code"] for one in insisted["warnings"]}
+    assert "held-back" not in {one["code"] for one in insisted["warnings"]} | {code for _, code in kept(path)}
     assert made_by(path, "/camera/retracks").parameters["side_view"] is True
 
 

@@ -159,7 +159,7 @@ def test_chunks_outside_of_the_span_are_not_touched(tmp_path):
     with log.read(path) as opened:
         chunk = opened.index.chunks[-1]
     raw = bytearray(path.read_bytes())
-    raw[chunk.offset + 70 : chunk.offset + 80] = bytes(10)
+    raw[chunk.chunk_start_offset + 70 : chunk.chunk_start_offset + 80] = bytes(10)
     path.write_bytes(raw)
     with log.read(path) as opened:
         assert [m.t_ns for m in opened.messages("a", 10, 20)] == list(range(10, 20))

@@ -10,6 +10,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
@@ -18,7 +19,7 @@ from mcaptrack.log import chunks, messages, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.chunks import checksum_at, message_heads_at, open_chunk, read_index_entries
 from mcaptrack.log.messages import Messages
-from mcaptrack.log.records import Damaged, Opcode, pack, pack_chunk, pack_message_index, record_at
+from mcaptrack.log.records import Damaged, pack, pack_chunk, pack_message_index, record_at
 from tests.logs import stock_messages, write_stock
 
 SOME = [(topic, 10 * n, n, topic.encode() * (n + 1)) for n in range(20) for topic in "ab"]
@@ -161,7 +162,9 @@ def test_a_chunk_that_is_larger_than_its_index_says_is_not_read(tmp_path, monkey
         heads = message_heads_at(content, number, batch.t_ns, offset)
         payloads = [bytes(content[a:b]) for a, b in zip(heads.start.tolist(), heads.end.tolist(), strict=True)]
         assert payloads == [data for topic, *_, data in SOME if topic == "b"]
-        with pytest.raises(Damaged, match=f"byte {batch.chunk.offset}: a chunk is larger than its index says"):
+        with pytest.raises(
+            Damaged, match=f"byte {batch.chunk.chunk_start_offset}: a chunk is larger than its index says"
+        ):
             Messages(source, one.index)._open(batch._replace(is_direct=False))
 
 

@@ -11,8 +11,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 from mcap.opcode import Opcode as StockOpcode
 from mcap.reader import make_reader
+from mcap.records import Channel
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import IndexType, Writer
 
@@ -21,7 +23,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.index import Index, read_index
-from mcaptrack.log.records import Opcode
 from mcaptrack.log.writer import LogWriter
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
@@ -220,7 +221,7 @@ def summary_of_bytes(folder: Path, whole: bytes):
 
 @pytest.mark.parametrize("compression", ["", "zstd", "lz4", "zst4", "another", "ü"])
 def test_chunks_and_their_indexes_are_read_as_they_were_written_or_not_at_all(compression):
-    index = records.ChunkIndexRecord(1, 2**64 - 1, 3, 4, {5: 6, 2**16 - 1: 7}, 8, compression, 9, 10)
+    index = records.chunk_index((1, 2**64 - 1), (3, 4), {5: 6, 2**16 - 1: 7}, 8, (compression, 9, 10))
     whole = memoryview(records.pack_chunk_index(index))
     assert records.read_chunk_index(whole, records.record_at(whole, 0)) == index
     chunk = memoryview(records.pack_chunk((1, 2**64 - 1, 3, 4), compression, b"data"))
@@ -286,7 +287,7 @@ def test_indexes_that_list_another_number_of_messages_than_was_counted_are_notic
 
 def test_a_new_channel_gets_the_next_number_and_then_the_lowest_that_is_free():
     def added(taken: Iterable[int]) -> int:
-        channels = {number: records.ChannelRecord(number, 0, f"/{number}", "json", {}) for number in taken}
+        channels = {number: Channel(number, f"/{number}", "json", {}, 0) for number in taken}
         return LogWriter(io.BytesIO(), index=Index(channels=channels)).add_channel("new", ("", "", b""), "json", {})
 
     last = 2**16 - 1
@@ -311,7 +312,7 @@ def test_a_log_without_a_summary_has_the_times_and_counts_of_its_messages(option
     index = read_index(source)
     assert (index.start_ns, index.end_ns) == (5, 40)
     assert {index.channels[number].topic: count for number, count in index.counts.items()} == {"a": 2, "b": 2, "c": 1}
-    assert [(one.start_ns, one.end_ns) for one in index.chunks] == [
+    assert [(one.message_start_time, one.message_end_time) for one in index.chunks] == [
         (min(times), max(times))
         for times in ([one.log_time for one in some] for some in chunks_of(tmp_path / "a.mcap"))
     ]

@@ -102,11 +102,11 @@ def test_damage_that_is_in_the_way_is_said_where_it_stands_and_nothing_changes(t
     with log.read(path) as opened:
         (chunk,) = opened.index.chunks[-1:]
     whole = bytearray(path.read_bytes())
-    whole[chunk.offset + chunk.length - 1] ^= 1
+    whole[chunk.chunk_start_offset + chunk.chunk_length - 1] ^= 1
     path.write_bytes(whole)
     with pytest.raises(
         McaptrackError,
-        match=rf"is damaged: byte {chunk.offset}: .*; `mcaptrack\.recover\(.*a.mcap'\)` saves what is intact$",
+        match=rf"is damaged: byte {chunk.chunk_start_offset}: .*; `mcaptrack\.recover\(.*a.mcap'\)` saves what is intact$",
     ):
         add_results(path, 2)
     assert path.read_bytes() == bytes(whole)

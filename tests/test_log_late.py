@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,7 +149,9 @@ def test_messages_may_share_a_time(early, tmp_path, monkeypatch, shared):
 
 def test_pictures_outside_of_the_times_that_their_chunk_names_are_refused(early):
     with log.read(early) as opened:
-        opened.index.chunks = ChunkList(chunk._replace(start_ns=0, end_ns=0) for chunk in opened.index.chunks)
+        opened.index.chunks = ChunkList(
+            replace(chunk, message_start_time=0, message_end_time=0) for chunk in opened.index.chunks
+        )
         with pytest.raises(McaptrackError, match="lie outside of the times that their chunk names"):
             list(Pictures(opened, "/camera/video").frames([3]))
 

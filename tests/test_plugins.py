@@ -12,6 +12,7 @@ from importlib import invalidate_caches
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
 
 import mcaptrack
@@ -178,6 +179,15 @@ def test_they_are_used_seen_made_again_and_refused_when_they_are_gone(place):
     assert channel["plugins"]["transform"] == {
         "name": "single", "implementation": "own:Single", "distribution": "own", "version": "1.5"
     }  # fmt: skip
+    with mcaptrack.open("a.mcap") as opened:
+        table = {row["topic"]: row["plugins"] for row in opened.table("channels").to_pylist()}
+    assert json.loads(table["/camera/tracks"]) == channel["plugins"]
+    assert json.loads(table["/camera/predictions"])["predictor"]["version"] == "1.5"
+    assert table["/camera/video"] is None
+    done("export", "a.mcap", "-o", "tables", "-q")
+    (file,) = Path("tables/tracks").glob("*/*.parquet")
+    lineage = json.loads(pq.read_metadata(file).metadata[b"mcaptrack.lineage"])
+    assert lineage["/camera/tracks"]["plugins"] == channel["plugins"]
 
     before = {topic: made(topic).digest for topic in ("/camera/detections", "/camera/tracks", "/camera/predictions")}
     assert "other-version" not in codes("run", "a.mcap", "--no-tables", "--force")

@@ -77,7 +77,7 @@ class Scene:
         """Change a byte of each chunk except the last."""
         data = bytearray(self.path.read_bytes())
         with log.read(self.path) as opened:
-            places = [chunk.offset + 200 for chunk in opened.index.chunks[:-1]]
+            places = [chunk.chunk_start_offset + 200 for chunk in opened.index.chunks[:-1]]
         for place in places:
             data[place] ^= 0xFF
         self.path.write_bytes(data)

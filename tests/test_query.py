@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from mcaptrack import log, tables
-from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema import EVENTS, FORECAST_ERRORS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from mcaptrack.sources.demo import demo_scene
@@ -163,6 +163,7 @@ def known_log(path, tracked=(7, 8)):
     whole = [Frame(ns(0.1 * n), n, rows) for n, rows in enumerate(seen)]
     ahead = [(7, 1, 0.4, 0.3), (7, 2, 0.8, 0.0), (8, 1, 0.0, 10.5), (8, 2, 0.4, 10.8)]
     predicted = Provenance("predict", {}, "/camera/samples")
+    of_whom = FORECAST_ERRORS.rows(track_id=[7, 8], truth_id=[1, 2], later_id=[-1, -1])
     told = [
         Frame(ns(2.4), 6, happened([(4, 1, 7, 9, 0.4), (2, 1, 7, -1, 0.8), (2, 2, 8, -1, 0.4), (2, 1, 9, -1, 1.2)]))
     ]
@@ -175,6 +176,11 @@ def known_log(path, tracked=(7, 8)):
             "/camera/retracks": (TRACKS, Provenance("retrack", {}, "/camera/samples"), samples),
             "/camera/retracks/full": (TRACKS, Provenance("carry", {}, "/camera/retracks"), whole),
             "/camera/predictions": (PREDICTIONS, predicted, [Frame(0, 0, forecasts(ahead))]),
+            "/camera/predictions/errors": (
+                FORECAST_ERRORS,
+                Provenance("events", {}, "/camera/predictions"),
+                [Frame(0, 0, of_whom)],
+            ),
             "/camera/tracks/events": (EVENTS, Provenance("events", {}, "/camera/tracks"), told),
         },
     )
@@ -185,7 +191,7 @@ KNOWN = {
     "next_ns": [[3, 1.0, 2.0]],
     "kind = 2": [[1, 2, 2.0], [2, 1, 0.4]],
     "made.input": [[0.4, 2, 0.15], [0.8, 2, 0.25]],
-    "with about": [[0.4, 2, 0.4], [0.8, 2, 0.45]],
+    "truth_id >= 0": [[0.4, 2, 0.4], [0.8, 2, 0.45]],
     "recursive": [
         ["/camera/retracks", "retrack", "/camera/samples"],
         ["/camera/samples", "sample", "/camera/tracks"],
@@ -232,7 +238,7 @@ def test_a_query_reads_only_the_tables_it_names(known, tmp_path):
     with log.read(known) as opened:
         number = opened.channel("/camera/predictions").id
         (chunk,) = (c for c in opened.index.chunks if number in c.message_index_offsets)
-    content[chunk.offset + 120] ^= 0xFF
+    content[chunk.chunk_start_offset + 120] ^= 0xFF
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(content)
     assert run(damaged, "select count(*) as n from tracks where topic = '/camera/truth'", "--format", "csv").out == (
@@ -260,8 +266,8 @@ def test_exported_tables_are_read_while_they_are_up_to_date(tmp_path):
 
 #: Tables that the log with known answers has no rows for.
 EMPTY = {
-    *("detections", "camera_motions", "counts", "ground_planes", "forecast_errors", "forecast_scores", "sightings"),
-    *("zone_visits", "zone_crossings", "zone_counts", "decisions", "appearances"),
+    *("detections", "camera_motions", "counts", "ground_planes", "forecast_scores", "sightings"),
+    *("zone_visits", "zone_crossings", "zone_counts", "decisions", "appearances", "warnings"),
 }
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mcap.records import Channel, Header, Schema
 
 from mcaptrack import log
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
@@ -59,14 +60,16 @@ def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(dat
         with log.read(path) as opened:
             index, buffer = opened.index, opened.snapshot.source
             (header,) = _fields(said, "Header")
-            assert records.read_header(buffer, records.record_at(buffer, 8)) == (header["profile"], header["library"])
-            assert {number: (f["name"], f["encoding"], _data(f["data"])) for number, f in schemas.items()} == {
-                number: tuple(schema)[1:] for number, schema in index.schemas.items()
+            assert records.read_header(buffer, records.record_at(buffer, 8)) == Header(
+                header["profile"], header["library"]
+            )
+            assert index.schemas == {
+                number: Schema(number, _data(f["data"]), f["encoding"], f["name"]) for number, f in schemas.items()
             }
-            assert {
-                number: (int(f["schema_id"]), f["topic"], f["message_encoding"], f["metadata"])
+            assert index.channels == {
+                number: Channel(number, f["topic"], f["message_encoding"], f["metadata"], int(f["schema_id"]))
                 for number, f in channels.items()
-            } == {number: tuple(channel)[1:] for number, channel in index.channels.items()}
+            }
             for number, channel in channels.items():
                 wanted = [
                     log.Message(int(f["log_time"]), int(f["sequence"]), int(f["publish_time"]), _data(f["data"]))
@@ -87,10 +90,10 @@ def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(dat
                 assert int(f["message_count"]) == sum(index.counts.values())
                 assert (int(f["message_start_time"]), int(f["message_end_time"])) == (index.start_ns, index.end_ns)
                 assert {int(n): int(c) for n, c in f["channel_message_counts"].items() if c != "0"} == index.counts
-            chunks = {chunk.offset: chunk for chunk in index.chunks}
+            chunks = {chunk.chunk_start_offset: chunk for chunk in index.chunks}
             for f in _fields(said, "ChunkIndex"):
                 chunk = chunks[int(f["chunk_start_offset"])]
-                sizes = (chunk.length, chunk.compressed_size, chunk.uncompressed_size)
+                sizes = (chunk.chunk_length, chunk.compressed_size, chunk.uncompressed_size)
                 names = (
                     "chunk_length",
                     "compressed_size",
@@ -98,7 +101,9 @@ def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(dat
                     "message_start_time",
                     "message_end_time",
                 )
-                assert tuple(int(f[name]) for name in names) == (*sizes, chunk.start_ns, chunk.end_ns)
+                assert tuple(int(f[name]) for name in names) == (
+                    *sizes, chunk.message_start_time, chunk.message_end_time,
+                )  # fmt: skip
             (end,) = _fields(said, "DataEnd")
             assert int(end["data_section_crc"]) == index.data_crc
 

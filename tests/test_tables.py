@@ -10,6 +10,7 @@ import io
 import json
 import math
 import os
+import re
 import resource
 import signal
 import sys
@@ -25,14 +26,18 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+import mcaptrack
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import EVENTS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema import EVENTS, SCHEMAS, SIGHTINGS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables import TABLES, Pointers, text
 from mcaptrack.tables import files as tables_files
+from mcaptrack.tables.fields import CODES
 from mcaptrack.tables.messages import messages_table
 from tests.commands import call
+from tests.logs import write_channels
 from tests.strategies import columns
 from tests.tiers import one_in
 from tests.worlds import ns, table_to_frames, tracks_at
@@ -552,3 +557,32 @@ def test_fields_of_bytes_are_left_out_unless_they_are_wanted():
         assert table.column("c_ns").to_pylist() == [None, 5, 7]
         words = table.schema.field("c_ns").metadata
         assert words == {b"unit": b"ns", b"description": b"field c_ns of the message", b"path": b"c_ns"}
+
+
+# Names beside numbers
+
+
+@pytest.mark.parametrize("name", [name for name, code in CODES.items() if code.names])
+def test_codes_are_named_as_the_schema_says(name):
+    schema, code = SCHEMAS[name], CODES[name]
+    text = (ROOT / "schemas" / f"{name.removeprefix('mcaptrack.')}.proto").read_text()
+    (said,) = re.findall(rf" {code.column} = \d+; *// (.*)", text)
+    wanted = {int(number): word for number, word in re.findall(r"\b(\d+) ([a-z]+(?: [a-z]+)?)(?=[,;:]| \(|$)", said)}
+    assert len(wanted) > 1
+    rows = schema.empty(len(wanted) + 1)
+    rows[code.column] = [*wanted, 99]
+    table = tables.rows_in_pieces(schema, {"/a": [Frame(0, 0, rows)]}).table()
+    found = dict(zip(table[code.column].to_pylist(), table[code.beside.name].to_pylist(), strict=True))
+    assert found == wanted | {99: None}
+
+
+def test_cameras_of_sightings_are_named_as_the_channel_says(tmp_path):
+    rows = SIGHTINGS.empty(3)
+    rows["camera"] = [1, 0, 7]
+    channels = {
+        "/a/sightings": (SIGHTINGS, Provenance("fuse", {"cameras": ["east", "west"]}), [Frame(0, 0, rows)]),
+        "/b/sightings": (SIGHTINGS, None, [Frame(0, 0, rows)]),
+    }
+    with mcaptrack.open(write_channels(tmp_path / "a.mcap", channels)) as opened:
+        table = opened.table("sightings")
+    assert table["camera_name"].to_pylist() == ["west", "east", None, None, None, None]

@@ -362,7 +362,8 @@ class TestWriting:
             times = [0, t_ns[0], t_ns[3] - 1, t_ns[3], t_ns[9] + SECOND]
             frames = [mcaptrack.detections([], t_ns=t, box_format="xyxy") for t in times]
             opened.write("/camera/detections", frames)
-            assert [frame.index for frame in opened._log.frames("/camera/detections", DETECTIONS)] == [0, 0, 2, 3, 9]
+            with log.read(path) as raw:
+                assert [frame.index for frame in raw.frames("/camera/detections", DETECTIONS)] == [0, 0, 2, 3, 9]
             opened.write("tracks", table(track_id=[4, 4], x_m=[np.nan, 7.0], y_m=[np.nan, 8.0], frame=[2, np.nan]))
             rows = opened.array("tracks", "/camera/tracks")
         assert (tmp_path / "a.layout.json").exists()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import duckdb
@@ -30,19 +31,21 @@ def answered(text: str, folder: Path) -> str:
 
     def with_answer(found: re.Match[str]) -> str:
         query = found["query"]
-        if not connection.sql(query).fetchone():  # it asks for other logs
+        relation = connection.sql(query)  # once, because a query may make a macro
+        rows = relation.fetchall()
+        if not rows:  # it asks for other logs
             return found[0]
         sure = "from metrics" not in query and not SURE.search(query)
         head = "" if sure else "For example:\n\n"
-        return f"```sql\n{query}```\n\n{head}{answer(connection.sql(query))}"
+        return f"```sql\n{query}```\n\n{head}{answer(relation.columns, rows)}"
 
     return QUERY.sub(with_answer, text)
 
 
-def answer(relation: duckdb.DuckDBPyRelation) -> str:
+def answer(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """What a query answers, as a table in Markdown."""
-    head = f"| {' | '.join(relation.columns)} |\n{'|---' * len(relation.columns)}|\n"
-    return head + "".join(f"| {' | '.join(map(word, row))} |\n" for row in relation.fetchall())
+    head = f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|\n"
+    return head + "".join(f"| {' | '.join(map(word, row))} |\n" for row in rows)
 
 
 def word(value: object) -> str:

@@ -42,6 +42,8 @@ class ChannelInfo:
         Messages per second of the log; None for less than two messages, and for a log without length.
     transform, input, version : str or None
         What made it, from which channel, and with which version of mcaptrack; None if it was recorded by others.
+    written_by : str or None
+        The program that wrote it with ``Recording.write``; None for other channels.
     plugins : dict or None
         Classes of other packages that made it, by the part that each is (transform, predictor): name, implementation,
         distribution and version.
@@ -75,6 +77,7 @@ class ChannelInfo:
     frame: str | None
     stale: bool
     camera: str | None = None
+    written_by: str | None = None
 
 
 @dataclass(frozen=True)
@@ -259,6 +262,7 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: st
         frame=frame_id_of(channel.metadata) or None,
         stale=not replaced and _is_stale(opened, channel.topic, provenance),
         camera=camera,
+        written_by=provenance.written_by or None if provenance else None,
     )
 
 

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from mcaptrack.registry import Kind
 
 PathLike = str | os.PathLike[str]
-#: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
-Progress = Callable[[str, float, float | None], None]
+#: Called with the name of a stage, the amount that is done, and the total.
+Progress = Callable[[str, int, int], None]
 
 #: Headings of options in the help.
 FILES: Final = "Input and output"
@@ -120,5 +120,5 @@ Output = Annotated[PathLike | None, output()]
 MinIou = Annotated[float, min_iou()]
 
 
-def no_progress(stage: str, done: float, total: float | None) -> None:
+def no_progress(stage: str, done: int, total: int) -> None:
     """Ignore the progress."""

@@ -5,33 +5,42 @@ Letters: N rows, H and W pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import datetime
 from threading import RLock
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, Self, TypeVar
+from weakref import WeakSet
 
 import numpy as np
+from mcap.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
 from mcaptrack.api.common import names_of
 from mcaptrack.api.declared import Option, checked
+from mcaptrack.api.messages import DecodedMessage, checked_factories, decoded_messages
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.rows import supervision_of
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, list_names
 from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
-from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame
+from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
-from mcaptrack.sources.own_rows import times_of
+from mcaptrack.sources.foreign import holds_pictures
+from mcaptrack.sources.own_rows import nanoseconds_of, times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from supervision import Detections
 
+T = TypeVar("T")
 Colour = Literal["bgr", "rgb", "grey"]
 _Seconds = Annotated[float | None, Option(least=0, most=1e9)]
 
@@ -109,20 +118,45 @@ class LogReader:
 
     def __init__(self, path: Location) -> None:
         self._place = path if isinstance(path, Url) else path.absolute()  # wherever the working folder moves
-        self._reading = RLock()  # tables are kept once they were made, and several threads may ask for them
+        self._lock, self._process = RLock(), os.getpid()
+        self._opened: WeakSet[Log] = WeakSet()  # also earlier ones, which iterators that were begun still read
         self._open(path)
         show_tables()
 
     def _open(self, path: Location) -> None:
         self._there = logs.read(path)
+        self._opened.add(self._there)
         self._contents = export.LogTables(self._there)
         self._is_open = True
 
-    @property
-    def _log(self) -> logs.Log:
+    @contextmanager
+    def _now(self) -> Iterator[Log]:
+        """Give the log as it is now, to this thread alone: it is opened again if its file, or its results, changed."""
+        with self._alone():
+            self._refuse_closed()
+            if not logs.is_current(self._there, self._place):
+                self._open(self._path_now())
+            yield self._there
+
+    def _alone(self) -> RLock:
+        """Return the lock that a thread holds while it reads: what was read is kept, and read on from there."""
+        if self._process != os.getpid():  # a fork copies the lock as it was, also if another thread held it
+            self._lock, self._process = RLock(), os.getpid()
+        return self._lock
+
+    def _refuse_closed(self) -> None:
         if not self._is_open:
             raise McaptrackError(f"{self.path} is closed; {call('open', self.path)} opens it again")
-        return self._there
+
+    def _path_now(self) -> Location:
+        """Return the path as it was given, unless it leads elsewhere from the present working folder."""
+        path = self._there.path
+        return path if isinstance(path, Url) or path.absolute() == self._place else self._place
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Location]]:
+        """Open the log again where it is unpickled, as in another process."""
+        self._refuse_closed()
+        return type(self), (self._place,)
 
     def __enter__(self) -> Self:
         return self
@@ -134,9 +168,11 @@ class LogReader:
         return f"mcaptrack.open({str(self.path)!r})"
 
     def close(self) -> None:
-        """Close the file."""
-        self._is_open = False
-        self._there.__exit__()
+        """Close the file; iterators that were begun end with an error."""
+        with self._alone():
+            self._is_open = False
+            for opened in self._opened:
+                opened.__exit__()
 
     @property
     def path(self) -> Location:
@@ -156,7 +192,10 @@ class LogReader:
     @property
     def topics(self) -> tuple[str, ...]:
         """The topics of all channels, in alphabetical order."""
-        return tuple(sorted(self._there.channels))
+        if not self._is_open:
+            return tuple(sorted(self._there.channels))
+        with self._now() as opened:
+            return tuple(sorted(opened.channels))
 
     @checked
     def table(self, name: str, topic: str | None = None) -> pa.Table:
@@ -165,7 +204,7 @@ class LogReader:
         Parameters
         ----------
         name : str
-            One of ``tables``; or the topic of any other channel, for a table of its flattened messages.
+            One of ``tables``; or the topic of any channel, for a table of its rows, or of its flattened messages.
         topic : str, optional
             Return the rows of this channel only.
 
@@ -187,8 +226,8 @@ class LogReader:
         ['topic', 'frame', 't', 't_ns']
 
         """
-        with self._reading:
-            channels = self._log.channels
+        with self._now() as opened:
+            channels = opened.channels
             if str(name) in tables.TABLES:
                 whole = self._contents.table(name)
             elif str(name) in channels:
@@ -197,12 +236,12 @@ class LogReader:
                 raise McaptrackError(
                     f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"
                 )
-        if topic is not None:
-            self._log.channel(topic)
-            if "topic" not in whole.schema.names:
-                raise McaptrackError(f"the rows of the table {name} are not by channel; leave `topic=` out")
-            whole = tables.rows_of_topic(whole, topic)
-        return tables.with_recording(whole, self.name)
+            if topic is not None:
+                opened.channel(topic)
+                if "topic" not in whole.schema.names:
+                    raise McaptrackError(f"the rows of the table {name} are not by channel; leave `topic=` out")
+                whole = tables.rows_of_topic(whole, topic)
+            return tables.with_recording(whole, self.name)
 
     def array(self, name: str, topic: str | None = None) -> NDArray[Any]:
         """Return a table as a structured NumPy array.
@@ -210,7 +249,7 @@ class LogReader:
         Parameters
         ----------
         name : str
-            One of ``tables``; or the topic of any other channel.
+            One of ``tables``; or the topic of any channel.
         topic : str, optional
             Return the rows of this channel only.
 
@@ -240,7 +279,7 @@ class LogReader:
     def frames(
         self, topic: str = "video", times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:
-        """Decode the pictures of a channel, in the order of time.
+        """Decode the pictures of a channel, or read its rows, in the order of time.
 
         Parameters
         ----------
@@ -250,17 +289,19 @@ class LogReader:
             Times in whole nanoseconds: decode the picture that is shown at each, the last one that is not later. By
             default all pictures.
         colour : {"bgr", "rgb", "grey"}, default "bgr"
-            Order of the colours.
+            Order of the colours of pictures.
 
         Returns
         -------
         iterator of mcaptrack.schema.Frame
-            ``t_ns``, ``index``, and ``rows``: the picture, (H, W, 3) uint8, or (H, W) for "grey".
+            ``t_ns``, ``index``, and ``rows``: the picture, (H, W, 3) uint8, or (H, W) for "grey"; or the rows of a
+            message, (N,) with a field for each column, as ``Recording.write`` takes them. Missing numbers are NaN.
 
         Raises
         ------
         McaptrackError
-            If there is no such channel of pictures, if a picture is damaged, or for a time before the first picture.
+            If there is no such channel of pictures or rows, if a picture is damaged, or for a time before the first
+            picture.
 
         Examples
         --------
@@ -271,10 +312,18 @@ class LogReader:
         (0, (48, 64))
 
         """
-        channel = find_pictures(self._log, topic)
-        wanted = None if times is None else shown_pictures(self._log, channel, times)
-        frames = self._decoded(channel, wanted, colour)
-        return frames if wanted is None else (frame for frame in frames for _ in range(wanted[frame.index]))
+        with self._now() as opened:
+            if (of_rows := _topic_of_rows(opened, topic)) is not None:
+                if times is not None:
+                    text = f"`times=` chooses pictures, and {of_rows[0]} holds rows; choose rows by their t_ns"
+                    raise McaptrackError(text)
+                return _InTurn(self, iter(opened.frame_columns(*of_rows)))
+            channel = find_pictures(opened, topic)
+            wanted = None if times is None else shown_pictures(opened, channel, times)
+            frames = _decoded(opened, channel, wanted, colour)
+            if wanted is not None:
+                frames = (frame for frame in frames for _ in range(wanted[frame.index]))
+            return _InTurn(self, frames)
 
     @checked
     def show(
@@ -333,15 +382,16 @@ class LogReader:
         (11, 11)
 
         """
-        return show_log(
-            self._log,
-            at_s,
-            topics=names_of(topic),
-            camera=camera,
-            choice=Choice(start_s=start_s, end_s=end_s, every=every, width_px=width),
-            max_mb=max_mb,
-            progress=progress,
-        )
+        with self._now() as opened:
+            return show_log(
+                opened,
+                at_s,
+                topics=names_of(topic),
+                camera=camera,
+                choice=Choice(start_s=start_s, end_s=end_s, every=every, width_px=width),
+                max_mb=max_mb,
+                progress=progress,
+            )
 
     def fetch(self, row: Mapping[str, Any]) -> FetchedMessage:
         """Read one message by its place in the file, without a scan.
@@ -371,9 +421,10 @@ class LogReader:
         '/camera/video'
 
         """
-        return fetch_message(self._log, row)
+        with self._now() as opened:
+            return fetch_message(opened, row)
 
-    def supervision(self, topic: str) -> Iterator[tuple[int, Any]]:
+    def supervision(self, topic: str) -> Iterator[tuple[int, Detections]]:
         """Return detections or tracks as ``supervision.Detections``, frame by frame.
 
         Parameters
@@ -402,20 +453,131 @@ class LogReader:
         4
 
         """
-        schemas = {c.topic: SCHEMAS.get(c.schema_name) for c in self._log.channels.values()}
-        boxes = {name: schema for name, schema in schemas.items() if schema in (DETECTIONS, TRACKS)}
-        end = "/" + topic.strip("/")
-        topics = [name for name in boxes if name == topic] or [name for name in boxes if name.endswith(end)]
-        if len(topics) != 1:
-            raise McaptrackError(
-                f"{self.path} has {len(topics) or 'no'} channels {topic} of boxes; it has {', '.join(sorted(boxes))}"
-            )
-        schema = boxes[topics[0]]
-        names = class_names(self._log.channel(topics[0]).metadata)
-        return supervision_of(self._log.frames(topics[0], schema or TRACKS), names)
+        with self._now() as opened:
+            schemas = {c.topic: SCHEMAS.get(c.schema_name) for c in opened.channels.values()}
+            boxes = {name: schema for name, schema in schemas.items() if schema in (DETECTIONS, TRACKS)}
+            topics = _named(topic, boxes)
+            if len(topics) != 1:
+                has = ", ".join(sorted(boxes))
+                raise McaptrackError(f"{self.path} has {len(topics) or 'no'} channels {topic} of boxes; it has {has}")
+            schema = boxes[topics[0]]
+            names = class_names(opened.channel(topics[0]).metadata)
+            return supervision_of(opened.frames(topics[0], schema or TRACKS), names)
 
-    def _decoded(self, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
-        pixels = decode_gray if colour == "grey" else decode_bgr
-        pictures = Pictures(self._log, topic)
-        for frame in pictures.frames(range(len(pictures.t_ns)) if wanted is None else wanted, pixels):
-            yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame
+    @checked
+    def messages(
+        self,
+        topics: str | Iterable[str] | None = None,
+        start: int | datetime | np.datetime64 | None = None,
+        end: int | datetime | np.datetime64 | None = None,
+        *,
+        decoder_factories: Iterable[DecoderFactory] = (),
+        decode: bool = True,
+        reverse: bool = False,
+    ) -> Iterator[DecodedMessage]:
+        """Return messages in the order of their log times, in the types of the ``mcap`` package.
+
+        They are those of the log and of the results beside it, as of one file: channels of results have ids that count
+        on from those of the log, and stand for channels of the same topic. Chunks outside of the period are not read.
+
+        Parameters
+        ----------
+        topics : str or iterable of str, optional
+            Return messages of these channels only, by topic, or by the end of a topic: "tracks" for /camera/tracks.
+        start, end : int, datetime or numpy.datetime64, optional
+            Return messages from the first time on, and before the second: nanoseconds since 1970, or with a time zone.
+        decoder_factories : iterable of mcap.decoder.DecoderFactory, optional
+            Decode with the first that can: ``mcap_ros2.decoder.DecoderFactory()``. What none can is decoded as without:
+            protobuf and ROS by the definition in the log to messages with fields as attributes, JSON to dictionaries.
+        decode : bool, default True
+            False leaves ``decoded`` None, which is quicker, and passes over payloads that nothing can decode.
+        reverse : bool, default False
+            Return the last message first.
+
+        Returns
+        -------
+        iterator of (mcap.records.Schema or None, mcap.records.Channel, mcap.records.Message, object)
+            The last one is the decoded payload. Messages of equal times are in the order of the file. What a decoder of
+            a factory raises comes as it is.
+
+        Raises
+        ------
+        McaptrackError
+            If there is no such channel, and for a payload that nothing can decode, which is also a
+            ``mcap.exceptions.DecoderNotFoundError`` if it is for want of a decoder.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> with mcaptrack.open("log.mcap") as log:
+        ...     for schema, channel, message, decoded in log.messages("/camera/tracks", end=10**9):
+        ...         channel.topic, schema.name, message.log_time, decoded.rows[0].track_id
+        ...         break
+        ('/camera/tracks', 'mcaptrack.Tracks', 0, 1)
+
+        """
+        factories = checked_factories(decoder_factories)
+        start_ns = None if start is None else nanoseconds_of(start, "`start=`")
+        end_ns = None if end is None else nanoseconds_of(end, "`end=`")
+        if start_ns is not None and end_ns is not None and start_ns > end_ns:
+            raise McaptrackError(f"`end=` is before `start=`: {end_ns} and {start_ns} ns")
+        with self._now() as opened:
+            chosen = opened.channels if topics is None else _topics(opened, topics)
+            return _InTurn(
+                self,
+                decoded_messages(opened, chosen, start_ns, end_ns, factories=factories, decode=decode, reverse=reverse),
+            )
+
+
+class _InTurn(Iterator[T]):
+    """Items that are read from a log bit by bit, each while no other thread reads from it."""
+
+    def __init__(self, reader: LogReader, items: Iterator[T]) -> None:
+        self._reader, self._items = reader, items
+
+    def __next__(self) -> T:
+        with self._reader._alone():
+            self._reader._refuse_closed()
+            return next(self._items)
+
+
+def _named(name: str, topics: Iterable[str]) -> list[str]:
+    """Return the topic of this name, or else all that end with it."""
+    topics = list(topics)
+    return [name] if name in topics else [topic for topic in topics if topic.endswith("/" + name.strip("/"))]
+
+
+def _topics(opened: Log, names: Any) -> set[str]:
+    """Return the topics of these names. Raises McaptrackError if there is none, or several, of a name."""
+    given = [names] if isinstance(names, str) or not isinstance(names, Iterable) else list(names)
+    chosen = set()
+    for name in given:
+        if not isinstance(name, str):
+            raise McaptrackError(f"`topics=` is a topic, or several, not {name!r:.40}")
+        found = _named(name, opened.channels)
+        if len(found) > 1:
+            raise McaptrackError(f"{opened.path} has {len(found)} channels {name}: {list_names(sorted(found))}")
+        chosen.add(opened.channel(found[0] if found else name).topic)
+    return chosen
+
+
+def _topic_of_rows(opened: Log, topic: str) -> tuple[str, Schema] | None:
+    """Return the channel of rows with this topic, or the only one that ends with it, and its schema.
+
+    None if there is none, or if pictures have such a topic.
+    """
+    fitting = [opened.channels[name] for name in _named(topic, opened.channels)]
+    of_rows = [(channel.topic, channel.schema) for channel in fitting if channel.schema is not None]
+    if not of_rows or any(map(holds_pictures, fitting)):
+        return None
+    if len(of_rows) > 1:
+        names = ", ".join(sorted(name for name, _ in of_rows))
+        raise McaptrackError(f"{opened.path} has several channels {topic}: {names}; name one")
+    return of_rows[0]
+
+
+def _decoded(opened: Log, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:
+    pixels = decode_gray if colour == "grey" else decode_bgr
+    pictures = Pictures(opened, topic)
+    for frame in pictures.frames(range(len(pictures.t_ns)) if wanted is None else wanted, pixels):
+        yield frame._replace(rows=frame.rows[..., ::-1]) if colour == "rgb" else frame

@@ -21,7 +21,7 @@ from mcaptrack.api.declared import checked
 from mcaptrack.api.reading import LogReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite
-from mcaptrack.location import Url
+from mcaptrack.schema import Schema
 
 __all__ = ["Recording", "open"]
 
@@ -46,26 +46,35 @@ class Recording(LogReader):
         topic: str,
         rows: Any,
         *,
+        schema: Schema | None = None,
         classes: Mapping[int, str] | None = None,
         frame_id: str = "",
+        by: str | None = None,
         replace: bool = False,
         sidecar: bool | None = None,
     ) -> int:
-        """Write detections or tracks as a channel of the log; ``track``, ``run`` and ``info`` then use it.
+        """Write rows as a channel of the log: detections or tracks for stages, forecasts, events, or rows of your own.
 
         Parameters
         ----------
         topic : str
             The channel, such as "/camera/detections", or its name below the only camera, "detections". Channels named
-            detections hold detections; those named tracks or truth hold tracks.
-        rows : iterable of Frame, structured array, table, or mapping
-            Frames as ``mcaptrack.detections`` makes them; or an array, or a table of pandas, Polars, Arrow or DuckDB,
-            with ``t_ns`` and the columns of rows; or ``supervision.Detections`` by time in nanoseconds, as a mapping or
-            as pairs. A table has no frames without rows. The names in a column ``class`` are kept.
+            detections, tracks (or truth), predictions and events hold rows of these schemas.
+        rows : iterable of Frame, structured array, table, instances of a dataclass, or mapping
+            Frames, as ``mcaptrack.detections`` makes them; or an array, a table of pandas, Polars, Arrow or DuckDB, or
+            instances of a dataclass, with ``t_ns`` and the columns of rows; or ``supervision.Detections`` by time in
+            nanoseconds, as a mapping or as pairs. A table has no frames without rows. The names in a column ``class``
+            are kept.
+        schema : Schema, optional
+            What the rows are: one of ``mcaptrack.schema``, such as PREDICTIONS, or one of your own, which
+            ``mcaptrack.schema_of`` makes. By default the topic or the columns decide; rows with other columns than
+            mcaptrack's get a schema of their own, named after the topic.
         classes : mapping of int to str, optional
             Names of classes by ``class_id``; 1 is a person.
         frame_id : str, optional
-            The frame that positions are in; "map" for detections in metres alone.
+            The frame that positions are in; "map" for detections in metres alone, and for tracks with 3D boxes.
+        by : str, optional
+            Who writes, such as "my_tool 1.2"; by default the program that runs. ``mcaptrack info`` shows it.
         replace : bool, default False
             Replace the channel if it exists and holds the same kind of rows, unless others recorded it.
         sidecar : bool, optional
@@ -92,13 +101,18 @@ class Recording(LogReader):
         """
         from mcaptrack.api.writing import write_rows
 
-        path = self._log.path
-        path = path if isinstance(path, Url) or path.absolute() == self._place else self._place
-        with self._reading:
-            count = write_rows(path, topic, rows, classes=classes, frame_id=frame_id, replace=replace, sidecar=sidecar)
-            self.close()
-            self._open(path)
-        return count
+        with self._now():
+            return write_rows(
+                self._path_now(),
+                topic,
+                rows,
+                schema=schema,
+                classes=classes,
+                frame_id=frame_id,
+                by=by,
+                replace=replace,
+                sidecar=sidecar,
+            )
 
 
 @checked

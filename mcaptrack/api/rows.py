@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +20,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import PERSON, UNKNOWN, class_name, is_person
 from mcaptrack.sources.own_rows import (
+    OURS,
     UNNUMBERED,
     BoxFormat,
     boxes_of,
@@ -32,8 +33,19 @@ from mcaptrack.sources.own_rows import (
     number_of,
     numbered_columns,
     numbers_of,
+    schema_of_columns,
     time_of,
 )
+from mcaptrack.sources.own_schemas import (
+    columns_of_dtype,
+    columns_of_objects,
+    columns_of_type,
+    derived,
+    is_dataclass,
+)
+
+if TYPE_CHECKING:
+    from supervision import Detections
 
 # ``supervision.Detections`` as frames of rows, and back; the package need not be installed to write them.
 #
@@ -126,7 +138,7 @@ def names_of_supervision(detections_: Any) -> dict[int, str]:
     return checked_names({number: name for number, name in out.items() if number != UNKNOWN})
 
 
-def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterator[tuple[int, Any]]:
+def supervision_of(frames: Iterable[Frame], names: Mapping[int, str]) -> Iterator[tuple[int, Detections]]:
     """Yield the time in nanoseconds and the ``supervision.Detections`` of each frame of detections or tracks.
 
     ``names`` are the names of classes by number, for ``data["class_name"]``, if there are others than people. Rows
@@ -252,10 +264,54 @@ def _in_pixels(boxes: Any, box_format: BoxFormat | None) -> Floats | None:
     return boxes_of(boxes, box_format)
 
 
-def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], dict[int, str]]:
+@checked
+def schema_of(
+    name: str, columns: Any, *, units: Mapping[str, str] | None = None, doc: Mapping[str, str] | None = None
+) -> Schema:
+    """Make a schema of your own, for the rows of a channel that ``Recording.write`` writes.
+
+    Parameters
+    ----------
+    name : str
+        Its name, such as "Speed" or "my_tool.Speed". Viewers and ROS tools show it, so one name stands for one set of
+        columns.
+    columns : dataclass, dtype with names, or Arrow schema
+        The columns: numbers and flags. Floating-point numbers may be missing: NaN in rows, None in dataclasses, null in
+        tables. ``t_ns`` and ``frame`` are left out: each message has its time and its frame number itself.
+    units : mapping of str to str, optional
+        Units by column. By default those of the end of a name (speed_m_per_s), of
+        ``Annotated[float, "m/s"]`` or ``field(metadata={"unit": "m/s"})`` in a dataclass, or of the metadata of a field
+        of Arrow.
+    doc : mapping of str to str, optional
+        Descriptions by column; by default those in the metadata of fields, as ``doc`` or ``description``.
+
+    Returns
+    -------
+    mcaptrack.schema.Schema
+        The schema: ``name``, ``columns``, ``dtype`` and ``arrow``.
+
+    Raises
+    ------
+    McaptrackError
+        If rows can't hold a column, or if a name can't be one in protobuf, ROS and SQL.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> speed = mcaptrack.schema_of("Speed", [("track_id", "i8"), ("speed", "f4")], units={"speed": "m/s"})
+    >>> [(column.name, column.kind, column.unit) for column in speed.columns]
+    [('track_id', 'sfixed64', ''), ('speed', 'float', 'm/s')]
+    """
+    is_of_arrow = hasattr(columns, "__arrow_c_schema__")
+    listed = tables.columns_of_arrow(columns) if is_of_arrow else columns_of_type(columns)
+    return derived(name, listed, units, doc)
+
+
+def frames_of(rows: Any, schema: Schema | None, own_name: str) -> tuple[Schema, list[Frame], dict[int, str]]:
     """Return the schema and the frames, by time, of rows in any form that ``Recording.write`` takes; and the names of
     classes that these rows bring along, by number.
 
+    Without a schema, their columns decide; ``own_name`` is the name of one of its own, if mcaptrack has none for them.
     Raises McaptrackError for anything else, and for rows that do not fit a schema.
     """
     names: dict[int, str] = {}
@@ -266,14 +322,20 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], di
                 "an array (N,) with named columns"
             )
         columns, names = numbered_columns({name: rows[name] for name in rows.dtype.names})
-        schema, frames = frames_of_columns(columns, schema)
+        schema, frames = frames_of_columns(columns, schema, own_name)
     elif hasattr(rows, "__arrow_c_stream__") or hasattr(
         rows, "__arrow_c_array__"
     ):  # of pyarrow, pandas, Polars, DuckDB
-        columns, names = numbered_columns(tables.columns_of(rows))
-        schema, frames = frames_of_columns(columns, schema)
+        table = tables.as_arrow(rows)
+        columns, names = numbered_columns(tables.columns_of(table))
+        schema, frames = frames_of_columns(columns, schema, own_name, tables.columns_of_arrow(table.schema))
     else:
-        schema, frames = _of_frames(rows, schema, names)
+        members = _members(rows)
+        if members and is_dataclass(members[0]) and not is_supervision(members[0]):
+            arrays, about = columns_of_objects(members)
+            schema, frames = frames_of_columns(dict(arrays), schema, own_name, about)
+        else:
+            schema, frames = _of_frames(members, schema, own_name, names)
     frames.sort(key=lambda frame: (frame.t_ns, frame.index))
     for before, after in pairwise(frames):
         if before[:2] == after[:2]:
@@ -285,30 +347,43 @@ def frames_of(rows: Any, schema: Schema | None) -> tuple[Schema, list[Frame], di
     return schema, frames, names
 
 
-def _of_frames(rows: Any, schema: Schema | None, names: dict[int, str]) -> tuple[Schema, list[Frame]]:
-    """The schema and the frames of an iterable; adds the names of classes that its members give to ``names``."""
+def _members(rows: Any) -> list[Any]:
+    """The members of an iterable: frames, instances of a dataclass, or supervision.Detections by time."""
     if is_supervision(rows):
         raise McaptrackError(
             "supervision.Detections have no time; give them by time in nanoseconds: {t_ns: detections}"
         )
+    if isinstance(rows, Frame) or is_dataclass(rows):
+        return [rows]
     if not isinstance(rows, Iterable) or isinstance(rows, str | bytes):
-        raise McaptrackError(f"rows are frames, an array, a table or supervision.Detections, not {kind_of(rows)}")
-    members = [rows] if isinstance(rows, Frame) else rows.items() if hasattr(rows, "items") else rows
+        raise McaptrackError(
+            "rows are frames, an array, a table, instances of a dataclass or supervision.Detections, not "
+            f"{kind_of(rows)}"
+        )
+    return list(rows.items() if hasattr(rows, "items") else rows)
+
+
+def _of_frames(
+    members: Sequence[Any], schema: Schema | None, own_name: str, names: dict[int, str]
+) -> tuple[Schema, list[Frame]]:
+    """The schema and the frames of their members; adds the names of classes that they give to ``names``."""
     frames = [_frame(item, schema, names) for item in members]
-    schema = schema or _schema_of(frames)
+    schema = schema or _schema_of(frames, own_name)
     return schema, [_checked(schema, frame) for frame in frames]
 
 
-def _schema_of(frames: Sequence[Frame]) -> Schema:
+def _schema_of(frames: Sequence[Frame], own_name: str) -> Schema:
     """The schema that all frames fit; any fits one without rows beside others with some."""
-    layouts = {frame.rows.dtype.names for frame in [frame for frame in frames if frame.rows.size] or frames}
-    for schema in (DETECTIONS, TRACKS):
-        if layouts and all(map(schema.has_columns, layouts)):
+    layouts = {frame.rows.dtype for frame in [frame for frame in frames if frame.rows.size] or frames}
+    for schema in OURS:
+        if layouts and all(schema.has_columns(layout.names) for layout in layouts):
             return schema
-    raise McaptrackError(
-        "it is not clear whether these are detections or tracks; all frames have to be of one kind, and without frames "
-        "the topic has to end in detections or tracks"
-    )
+    if len(layouts) != 1 or not next(iter(layouts)).names:
+        raise McaptrackError(
+            "it is not clear whether these are detections or tracks; all frames have to be of one kind, and without "
+            "frames the topic has to end in detections or tracks, or `schema=` says what they are"
+        )
+    return schema_of_columns(own_name, columns_of_dtype(layouts.pop()))
 
 
 def _checked(schema: Schema, frame: Frame) -> Frame:

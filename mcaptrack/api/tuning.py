@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
@@ -27,7 +27,6 @@ from mcaptrack.api.options import (
     PointOfBox,
     Reports,
     Topic,
-    Value,
     chooser,
     gate_m,
     no_progress,
@@ -84,7 +83,7 @@ class TuneResult:
     stage: TunedStage
     metric: Metric
     similarity: Similarity
-    settings: Mapping[str, Value | Transform]
+    settings: Mapping[str, Any]  # any other type would not be taken as ``**settings``
     scores: Mapping[str, float]
     default_scores: Mapping[str, float]
     trials: int

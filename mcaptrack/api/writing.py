@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import warnings_about
+from mcaptrack.api.common import detail, warnings_about
 from mcaptrack.api.options import no_progress
 from mcaptrack.api.products import write_products
 from mcaptrack.api.rows import frames_of
@@ -17,23 +19,34 @@ from mcaptrack.api.running import warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.location import Location
-from mcaptrack.pipeline.views import make_views
+from mcaptrack.pipeline.views import WITH_VIEWS, make_views
 from mcaptrack.pipeline.write import Made, RunState, write
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.provenance import INGEST, Provenance
-from mcaptrack.sources.cameras import USUAL
+from mcaptrack.registry import distribution_of, entry_points, package_of
+from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
+from mcaptrack.schema.classes import has_classes
+from mcaptrack.schema.own import columns_in_metadata, name_for
+from mcaptrack.schema.proto import Column
+from mcaptrack.schema.provenance import INGEST, WRITTEN_BY, Provenance
+from mcaptrack.sources.cameras import USUAL, name_above
 from mcaptrack.sources.own_rows import UNNUMBERED, checked_names
 from mcaptrack.sources.sidecar import SidecarChoice
 
-#: What channels usually hold, by the end of their topic.
-_HOLDS: Final[Mapping[str, Schema]] = {"detections": DETECTIONS, "tracks": TRACKS, "truth": TRACKS}
+#: What channels hold, by the end of their topic.
+_HOLDS: Final[Mapping[str, Schema]] = {
+    "detections": DETECTIONS,
+    "tracks": TRACKS,
+    "truth": TRACKS,
+    "predictions": PREDICTIONS,
+    "events": EVENTS,
+}
 #: The ends of names of channels that stand beside others.
 _BESIDE: Final = ("events", "counts", "errors", "scores", "view")
 _SUCH: Final = "/own/detections or /own/tracks"
 #: The frame of detections in metres, unless it is given.
 _FRAME: Final = "map"
-#: The longest topic in bytes.
+#: The longest topic in bytes, and the longest name of a program.
 _LONGEST: Final = 1024
+_LONGEST_NAME: Final = 200
 
 
 def write_rows(
@@ -41,29 +54,35 @@ def write_rows(
     topic: str,
     rows: Any,
     *,
+    schema: Schema | None,
     classes: Mapping[int, str] | None,
     frame_id: str,
+    by: str | None,
     replace: bool,
     sidecar: bool | None,
 ) -> int:
     """Write rows as a channel of the log; returns the number of frames. See ``Recording.write``."""
-    place, names_by_number = SidecarChoice(sidecar), checked_names(classes)
+    place, names_by_number, program = SidecarChoice(sidecar), checked_names(classes), _program(by)
     with warnings_about(path), logs.read(path, sidecar=place) as opened:
         opened.lock()
         name = _topic(opened, topic)
-        prefix, _, last = name.rpartition("/")
-        schema, frames, names_in_rows = frames_of(rows, _HOLDS.get(last))
+        prefix = name_above(name)
+        schema, frames, names_in_rows = frames_of(rows, _schema_of(name, schema), name_for(name))
         names = {str(number): class_name for number, class_name in sorted((names_in_rows | names_by_number).items())}
+        if names_by_number and not has_classes(schema):
+            raise McaptrackError(f"`classes=` names classes of rows, and {schema.name} has no column class_id")
         _refuse_to_replace(opened, name, schema, replace)
+        detail(f"{name}: rows of {schema.name}, with {', '.join(map(_described, schema.columns))}")
         planes = pipeline.read_planes(opened, prefix) or ()
         frames = _numbered(
             opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
         )
-        own_frame = frame_id or (_FRAME if schema is DETECTIONS and _in_space(frames) else "")
-        how = Provenance(INGEST, {"written_with": "mcaptrack.open"}, classes=names, frame_id=own_frame)
+        own_frame = frame_id or (_FRAME if _is_in_space(schema, frames) else "")
+        columns = columns_in_metadata(schema)
+        how = Provenance(INGEST, {WRITTEN_BY: program}, classes=names, frame_id=own_frame, columns=columns)
         channel = Made.of(schema, frames, how)
         state = RunState(opened, prefix, {name: channel})
-        write(state, None, make_views(state, planes))
+        write(state, None, make_views(state, planes) if schema in WITH_VIEWS else None)
         stale = pipeline.outdated_by(opened, {name: channel.provenance.digest})
         for topic_of_stage in stale:
             warn_stale(topic_of_stage, path, {topic_of_stage: pipeline.camera_to_name(opened, topic_of_stage)})
@@ -71,10 +90,61 @@ def write_rows(
     return len(frames)
 
 
-def _in_space(frames: Sequence[Frame]) -> bool:
-    """Return whether rows are positions in metres alone."""
+def _is_in_space(schema: Schema, frames: Sequence[Frame]) -> bool:
+    """Return whether rows are detections in metres alone, or tracks with 3D boxes: no ground plane is their frame."""
     parts = [frame.rows for frame in frames if len(frame.rows)]
-    return bool(parts) and all(np.isnan(rows["x_px"]).all() for rows in parts)
+    if schema is TRACKS:
+        return any(np.isfinite(rows["z_m"]).any() for rows in parts)
+    return schema is DETECTIONS and bool(parts) and all(np.isnan(rows["x_px"]).all() for rows in parts)
+
+
+def _described(column: Column) -> str:
+    """Return a column with its unit, as text."""
+    return f"{column.name} ({column.unit})" if column.unit else column.name
+
+
+def _program(by: str | None) -> str:
+    """Return the name of the program that writes: as it is given, or that of the running one, without its place."""
+    if by is None:
+        return _running_program()
+    if not isinstance(by, str) or not by.strip() or not by.isprintable() or len(by) > _LONGEST_NAME:
+        raise McaptrackError(
+            f"`by=` is the name of a program, such as 'my_tool 1.2', of at most {_LONGEST_NAME} characters, not "
+            f"{by!r:.60}"
+        )
+    return by
+
+
+def _running_program() -> str:
+    """Return the name of the running program, with the version of its package."""
+    main = sys.modules.get("__main__")
+    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+    if spec is not None:
+        module = spec.name.removesuffix(".__main__")
+        return " ".join(filter(None, distribution_of(module))) or module
+    if not file:
+        return "a notebook" if "ipykernel" in sys.modules else "Python"
+    script = Path(file)
+    points = entry_points("console_scripts") if not script.suffix else []
+    package = next((package_of(point) for point in points if point.name == script.name), ())
+    plain = "".join(character if character.isprintable() else "?" for character in script.name)[:_LONGEST_NAME]
+    return " ".join(filter(None, package)) or plain
+
+
+def _schema_of(name: str, schema: Schema | None) -> Schema | None:
+    """Return the schema that a channel is written with; None if its rows decide."""
+    last = name.rpartition("/")[2]
+    usual = _HOLDS.get(last)
+    if schema is None:
+        return usual
+    if not isinstance(schema, Schema) or not (schema.is_own or SCHEMAS.get(schema.name) is schema):
+        raise McaptrackError(
+            "`schema=` is a schema of mcaptrack.schema, such as PREDICTIONS, or one that `mcaptrack.schema_of` makes, "
+            f"not {schema!r:.60}"
+        )
+    if usual not in (None, schema):
+        raise McaptrackError(f"a channel named {last} holds {usual.name}; write {schema.name} to another one")
+    return schema
 
 
 def _topic(opened: logs.Log, topic: str) -> str:
@@ -86,14 +156,29 @@ def _topic(opened: logs.Log, topic: str) -> str:
         raise McaptrackError(f"{topic!r:.80} is no topic; give one such as detections or /camera/detections")
     if len(name.encode()) > _LONGEST:
         raise McaptrackError(f"{topic:.80}... is longer than {_LONGEST} bytes; give the channel a shorter topic")
-    taken = [*(usual for usual in USUAL if usual not in _HOLDS), *_BESIDE]
-    if "/view/" in name or name.endswith(tuple(f"/{end}" for end in taken)):
+    if _is_reserved(opened, name):
         raise McaptrackError(f"{name} is a name of what stages make or of pictures; write to another, such as {_SUCH}")
     return name
 
 
+def _is_reserved(opened: logs.Log, name: str) -> bool:
+    """Return whether a topic is that of pictures, of results of stages, or of what stands beside a channel."""
+    above, _, last = name.rpartition("/")
+    is_above_usual = above in opened.channels or above.endswith(tuple(f"/{end}" for end in USUAL))
+    is_beside = last == "view" or "/view/" in name or (last in _BESIDE and is_above_usual)
+    return is_beside or name.endswith(tuple(f"/{end}" for end in USUAL if end not in _HOLDS))
+
+
 def _refuse_to_replace(opened: logs.Log, name: str, schema: Schema, replace: bool) -> None:
     """Raise McaptrackError if there is a channel of this name that has to stay."""
+    alike = (c for c in opened.channels.values() if c.topic != name and schema.is_own and c.schema_name == schema.name)
+    columns = columns_in_metadata(schema)
+    other = next((c.topic for c in alike if c.schema is None or columns_in_metadata(c.schema) != columns), None)
+    if other is not None:
+        raise McaptrackError(
+            f"{opened.path}: {other} has other columns of {schema.name}; give this schema another name, as in "
+            "`schema=mcaptrack.schema_of(name, columns)`"
+        )
     channel = opened.channels.get(name)
     if channel is None:
         return

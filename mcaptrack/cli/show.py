@@ -184,7 +184,8 @@ def _label(channel: dict[str, Any]) -> Text:
     """Return a channel in a line: what made it, with what, in which frame of reference."""
     from rich.text import Text
 
-    facts = [channel["transform"] or ""]
+    by = channel.get("written_by")
+    facts = [f"written by {by}" if by else channel["transform"] or ""]
     for plugin in (channel["plugins"] or {}).values():
         package = f"{plugin['distribution']} {plugin['version']}".strip()
         facts.append(f"{plugin['name']} ({package})" if package else plugin["name"])

@@ -223,12 +223,21 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
         mode = None
         if provenance and provenance.transform in STAGES and STAGES[provenance.transform].repairs_tracks:
             mode = "online" if topic.endswith("/online") else "offline"
-        name = forecasts_of.get(topic, "")
+        name = forecasts_of.get(topic) or _own_forecasts(opened, topic)
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
         names = class_names(opened.channel(topic).metadata)
         candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name, classes=names))
     names = class_names(opened.channel(camera_at(opened, prefix).truth).metadata)
     return EvaluationInput(opened.path.stem, ground_truth, candidates, names)
+
+
+def _own_forecasts(opened: log.Log, topic: str) -> str:
+    """The forecasts that a user has written beside tracks, without samples that they could be of; "" if none."""
+    above = topic.rpartition("/")[0]
+    samples, forecasts = f"{above}/{FORECAST_INPUTS['predictions']}", f"{above}/predictions"
+    channel = opened.channels.get(forecasts)
+    how = Provenance.from_metadata(channel.metadata) if channel else None
+    return forecasts if how is not None and how.written_by and samples not in opened.channels else ""
 
 
 def evaluate(

@@ -265,7 +265,7 @@ def run(
     on_outcome: Callable[[LogOutcome[T]], None] | None = None,
     on_status: Watch | None = None,
     on_note: Callable[[str], None] | None = None,
-    progress: Callable[[str, float, float | None], None] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
 ) -> FleetResult[T]:
     """Run a function on many logs, each in a worker process that stays warm for the next one.
 

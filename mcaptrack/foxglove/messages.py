@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, Final
 
+from mcap.well_known import SchemaEncoding
+
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 
@@ -42,7 +44,7 @@ def schema_record(schema_name: str) -> tuple[str, str, bytes]:
         descriptor.CopyToProto(files.file.add())
 
     add(message_class(schema_name).DESCRIPTOR.file)
-    return schema_name, "protobuf", files.SerializeToString(deterministic=True)
+    return schema_name, SchemaEncoding.Protobuf, files.SerializeToString(deterministic=True)
 
 
 def pack_picture(schema_name: str, t_ns: int, frame_id: str, image_format: str, data: bytes) -> bytes:

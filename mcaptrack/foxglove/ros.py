@@ -15,12 +15,13 @@ from itertools import chain, islice
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from mcap.well_known import SchemaEncoding
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.messages import message_class, schema_record
 from mcaptrack.geometry.arrays import Bools, Bytes, Ints
 from mcaptrack.geometry.ragged import ragged_range
-from mcaptrack.schema.encodings import CDR, ROS2MSG, Encoding
+from mcaptrack.schema.encodings import CDR, Encoding
 
 #: Types of ROS for messages of protobuf, and their definitions.
 _STANDARD: Final = {
@@ -403,7 +404,7 @@ def record_in(schema_name: str, encoding: Encoding) -> tuple[str, str, bytes]:
             if member.full_name not in done:
                 done.add(member.full_name)
                 waiting.append(member)
-    return _ros_type(descriptor).replace("/", "/msg/"), ROS2MSG, ("\n".join(sections) + "\n").encode()
+    return _ros_type(descriptor).replace("/", "/msg/"), SchemaEncoding.ROS2, ("\n".join(sections) + "\n").encode()
 
 
 def messages_in(

@@ -10,6 +10,8 @@ recover(path, output)                   write what is intact to a new log
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
+from mcap.opcode import Opcode
+
 from mcaptrack import objects
 from mcaptrack.files import temporary_folder
 from mcaptrack.location import Location, Url
@@ -21,7 +23,7 @@ from mcaptrack.log.extend import extend, refuse_to_replace_recorded
 from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Channel, Log
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, refuse_non_mcap, results_path, split_files_in
-from mcaptrack.log.records import MAGIC, Bytes, Opcode, Record, walk
+from mcaptrack.log.records import MAGIC, Bytes, Record, walk
 from mcaptrack.log.recover import recover
 from mcaptrack.log.writer import LIBRARY, LogWriter, create
 from mcaptrack.objects import AbsentError
@@ -68,6 +70,23 @@ def read(path: Location, *, sidecar: bool | Callable[[Log], bool] | None = None)
         log.__exit__()
         raise
     return log
+
+
+def is_current(opened: Log, place: Location) -> bool:
+    """Whether ``read`` would give the same log at this place: neither it nor its results were changed since.
+
+    Raises McaptrackError if a store can't tell.
+    """
+    has_results = not place.name.endswith(RESULTS_SUFFIX)
+    parts = [(place, opened), *([(results_path(place), opened.results)] if has_results else [])]
+    return all(_is_at(where, part) for where, part in parts)
+
+
+def _is_at(place: Location, part: Log | None) -> bool:
+    """Whether a place still holds a part of a log as it was opened; None is nothing there."""
+    if isinstance(place, Url):
+        return objects.find(place) == (part.version if part else None)
+    return part.snapshot.is_at(place) if part else not place.exists()
 
 
 def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:
@@ -135,7 +154,8 @@ def header(log: Log) -> tuple[str, str]:
     """The profile and the library in the header of a log."""
     with log.snapshot.reporting_damage():
         whole = log.snapshot.record(len(MAGIC))
-        return records.read_header(whole, records.record_at(whole, 0))
+        about = records.read_header(whole, records.record_at(whole, 0))
+        return about.profile, about.library
 
 
 def copy_attachments_and_metadata(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:

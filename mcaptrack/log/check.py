@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
@@ -41,7 +42,7 @@ from mcaptrack.log.index import (
     starts_with_magic,
 )
 from mcaptrack.log.journal import changed, find_journal, journal_of, load_old_content
-from mcaptrack.log.records import MAGIC, Bytes, ChunkIndexRecord, Damaged, Opcode, Reader, Record, walk
+from mcaptrack.log.records import MAGIC, Bytes, Damaged, Reader, Record, walk
 
 if TYPE_CHECKING:
     from mcaptrack.log.reader import Log
@@ -224,11 +225,11 @@ def _long(seconds: float) -> str:
 def _spans(part: Log) -> Iterator[Span]:
     index = part.index
     for chunk in index.chunks:
-        span, entries = (chunk.start_ns, chunk.end_ns), dict[int, Entries]()
+        span, entries = (chunk.message_start_time, chunk.message_end_time), dict[int, Entries]()
         if span[1] - span[0] > _JUMP_NS:
             for channel, at in chunk.message_index_offsets.items():
                 listed = read_index_entries(part.snapshot.source, at, channel) if at else None
-                entries[channel] = index.entries[chunk.offset][channel] if listed is None else listed
+                entries[channel] = index.entries[chunk.chunk_start_offset][channel] if listed is None else listed
             entries = {channel: listed for channel, listed in entries.items() if len(listed)}
         if chunk.message_index_offsets:
             yield from spans_of(span, entries)
@@ -377,8 +378,8 @@ class _Checker:
             self._find("chunk-times", record.start, text)
         last = max((records.record_at(buffer, at).end for at in indexes.values()), default=record.end)
         sizes = (head.compression, head.end - head.start, head.uncompressed_size)
-        place = (record.start, record.end - record.start, dict(indexes), last - record.end)
-        self.found.chunks.append(ChunkIndexRecord(head.start_ns, head.end_ns, *place, *sizes))
+        span, place = (head.start_ns, head.end_ns), (record.start, record.end - record.start)
+        self.found.chunks.append(records.chunk_index(span, place, dict(indexes), last - record.end, sizes))
 
     def _add_spans(self, entries: Mapping[int, Entries], where: int) -> None:
         """Keep the spans of time of messages: those of one record, by channel."""

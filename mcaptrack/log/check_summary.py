@@ -8,9 +8,10 @@ from collections.abc import Iterator, Mapping
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
 
 from mcaptrack.log.index import DATA_END_SIZE, FOOTER_SIZE, Index, add_summary_record, read_footer
-from mcaptrack.log.records import FOOTER_BODY, MAGIC, Bytes, Damaged, Opcode, Reader, walk
+from mcaptrack.log.records import FOOTER_BODY, MAGIC, Bytes, Damaged, Reader, walk
 
 Level = Literal["error", "warning"]
 
@@ -163,18 +164,19 @@ class _Checker:
             return
         missing = np.ones(len(ours), bool)
         for chunk in summary.chunks:
-            row = ours.row_at(chunk.offset)
+            row = ours.row_at(chunk.chunk_start_offset)
             if row is None or not missing[row]:
                 self._find(
                     "chunk-index",
                     where,
-                    f"the summary lists a chunk at byte {chunk.offset}, where there is no intact one",
+                    f"the summary lists a chunk at byte {chunk.chunk_start_offset}, where there is no intact one",
                 )
                 continue
             missing[row] = False
-            names = [name for name, listed, two in zip(chunk._fields, chunk, ours[row], strict=True) if listed != two]
+            present, stated = vars(ours[row]), vars(chunk)
+            names = [name for name, value in stated.items() if value != present[name]]
             if names:
-                text = f"the chunk index differs from the chunk at byte {chunk.offset}: {', '.join(names)}"
+                text = f"the chunk index differs from the chunk at byte {chunk.chunk_start_offset}: {', '.join(names)}"
                 self._find("chunk-index", where, text)
         if missing.any():
             text = "a chunk that the summary does not list"

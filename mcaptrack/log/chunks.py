@@ -8,6 +8,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
 from mcaptrack import environment
@@ -15,7 +17,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource
 from mcaptrack.log.checksums import crc_of
-from mcaptrack.log.records import Bytes, ChunkHead, ChunkIndexRecord, Damaged, Opcode, Record, walk
+from mcaptrack.log.records import Bytes, ChunkHead, Damaged, Record, walk
 
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]
@@ -45,7 +47,7 @@ HEAD: Final = np.dtype(
 
 
 class MessageHeads(NamedTuple):
-    """M messages of one channel: their record heads (M,) of ``HEAD``, and where payloads start and end."""
+    """M messages: their record heads (M,) of ``HEAD``, and where payloads start and end."""
 
     head: NDArray[np.void]
     start: Ints
@@ -62,9 +64,9 @@ def message_head(buffer: Bytes, record: Record) -> tuple[int, int, int, int]:
     return head
 
 
-def chunk_record(buffer: Bytes, chunk: ChunkIndexRecord) -> Record:
+def chunk_record(buffer: Bytes, chunk: ChunkIndex) -> Record:
     """The record of an indexed chunk."""
-    return _chunk_at(buffer, chunk.offset)
+    return _chunk_at(buffer, chunk.chunk_start_offset)
 
 
 def _chunk_at(buffer: Bytes, offset: int) -> Record:
@@ -189,8 +191,11 @@ def scan_entries(content: Bytes) -> dict[int, Entries]:
     return {channel: np.array(entries, "<u8") for channel, entries in entries_of.items()}
 
 
-def message_heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints) -> MessageHeads:
-    """The heads of indexed messages. Raises Damaged if there is no such message at one of the offsets."""
+def message_heads_at(content: Bytes, channel_id: int | NDArray[np.uint16], t_ns: Times, offset: Ints) -> MessageHeads:
+    """The heads of indexed messages: of one channel, or each of its own, (M,).
+
+    Raises Damaged if there is no such message at one of the offsets.
+    """
     room = len(content) - HEAD.itemsize
     outside = offset[(offset < 0) | (offset > room)]
     if len(outside):
@@ -208,6 +213,7 @@ def message_heads_at(content: Bytes, channel_id: int, t_ns: Times, offset: Ints)
     # A size beyond the chunk is rejected here, before it is used in a sum that could overflow.
     wrong |= head["size"] > (len(content) - start + records.MESSAGE_HEAD.size).astype(np.uint64)
     if wrong.any():
-        time = int(t_ns[wrong.argmax()])
-        raise Damaged(f"there is no message of channel {channel_id} at {time} ns where the index says")
+        first = int(wrong.argmax())
+        channel = int(np.broadcast_to(channel_id, len(t_ns))[first])
+        raise Damaged(f"there is no message of channel {channel} at {int(t_ns[first])} ns where the index says")
     return MessageHeads(head, start, start + head["size"].astype(np.int64) - records.MESSAGE_HEAD.size)

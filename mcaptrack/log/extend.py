@@ -17,6 +17,10 @@ from itertools import islice
 from pathlib import Path
 from typing import IO
 
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import ChunkIndex
+
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import can_replace, publish_stream
 from mcaptrack.location import Url, is_remote
@@ -27,7 +31,7 @@ from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.in_place import rewrite_tail
 from mcaptrack.log.index import Index
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import BLOCK, MAGIC, Bytes, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, Record, walk
+from mcaptrack.log.records import BLOCK, MAGIC, Bytes, Damaged, Record, walk
 from mcaptrack.log.remote import publish_object, refuse_replaced
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance
@@ -167,7 +171,8 @@ class _Rewrite:
             change.open_all = True
             return change
         places = [index.data_end]
-        places += [chunk.offset for chunk in islice(index.chunks.with_channels(dropped), 1)]  # the first in the file
+        first = islice(index.chunks.with_channels(dropped), 1)  # in the file
+        places += [chunk.chunk_start_offset for chunk in first]
         places += [listed.offset for listed in index.metadata if listed.name in metadata]
         places += [listed.offset for listed in index.attachments if listed.name in attachments]
         undescribed = dropped - change._described_by_first_chunk()
@@ -221,7 +226,7 @@ class _Rewrite:
             return Index(schemas=schemas, channels=channels)
         counts = dict(index.counts)
         for chunk in index.chunks:
-            if chunk.offset >= self.cut:
+            if chunk.chunk_start_offset >= self.cut:
                 for offset in chunk.message_index_offsets.values():
                     channel, count = records.read_message_index(self.source, records.record_at(self.source, offset))
                     counts[channel] = counts.get(channel, 0) - count
@@ -273,7 +278,7 @@ class _Rewrite:
         if record.opcode == Opcode.ATTACHMENT:
             return records.read_attachment(buffer, record).name not in self.attachments
         if record.opcode == Opcode.METADATA:
-            return records.read_metadata(buffer, record)[0] not in self.metadata
+            return records.read_metadata(buffer, record).name not in self.metadata
         return True
 
     def _copy_kept_chunk(
@@ -282,7 +287,7 @@ class _Rewrite:
         buffer: Bytes,
         base: int,
         record: Record,
-        listed: ChunkIndexRecord,
+        listed: ChunkIndex,
         lost: _Descriptions,
     ) -> None:
         holds = set(listed.message_index_offsets)
@@ -311,11 +316,11 @@ class _Rewrite:
                 channel, entries = records.read_message_entries(buffer, index)
                 indexes[channel] = bytes(entries)
         else:
-            entries_of = self.index.entries[listed.offset]
+            entries_of = self.index.entries[listed.chunk_start_offset]
             indexes = {channel: entries.tobytes() for channel, entries in entries_of.items()}
             low = min((int(entries[:, 0].min()) for entries in entries_of.values()), default=0)
             high = max((int(entries[:, 0].max()) for entries in entries_of.values()), default=0)
-            listed = listed._replace(start_ns=low, end_ns=high)
+            listed = replace(listed, message_start_time=low, message_end_time=high)
         writer.copy_chunk(bytes(buffer[record.start : record.end]), listed, indexes)
 
     def _kept_records(self, content: Bytes) -> Iterator[tuple[int, int, memoryview]]:

@@ -9,9 +9,14 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
+from operator import attrgetter
 from typing import Final, NamedTuple, overload
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import ChunkIndex
+from mcap.records import Schema as SchemaRecord
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
@@ -19,18 +24,7 @@ from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, RunningChecksum
 from mcaptrack.log.chunks import Entries, message_head, open_chunk, scan_entries
-from mcaptrack.log.records import (
-    MAGIC,
-    Bytes,
-    ChannelRecord,
-    ChunkIndexRecord,
-    Damaged,
-    Opcode,
-    Reader,
-    Record,
-    SchemaRecord,
-    walk,
-)
+from mcaptrack.log.records import MAGIC, Bytes, Damaged, Reader, Record, walk
 
 FOOTER_SIZE: Final = 9 + records.FOOTER_BODY.size + len(MAGIC)
 DATA_END_SIZE: Final = 9 + 4
@@ -51,14 +45,15 @@ class SummaryEntry(NamedTuple):
 
 #: The numbers of an entry in the order of their columns, and how many there are.
 _NUMBERS: Final = (
-    "start_ns",
-    "end_ns",
-    "offset",
-    "length",
+    "message_start_time",
+    "message_end_time",
+    "chunk_start_offset",
+    "chunk_length",
     "message_index_length",
     "compressed_size",
     "uncompressed_size",
 )
+_numbers_of: Final = attrgetter(*_NUMBERS)
 _WIDTH: Final = len(_NUMBERS)
 _START, _END, _OFFSET, _LENGTH, _INDEX_LENGTH = range(5)
 #: Entries of chunks with so many channels are kept, and how many of them.
@@ -72,7 +67,7 @@ class ChunkList:
     ``at``, ``row_at`` and ``before`` need them in the order of the file, which ``sort_by_offset`` establishes.
     """
 
-    def __init__(self, chunks: Iterable[ChunkIndexRecord] = ()) -> None:
+    def __init__(self, chunks: Iterable[ChunkIndex] = ()) -> None:
         self._numbers = array("Q")  # _WIDTH for each chunk
         self._compression = array("H")  # an index into _names
         self._names: list[str] = []
@@ -80,40 +75,39 @@ class ChunkList:
         self._channels = array("H")
         self._indexes = array("Q")  # offsets of message indexes
         #: Entries of large chunks that were asked for last: each of their channels asks again.
-        self._kept: dict[int, ChunkIndexRecord] = {}
+        self._kept: dict[int, ChunkIndex] = {}
         self._by_channel: tuple[Ints, Ints] | None = None
         for chunk in chunks:
             self.append(chunk)
 
-    def append(self, chunk: ChunkIndexRecord) -> None:
+    def append(self, chunk: ChunkIndex) -> None:
         """Add an entry."""
-        first, last, offset, length, indexes, index_length, compression, stored, opened = chunk
         self._by_channel = None
-        if compression not in self._names:
-            self._names.append(compression)
-        self._compression.append(self._names.index(compression))
-        self._numbers.extend((first, last, offset, length, index_length, stored, opened))
-        self._channels.extend(indexes)
-        self._indexes.extend(indexes.values())
+        if chunk.compression not in self._names:
+            self._names.append(chunk.compression)
+        self._compression.append(self._names.index(chunk.compression))
+        self._numbers.extend(_numbers_of(chunk))
+        self._channels.extend(chunk.message_index_offsets)
+        self._indexes.extend(chunk.message_index_offsets.values())
         self._ends.append(len(self._channels))
 
     def __len__(self) -> int:
         return len(self._ends)
 
-    def __iter__(self) -> Iterator[ChunkIndexRecord]:
+    def __iter__(self) -> Iterator[ChunkIndex]:
         return map(self._entry, range(len(self)))
 
     @overload
-    def __getitem__(self, row: int, /) -> ChunkIndexRecord: ...
+    def __getitem__(self, row: int, /) -> ChunkIndex: ...
 
     @overload
-    def __getitem__(self, row: slice, /) -> list[ChunkIndexRecord]: ...
+    def __getitem__(self, row: slice, /) -> list[ChunkIndex]: ...
 
-    def __getitem__(self, row: int | slice, /) -> ChunkIndexRecord | list[ChunkIndexRecord]:
+    def __getitem__(self, row: int | slice, /) -> ChunkIndex | list[ChunkIndex]:
         rows = range(len(self))[row]
         return self._entry(rows) if isinstance(rows, int) else list(map(self._entry, rows))
 
-    def _entry(self, row: int) -> ChunkIndexRecord:
+    def _entry(self, row: int) -> ChunkIndex:
         low, high = self._ends[row - 1] if row else 0, self._ends[row]
         if high - low < _MANY_CHANNELS:
             return self._made(row, low, high)
@@ -123,11 +117,11 @@ class ChunkList:
             self._kept[row] = self._made(row, low, high)
         return self._kept[row]
 
-    def _made(self, row: int, low: int, high: int) -> ChunkIndexRecord:
+    def _made(self, row: int, low: int, high: int) -> ChunkIndex:
         first, last, offset, length, index_length, stored, opened = self._numbers[row * _WIDTH : (row + 1) * _WIDTH]
         indexes = dict(zip(self._channels[low:high], self._indexes[low:high], strict=True))
-        compression = self._names[self._compression[row]]
-        return ChunkIndexRecord(first, last, offset, length, indexes, index_length, compression, stored, opened)
+        sizes = (self._names[self._compression[row]], stored, opened)
+        return records.chunk_index((first, last), (offset, length), indexes, index_length, sizes)
 
     def __eq__(self, other: object) -> bool:
         """Whether the same entries follow in the same order."""
@@ -137,7 +131,7 @@ class ChunkList:
 
     __hash__ = None  # type: ignore[assignment]
 
-    def at(self, offset: int) -> ChunkIndexRecord | None:
+    def at(self, offset: int) -> ChunkIndex | None:
         """The entry of the chunk at an offset of the file; None if there is none."""
         row = self.row_at(offset)
         return None if row is None else self._entry(row)
@@ -174,7 +168,7 @@ class ChunkList:
             self._by_channel = listed[order], np.searchsorted(ends, order, "right")
         return self._by_channel
 
-    def with_channels(self, channels: Collection[int]) -> Iterator[ChunkIndexRecord]:
+    def with_channels(self, channels: Collection[int]) -> Iterator[ChunkIndex]:
         """The entries of chunks with messages of any of these channels."""
         return map(self._entry, self.rows_with(channels).tolist())
 
@@ -277,8 +271,8 @@ class Index:
         return all(
             chunk == theirs
             and (
-                chunk.offset not in self.entries
-                or _equal(self.entries[chunk.offset][channel_id], other.entries[chunk.offset][channel_id])
+                (at := chunk.chunk_start_offset) not in self.entries
+                or _equal(self.entries[at][channel_id], other.entries[at][channel_id])
             )
             for chunk, theirs in both
         )
@@ -479,16 +473,12 @@ def _scan_chunk(index: Index, buffer: Bytes, record: Record) -> None:
     index.entries[record.start] = entries
     edges = edges_of(entries)
     index.chunks.append(
-        ChunkIndexRecord(
-            min(edges, default=head.start_ns),  # the head of the chunk may be wrong
-            max(edges, default=head.end_ns),
-            record.start,
-            record.end - record.start,
+        records.chunk_index(
+            (min(edges, default=head.start_ns), max(edges, default=head.end_ns)),  # the head of the chunk may be wrong
+            (record.start, record.end - record.start),
             dict.fromkeys(entries, 0),  # 0: without message index
             0,
-            head.compression,
-            head.end - head.start,
-            head.uncompressed_size,
+            (head.compression, head.end - head.start, head.uncompressed_size),
         )
     )
 
@@ -504,6 +494,6 @@ def attachment_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry
 
 def metadata_entry(buffer: Bytes, record: Record, offset: int) -> SummaryEntry:
     """The summary entry of a metadata record at ``offset`` of a file."""
-    name = records.read_metadata(buffer, record)[0]
+    name = records.read_metadata(buffer, record).name
     packed = records.number(offset, 8) + records.number(record.end - record.start, 8)
     return SummaryEntry(name, offset, records.pack(Opcode.METADATA_INDEX, packed, records.text(name)))

@@ -178,7 +178,7 @@ class _Comparison:
         try:
             index = read_index(self._now)
             for chunk in index.chunks:
-                if chunk.offset >= self._journal.start:
+                if chunk.chunk_start_offset >= self._journal.start:
                     open_chunk(self._now, chunk_record(self._now, chunk))
         except Damaged:
             return False

@@ -9,11 +9,14 @@ import hashlib
 import zlib
 from array import array
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+from mcap.records import Message as MessageRecord
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
@@ -33,20 +36,11 @@ from mcaptrack.log.chunks import (
     read_index_entries,
 )
 from mcaptrack.log.index import Index
-from mcaptrack.log.records import (
-    BLOCK,
-    CHUNK_HEAD_BYTES,
-    MESSAGE_HEAD,
-    Bytes,
-    ChunkIndexRecord,
-    Damaged,
-    Opcode,
-    Record,
-    read_chunk,
-    record_at,
-)
+from mcaptrack.log.records import BLOCK, CHUNK_HEAD_BYTES, MESSAGE_HEAD, Bytes, Damaged, Record, read_chunk, record_at
 from mcaptrack.schema import Rows, Schema
 from mcaptrack.schema.encodings import RowReader
+
+T = TypeVar("T")
 
 #: Limit for open chunks in bytes; above it, overlapping chunks are closed and opened again later.
 OPEN_BYTES: Final = 128 * 2**20
@@ -140,8 +134,9 @@ def fingerprint(buffer: Bytes, index: Index, channel_id: int | None = None, chec
     for row in rows:
         chunk = index.chunks[row]
         # Offsets of chunks matter for the whole log, because they locate its messages, but not for one channel.
-        place = (chunk.offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
-        say(place, chunk.start_ns, chunk.end_ns, chunk.uncompressed_size, checksums.of(buffer, index, row))
+        place = (chunk.chunk_start_offset, *sorted(chunk.message_index_offsets)) if channel_id is None else ()
+        span = (chunk.message_start_time, chunk.message_end_time)
+        say(place, *span, chunk.uncompressed_size, checksums.of(buffer, index, row))
     for number in sorted(index.loose) if channel_id is None else [channel_id]:
         for offset in index.loose[number][:, 1].tolist() if number in index.loose else []:
             record = record_at(buffer, offset)
@@ -194,14 +189,15 @@ class TimeOutOfRange(Exception):
 
 
 class MessageBatch(NamedTuple):
-    """Messages of one channel that are read together, in time order, (M,) each: of one chunk, or near each other.
+    """Messages that are read together, in time order, (M,) each: of one chunk, or near each other in the file.
 
+    ``channel`` is that of all messages, or of each, (M,).
     ``is_direct``: the messages are read from the file itself, because they are outside of chunks or in an uncompressed
     chunk that is too large for memory.
     """
 
-    channel: int
-    chunk: ChunkIndexRecord | None
+    channel: int | NDArray[np.uint16]
+    chunk: ChunkIndex | None
     is_direct: bool
     t_ns: Times
     offset: Ints
@@ -238,8 +234,10 @@ class MessageBatches:
             chunk = index.chunks[row]
             if not overlaps(chunk, self._span):
                 continue
-            at = chunk.message_index_offsets[channel_id]
-            entries = read_index_entries(source, at, channel_id) if at else index.entries[chunk.offset][channel_id]
+            if at := chunk.message_index_offsets[channel_id]:
+                entries = read_index_entries(source, at, channel_id)
+            else:
+                entries = index.entries[chunk.chunk_start_offset][channel_id]
             listed += len(entries)
             if is_left_in_file(chunk.compression, chunk.compressed_size):
                 self._add_pieces(channel_id, row, entries)
@@ -336,11 +334,45 @@ class MessageBatches:
         if group:
             yield [self[member] for member in sorted(group)]
 
+    def apart(self) -> list[list[int]]:
+        """The numbers of batches in groups: all messages of a group are earlier than those of the next."""
+        numbers = np.flatnonzero(np.diff(self.edges))
+        first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
+        order = np.argsort(first_ns, kind="stable")
+        until = np.maximum.accumulate(last_ns[order])
+        starts = 1 + np.flatnonzero(first_ns[order][1:] > until[:-1])
+        return [group.tolist() for group in np.split(numbers[order], starts) if len(group)]
 
-def overlaps(chunk: ChunkIndexRecord, span: Span) -> bool:
+
+def joined_by_chunk(batches: Sequence[MessageBatch], *, reverse: bool) -> tuple[list[MessageBatch], Ints]:
+    """Batches of several channels as one for each chunk, and the batch of each message in the order of time, (M,).
+
+    Messages of equal time are in the order of the file. ``reverse`` gives the reverse of all of that.
+    """
+    counts = [len(batch.t_ns) for batch in batches]
+    channel = np.repeat(np.array([batch.channel for batch in batches], np.uint16), counts)
+    t_ns = np.concatenate([batch.t_ns for batch in batches])
+    offset = np.concatenate([batch.offset for batch in batches])
+    chunk = np.repeat([-1 if batch.chunk is None else batch.chunk.chunk_start_offset for batch in batches], counts)
+    in_order = np.lexsort((offset, np.where(chunk < 0, offset, chunk), t_ns))[:: -1 if reverse else 1]
+    firsts: dict[int, int] = {}  # by chunk the first of its batches; what is read from the file stays as it is
+    joined = [
+        number if batch.chunk is None or batch.is_direct else firsts.setdefault(batch.chunk.chunk_start_offset, number)
+        for number, batch in enumerate(batches)
+    ]
+    numbers, of_batches = np.unique(joined, return_inverse=True)
+    of = np.repeat(of_batches, counts)[in_order]
+    parts = np.split(in_order[np.argsort(of, kind="stable")], np.cumsum(np.bincount(of))[:-1])
+    return [
+        batches[number]._replace(channel=channel[part], t_ns=t_ns[part], offset=offset[part])
+        for number, part in zip(numbers.tolist(), parts, strict=True)
+    ], of
+
+
+def overlaps(chunk: ChunkIndex, span: Span) -> bool:
     """Whether a chunk may have messages in a span of times."""
     first, last = span
-    return (first is None or chunk.end_ns >= first) and (last is None or chunk.start_ns < last)
+    return (first is None or chunk.message_end_time >= first) and (last is None or chunk.message_start_time < last)
 
 
 def to_int64(t_ns: Times) -> Ints:
@@ -400,16 +432,53 @@ class Messages:
     def by_time(self, channels: Sequence[int], span: Span = (None, None)) -> Iterator[Message]:
         """Messages in time order; those of equal time by channel, then in file order.
 
-        ``span`` is a half-open interval of times. Chunks stay open while they have messages to come, within the limit
-        ``OPEN_BYTES``.
+        ``span`` is a half-open interval of times.
         """
         batches = self._located(channels, span)
-        if not len(batches.t_ns):
-            return
         in_order = batches.batch[np.argsort(batches.t_ns, kind="stable")]
+        return self._interleaved(batches, in_order, self._read)
+
+    def records(
+        self, channels: Sequence[int], span: Span = (None, None), *, reverse: bool = False, first_id: int = 0
+    ) -> Iterator[MessageRecord]:
+        """Message records in time order; those of equal time in file order.
+
+        ``first_id`` is added to the ids of channels, so that channels of two files have different ones.
+        """
+        batches = self._located(channels, span)
+
+        def read(batch: MessageBatch, skip: int) -> Iterator[MessageRecord]:
+            head, payloads = self._parsed(batch, skip)
+            ids = (head["channel"].astype(np.int64) + first_id).tolist()
+            return map(
+                MessageRecord,
+                ids,
+                head["t_ns"].tolist(),
+                payloads,
+                head["publish_ns"].tolist(),
+                head["sequence"].tolist(),
+            )
+
+        groups = batches.apart()
+        for numbers in reversed(groups) if reverse else groups:
+            yield from self._interleaved(*joined_by_chunk([batches[n] for n in numbers], reverse=reverse), read)
+
+    def _interleaved(
+        self,
+        batches: MessageBatches | Sequence[MessageBatch],
+        in_order: Ints,
+        read: Callable[[MessageBatch, int], Iterator[T]],
+    ) -> Iterator[T]:
+        """The messages of batches, each time the next one of the batch that ``in_order`` names, (M,).
+
+        ``read`` gives those of a batch but the first few. Chunks stay open while they have messages to come, within the
+        limit ``OPEN_BYTES``.
+        """
+        if not len(in_order):
+            return
         # Chunks rarely overlap: consecutive messages of one chunk are yielded together.
         starts = np.append(np.flatnonzero(run_starts(in_order)), len(in_order))
-        opened: OrderedDict[int, Iterator[Message]] = OrderedDict()
+        opened: OrderedDict[int, Iterator[T]] = OrderedDict()
         taken = array("Q", bytes(8 * len(batches)))
         size = 0
         for number, run in zip(in_order[starts[:-1]].tolist(), np.diff(starts).tolist(), strict=True):
@@ -418,7 +487,7 @@ class Messages:
                 size += batch.size
                 while size > OPEN_BYTES and opened:
                     size -= batches[opened.popitem(last=False)[0]].size
-                opened[number] = self._read(batch, taken[number])
+                opened[number] = read(batch, taken[number])
             opened.move_to_end(number)
             yield from islice(opened[number], run)
             taken[number] += run
@@ -495,10 +564,10 @@ class Messages:
         for chunk in self.index.chunks.with_channels(channels):
             if not overlaps(chunk, span):
                 continue
-            end = chunk.offset + chunk.length  # its message indexes follow
+            end = chunk.chunk_start_offset + chunk.chunk_length  # its message indexes follow
             indexes.append((end, end + chunk.message_index_length))
             is_direct = is_left_in_file(chunk.compression, chunk.compressed_size)
-            wholes.append((end if is_direct else chunk.offset, end + chunk.message_index_length))
+            wholes.append((end if is_direct else chunk.chunk_start_offset, end + chunk.message_index_length))
         is_one = are_read and sum(end - start for start, end in wholes) <= _READ_AT_ONCE_BYTES
         self.source.expect(wholes if is_one else indexes, GAP_BYTES if is_one or not are_read else _MIN_GAP_BYTES)
         batches = MessageBatches(self.source, self.index, channels, span)
@@ -506,17 +575,17 @@ class Messages:
             self.source.expect(wholes)
         return batches
 
-    def _content(self, chunk: ChunkIndexRecord) -> Bytes:
+    def _content(self, chunk: ChunkIndex) -> Bytes:
         """The records in a chunk."""
-        content = self._opened.pop(chunk.offset, None)
+        content = self._opened.pop(chunk.chunk_start_offset, None)
         if content is None:
             content, mark = open_chunk_with_checksum(self.source, chunk_record(self.source, chunk))
-            self._remember_chunk(chunk.offset, mark)
+            self._remember_chunk(chunk.chunk_start_offset, mark)
         else:
             self._opened_bytes -= len(content)
         if len(chunk.message_index_offsets) == 1 and isinstance(content, memoryview):
             return content  # no other channel needs it
-        self._opened[chunk.offset] = content
+        self._opened[chunk.chunk_start_offset] = content
         self._opened_bytes += len(content)
         while self._opened_bytes > _KEPT_BYTES and len(self._opened) > 1:
             self._opened_bytes -= len(self._opened.popitem(last=False)[1])
@@ -531,7 +600,7 @@ class Messages:
                 return content, batch.offset
             base = read_chunk(self.source, chunk_record(self.source, batch.chunk)).start
             if not batch.is_direct:
-                raise Damaged("a chunk is larger than its index says", batch.chunk.offset)
+                raise Damaged("a chunk is larger than its index says", batch.chunk.chunk_start_offset)
         if not len(batch.offset):
             return memoryview(b""), batch.offset
         places = batch.offset + base
@@ -562,11 +631,15 @@ class Messages:
 
     def _read(self, batch: MessageBatch, skip: int) -> Iterator[Message]:
         """The messages of a batch except the first ``skip``."""
+        head, payloads = self._parsed(batch, skip)
+        return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
+
+    def _parsed(self, batch: MessageBatch, skip: int) -> tuple[NDArray[np.void], Iterator[bytes]]:
+        """The heads of the messages of a batch except the first ``skip``, of ``HEAD``, and their payloads."""
         content, offset = self._open(batch)
-        message_heads = message_heads_at(content, batch.channel, batch.t_ns[skip:], offset[skip:])
+        channel = batch.channel if isinstance(batch.channel, int) else batch.channel[skip:]
+        message_heads = message_heads_at(content, channel, batch.t_ns[skip:], offset[skip:])
         whole = content.obj
         data = whole if isinstance(whole, bytes) and len(whole) == len(content) else content
         spans = zip(message_heads.start.tolist(), message_heads.end.tolist(), strict=True)
-        payloads = (bytes(data[start:end]) for start, end in spans)
-        head = message_heads.head
-        return map(Message, head["t_ns"].tolist(), head["sequence"].tolist(), head["publish_ns"].tolist(), payloads)
+        return message_heads.head, (bytes(data[start:end]) for start, end in spans)

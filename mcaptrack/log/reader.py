@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import heapq
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple, Self, TypeVar
 
 import numpy as np
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Message as MessageRecord
+from mcap.records import Schema as SchemaRecord
+from mcap.well_known import SchemaEncoding
 
 from mcaptrack import notices
 from mcaptrack.errors import DamagedError, McaptrackError, call, list_names
@@ -23,8 +29,8 @@ from mcaptrack.log.byte_source import ByteSource, OpenFile, ReadFile, Signature,
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.journal import changed, find_journal, recover_hint
-from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, TimeOutOfRange
-from mcaptrack.log.records import ChannelRecord, Damaged
+from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, Span, TimeOutOfRange
+from mcaptrack.log.records import Damaged
 from mcaptrack.log.remote import RemoteFile
 from mcaptrack.objects import Version
 from mcaptrack.schema import Frame, Schema
@@ -32,6 +38,7 @@ from mcaptrack.schema.classes import with_only_class
 from mcaptrack.schema.encodings import ROW_ENCODINGS, RowReader, reader_of, schema_name_of
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import split_rows
+from mcaptrack.schema.own import schema_of_channel
 
 T = TypeVar("T")
 
@@ -52,6 +59,11 @@ class Channel(NamedTuple):
     def holds(self, schema: Schema) -> bool:
         """Whether it has rows of a schema, in any encoding of rows."""
         return self.schema_name == schema.name and self.message_encoding in ROW_ENCODINGS
+
+    @property
+    def schema(self) -> Schema | None:
+        """The schema of its rows, mcaptrack's or a user's own; None if it holds no rows."""
+        return schema_of_channel(self.schema_name, self.metadata) if self.message_encoding in ROW_ENCODINGS else None
 
 
 # A log as it was when it was opened, even if its file changes afterwards.
@@ -144,6 +156,15 @@ class Snapshot:
     def is_through_journal(self) -> bool:
         """Whether the log is read through a journal, as it was before an unfinished change."""
         return len(self.source.pieces) > 1
+
+    def is_at(self, path: Path) -> bool:
+        """Whether a path leads to the file that was opened, and that was certainly not changed."""
+        assert isinstance(self.file, OpenFile)
+        try:
+            is_same = os.path.samestat(path.stat(), os.fstat(self.file.handle))
+        except OSError:
+            return False
+        return is_same and self._is_certain and self.file.signature() == self._signature
 
     def is_on_disk(self, status: os.stat_result) -> bool:
         """Whether a file is the one that was opened, with the same content on the disk."""
@@ -376,7 +397,7 @@ class Log:
 
     def _channel(self, record: ChannelRecord) -> Channel:
         schema = self.index.schemas.get(record.schema_id)
-        name = schema_name_of(schema.name, schema.encoding, record.message_encoding) if schema else ""
+        name = schema_name_of(schema.name, schema.encoding, record.message_encoding, record.metadata) if schema else ""
         count = self.index.counts.get(record.id, 0)
         return Channel(record.id, record.topic, name, record.message_encoding, record.metadata, count)
 
@@ -403,7 +424,7 @@ class Log:
         if schema is None:
             return (channel.message_encoding,)
         data = bytes(schema.data)
-        if schema.encoding in ("ros1msg", "ros2msg"):
+        if schema.encoding in (SchemaEncoding.ROS1, SchemaEncoding.ROS2):
             data = b"\n".join(b" ".join(line.partition(b"#")[0].split()) for line in data.splitlines())
             data = b"\n".join(filter(None, data.split(b"\n")))
         return (channel.message_encoding, schema.name, schema.encoding, hashlib.sha256(data).hexdigest())
@@ -422,7 +443,7 @@ class Log:
             return None
         with self.snapshot.reporting_damage():
             whole = self.snapshot.record(offsets[-1])
-            return records.read_metadata(whole, records.record_at(whole, 0))[1]
+            return records.read_metadata(whole, records.record_at(whole, 0)).metadata
 
     def attachment(self, name: str) -> bytes | None:
         """The data of the last attachment of that name."""
@@ -447,6 +468,48 @@ class Log:
         channels = self._ids(topic)
         with self.snapshot.reporting_damage():
             yield from self._messages.by_time(channels, (start_ns, end_ns))
+            self.snapshot.confirm_unchanged(channels)
+
+    def records(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None, *, reverse: bool = False
+    ) -> Iterator[tuple[SchemaRecord | None, ChannelRecord, MessageRecord]]:
+        """The messages of several topics in time order, as records with those of their channels and schemas.
+
+        Messages of equal time are in file order, those of the sidecar last; ``reverse`` gives the reverse of all. Each
+        channel and schema has an id of its own: those of the sidecar count on from those of the log. Raises
+        McaptrackError where the file is damaged.
+        """
+        streams, first_ids = [], (0, 0)
+        for part in self.parts:
+            ids = [
+                channel.id for channel in part.recorded if channel.topic in topics and self.part(channel.topic) is part
+            ]
+            streams.append(part._records(ids, (start_ns, end_ns), first_ids, reverse=reverse))
+            first_ids = (max(part.index.channels, default=0), max(part.index.schemas, default=0))
+        if len(streams) == 1:
+            return streams[0]
+        if reverse:
+            streams.reverse()
+        return heapq.merge(*streams, key=lambda record: record[2].log_time, reverse=reverse)
+
+    def _records(
+        self, channels: Sequence[int], span: Span, first_ids: tuple[int, int], *, reverse: bool
+    ) -> Iterator[tuple[SchemaRecord | None, ChannelRecord, MessageRecord]]:
+        """The records of channels of this file; ``first_ids`` are added to the ids of channels and of schemas."""
+        first_channel, first_schema = first_ids
+        described = {}
+        for number in channels:
+            channel = self.index.channels[number]
+            schema = self.index.schemas.get(channel.schema_id)
+            schema_id = first_schema + channel.schema_id if channel.schema_id else 0
+            metadata = dict(channel.metadata)
+            described[first_channel + number] = (
+                replace(schema, id=schema_id) if schema else None,
+                replace(channel, id=first_channel + number, schema_id=schema_id, metadata=metadata),
+            )
+        with self.snapshot.reporting_damage():
+            for message in self._messages.records(channels, span, reverse=reverse, first_id=first_channel):
+                yield *described[message.channel_id], message
             self.snapshot.confirm_unchanged(channels)
 
     def timed(self, topic: str) -> Iterator[Message]:

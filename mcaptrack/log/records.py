@@ -1,6 +1,8 @@
-"""MCAP records <-> bytes, by the MCAP specification (version 0). Only this package knows them.
+"""MCAP records <-> bytes, by the MCAP specification (version 0). Only this package knows their bytes.
 
-Integers are little endian; strings, arrays and maps are preceded by their length in bytes.
+Records have the types of the ``mcap`` package. Of those with much data only the head is read, and where the data is:
+``ChunkHead`` and ``AttachmentHead``. Integers are little endian; strings, arrays and maps are preceded by their length
+in bytes.
 """
 
 from __future__ import annotations
@@ -8,8 +10,10 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from enum import IntEnum
 from typing import Final, NamedTuple, Protocol, overload
+
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Header, Metadata, Schema
 
 from mcaptrack.errors import McaptrackError
 
@@ -34,27 +38,6 @@ _CHUNK_INDEX_SIZES: Final = struct.Struct("<QQ")
 #: Bytes read at once: of one record, and of consecutive records.
 _LOOKAHEAD: Final = 1024
 _WALK_BLOCK: Final = 64 * 2**10
-
-
-class Opcode(IntEnum):
-    """The first byte of a record says what it is. Opcodes from 0x80 on are for private records of applications."""
-
-    HEADER = 0x01
-    FOOTER = 0x02
-    SCHEMA = 0x03
-    CHANNEL = 0x04
-    MESSAGE = 0x05
-    CHUNK = 0x06
-    MESSAGE_INDEX = 0x07
-    CHUNK_INDEX = 0x08
-    ATTACHMENT = 0x09
-    ATTACHMENT_INDEX = 0x0A
-    STATISTICS = 0x0B
-    METADATA = 0x0C
-    METADATA_INDEX = 0x0D
-    SUMMARY_OFFSET = 0x0E
-    DATA_END = 0x0F
-
 
 #: The records of a data section.
 DATA_OPCODES: Final = (
@@ -91,21 +74,6 @@ class Record(NamedTuple):
     end: int
 
 
-class SchemaRecord(NamedTuple):
-    id: int
-    name: str
-    encoding: str
-    data: bytes
-
-
-class ChannelRecord(NamedTuple):
-    id: int
-    schema_id: int
-    topic: str
-    message_encoding: str
-    metadata: dict[str, str]
-
-
 class ChunkHead(NamedTuple):
     """The head of a chunk. Its records are in the buffer from ``start`` to ``end``."""
 
@@ -116,18 +84,6 @@ class ChunkHead(NamedTuple):
     compression: str
     start: int
     end: int
-
-
-class ChunkIndexRecord(NamedTuple):
-    start_ns: int
-    end_ns: int
-    offset: int
-    length: int
-    message_index_offsets: dict[int, int]
-    message_index_length: int
-    compression: str
-    compressed_size: int
-    uncompressed_size: int
 
 
 class Damaged(McaptrackError):
@@ -239,14 +195,17 @@ def _record(near: memoryview, low: int, at: int, end: int) -> Record:
     return Record(opcode, at, body, body + length)
 
 
-def read_schema(buffer: Bytes, record: Record) -> SchemaRecord:
+def read_schema(buffer: Bytes, record: Record) -> Schema:
     r = Reader(buffer, record.body, record.end)
-    return SchemaRecord(r.number(2), r.text(), r.text(), bytes(r.raw()))
+    return Schema(id=r.number(2), name=r.text(), encoding=r.text(), data=bytes(r.raw()))
 
 
-def read_channel(buffer: Bytes, record: Record) -> ChannelRecord:
+def read_channel(buffer: Bytes, record: Record) -> Channel:
     r = Reader(buffer, record.body, record.end)
-    return ChannelRecord(r.number(2), r.number(2), r.text(), r.text(), r.text_map())
+    number, schema_id, topic, message_encoding = r.number(2), r.number(2), r.text(), r.text()
+    return Channel(
+        id=number, topic=topic, message_encoding=message_encoding, metadata=r.text_map(), schema_id=schema_id
+    )
 
 
 def read_chunk(buffer: Bytes, record: Record) -> ChunkHead:
@@ -285,12 +244,12 @@ def read_message_entries(buffer: Bytes, record: Record) -> tuple[int, memoryview
     return channel, whole[_INDEX_HEAD.size : _INDEX_HEAD.size + size]
 
 
-def read_metadata(buffer: Bytes, record: Record) -> tuple[str, dict[str, str]]:
+def read_metadata(buffer: Bytes, record: Record) -> Metadata:
     r = Reader(buffer, record.body, record.end)
-    return r.text(), r.text_map()
+    return Metadata(name=r.text(), metadata=r.text_map())
 
 
-class AttachmentRecord(NamedTuple):
+class AttachmentHead(NamedTuple):
     """The head of an attachment. Its data is in the buffer from ``start`` to ``end``."""
 
     log_ns: int
@@ -301,15 +260,14 @@ class AttachmentRecord(NamedTuple):
     end: int
 
 
-def read_attachment(buffer: Bytes, record: Record) -> AttachmentRecord:
+def read_attachment(buffer: Bytes, record: Record) -> AttachmentHead:
     r = Reader(buffer, record.body, record.end)
-    return AttachmentRecord(r.number(8), r.number(8), r.text(), r.text(), *r.span(8))
+    return AttachmentHead(r.number(8), r.number(8), r.text(), r.text(), *r.span(8))
 
 
-def read_header(buffer: Bytes, record: Record) -> tuple[str, str]:
-    """Profile and library."""
+def read_header(buffer: Bytes, record: Record) -> Header:
     r = Reader(buffer, record.body, record.end)
-    return r.text(), r.text()
+    return Header(profile=r.text(), library=r.text())
 
 
 def pack(opcode: int, *fields: bytes) -> bytes:
@@ -338,11 +296,11 @@ def number_map(values: Mapping[int, int], key_size: int, value_size: int) -> byt
     return raw(b"".join(number(key, key_size) + number(value, value_size) for key, value in values.items()))
 
 
-def pack_schema(schema: SchemaRecord) -> bytes:
+def pack_schema(schema: Schema) -> bytes:
     return pack(Opcode.SCHEMA, number(schema.id, 2), text(schema.name), text(schema.encoding), raw(schema.data))
 
 
-def pack_channel(channel: ChannelRecord) -> bytes:
+def pack_channel(channel: Channel) -> bytes:
     head = number(channel.id, 2) + number(channel.schema_id, 2)
     return pack(Opcode.CHANNEL, head, text(channel.topic), text(channel.message_encoding), text_map(channel.metadata))
 
@@ -359,10 +317,13 @@ def pack_chunk(head: tuple[int, int, int, int], compression: str, data: bytes) -
     return pack(Opcode.CHUNK, fields, text(compression), raw(data, 8))
 
 
-def pack_chunk_index(index: ChunkIndexRecord) -> bytes:
+def pack_chunk_index(index: ChunkIndex) -> bytes:
     return pack(
         Opcode.CHUNK_INDEX,
-        *(number(value, 8) for value in index[:4]),
+        number(index.message_start_time, 8),
+        number(index.message_end_time, 8),
+        number(index.chunk_start_offset, 8),
+        number(index.chunk_length, 8),
         number_map(index.message_index_offsets, 2, 8),
         number(index.message_index_length, 8),
         text(index.compression),
@@ -371,7 +332,7 @@ def pack_chunk_index(index: ChunkIndexRecord) -> bytes:
     )
 
 
-def read_chunk_index(buffer: Bytes, record: Record) -> ChunkIndexRecord:
+def read_chunk_index(buffer: Bytes, record: Record) -> ChunkIndex:
     whole = buffer[record.body : record.end]
     with suppress(struct.error, UnicodeDecodeError):  # the slow path below reports what is wrong
         first, last, offset, length, size = _CHUNK_INDEX_HEAD.unpack_from(whole)
@@ -381,7 +342,32 @@ def read_chunk_index(buffer: Bytes, record: Record) -> ChunkIndexRecord:
         at += _CHUNK_INDEX_NAME.size + size
         stored, opened = _CHUNK_INDEX_SIZES.unpack_from(whole, at)
         name = bytes(whole[at - size : at]).decode()
-        return ChunkIndexRecord(first, last, offset, length, offsets, index_length, name, stored, opened)
+        return chunk_index((first, last), (offset, length), offsets, index_length, (name, stored, opened))
     r = Reader(buffer, record.body, record.end)
-    head = (r.number(8), r.number(8), r.number(8), r.number(8))
-    return ChunkIndexRecord(*head, r.number_map(2, 8), r.number(8), r.text(), r.number(8), r.number(8))
+    span, place = (r.number(8), r.number(8)), (r.number(8), r.number(8))
+    return chunk_index(span, place, r.number_map(2, 8), r.number(8), (r.text(), r.number(8), r.number(8)))
+
+
+def chunk_index(
+    span: tuple[int, int],
+    place: tuple[int, int],
+    indexes: dict[int, int],
+    indexes_length: int,
+    sizes: tuple[str, int, int],
+) -> ChunkIndex:
+    """The index entry of a chunk.
+
+    ``span`` is the first and the last time in ns, ``place`` its offset and its length, ``sizes`` its compression, and
+    its size with and without that.
+    """
+    return ChunkIndex(
+        message_start_time=span[0],
+        message_end_time=span[1],
+        chunk_start_offset=place[0],
+        chunk_length=place[1],
+        message_index_offsets=indexes,
+        message_index_length=indexes_length,
+        compression=sizes[0],
+        compressed_size=sizes[1],
+        uncompressed_size=sizes[2],
+    )

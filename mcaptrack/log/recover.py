@@ -18,6 +18,9 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Schema as SchemaRecord
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
@@ -28,20 +31,7 @@ from mcaptrack.log.check_summary import record_name
 from mcaptrack.log.checksums import attachment_is_whole, crc_of
 from mcaptrack.log.chunks import Entries, message_head, open_chunk, scan_entries
 from mcaptrack.log.index import Index, read_intact_summary, starts_with_magic, summary_start
-from mcaptrack.log.records import (
-    BLOCK,
-    DATA_OPCODES,
-    MAGIC,
-    Bytes,
-    ChannelRecord,
-    ChunkIndexRecord,
-    Damaged,
-    Opcode,
-    Reader,
-    Record,
-    SchemaRecord,
-    walk,
-)
+from mcaptrack.log.records import BLOCK, DATA_OPCODES, MAGIC, Bytes, Damaged, Reader, Record, walk
 from mcaptrack.log.writer import LogWriter, create
 
 Progress = Callable[[str, int, int], None]
@@ -336,7 +326,7 @@ class _Recovery:
             numbers = (first, last, head.uncompressed_size, head.uncompressed_crc)
             whole = records.pack_chunk(numbers, head.compression, bytes(self._buffer[head.start : head.end]))
         sizes = (head.compression, head.end - head.start, head.uncompressed_size)
-        entry = ChunkIndexRecord(first, last, 0, len(whole), {}, 0, *sizes)
+        entry = records.chunk_index((first, last), (0, len(whole)), {}, 0, sizes)
         self._saved.update({number: len(listed) for number, listed in entries.items()})
         self._writer.copy_chunk(whole, entry, {number: listed.tobytes() for number, listed in entries.items()})
 
@@ -375,7 +365,7 @@ class _Recovery:
             for n in listed.message_index_offsets
             if n in self._summary_index.channels
         ]
-        span = f"{listed.start_ns / 1e9:.3f} to {listed.end_ns / 1e9:.3f} s"
+        span = f"{listed.message_start_time / 1e9:.3f} to {listed.message_end_time / 1e9:.3f} s"
         return f"{why}; it held messages of {', '.join(sorted(topics)) or 'no topic'} from {span}"
 
     def _report_lost(self, start: int, end: int, reason: str) -> None:

@@ -12,12 +12,16 @@ import zlib
 from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Final, Literal, Protocol
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import ChunkIndex
+from mcap.records import Schema as SchemaRecord
 
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
@@ -28,7 +32,7 @@ from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import LOG_MAX_NS
 from mcaptrack.log.index import ChunkList, Index, SummaryEntry, attachment_entry, metadata_entry, read_index
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, results_path
-from mcaptrack.log.records import MAGIC, ChannelRecord, ChunkIndexRecord, Damaged, Opcode, SchemaRecord
+from mcaptrack.log.records import MAGIC, Damaged
 
 #: The library name in the header record, before the version.
 LIBRARY: Final = "mcaptrack"
@@ -119,10 +123,16 @@ class LogWriter:
         if schema != ("", "", b""):
             schema_id = self._schema_ids.get(schema, 0) or _free_id(self.schemas, self._last[0], "schemas")
             self._schema_ids[schema] = schema_id
-            self.schemas[schema_id] = SchemaRecord(schema_id, *schema)
+            self.schemas[schema_id] = SchemaRecord(schema_id, name=schema[0], encoding=schema[1], data=schema[2])
         channel_id = _free_id(self.channels, self._last[1], "channels")
         self._last = max(schema_id, self._last[0]), max(channel_id, self._last[1])
-        self.channels[channel_id] = ChannelRecord(channel_id, schema_id, topic, message_encoding, dict(metadata))
+        self.channels[channel_id] = ChannelRecord(
+            id=channel_id,
+            topic=topic,
+            message_encoding=message_encoding,
+            metadata=dict(metadata),
+            schema_id=schema_id,
+        )
         self._topics.add(topic)
         self._groups[channel_id] = (kind, group)
         return channel_id
@@ -190,7 +200,7 @@ class LogWriter:
         self._attachments.append(attachment_entry(buffer, records.record_at(buffer, 0), self.offset))
         self.write(record)
 
-    def copy_chunk(self, record: bytes, listed: ChunkIndexRecord, indexes: Mapping[int, bytes]) -> None:
+    def copy_chunk(self, record: bytes, listed: ChunkIndex, indexes: Mapping[int, bytes]) -> None:
         """Copy a chunk, and write its message indexes from their entries (time and offset, 8 bytes each)."""
         start = self.offset
         self.write(record)
@@ -200,11 +210,16 @@ class LogWriter:
             self.write(records.pack_message_index(channel_id, entries))
             self.counts[channel_id] = self.counts.get(channel_id, 0) + len(entries) // 16
         self.chunks.append(
-            listed._replace(offset=start, message_index_offsets=offsets, message_index_length=self.offset - index_start)
+            replace(
+                listed,
+                chunk_start_offset=start,
+                message_index_offsets=offsets,
+                message_index_length=self.offset - index_start,
+            )
         )
         if indexes:
-            low, high = self._times or (listed.start_ns, listed.end_ns)
-            self._times = (min(low, listed.start_ns), max(high, listed.end_ns))
+            low, high = self._times or (listed.message_start_time, listed.message_end_time)
+            self._times = (min(low, listed.message_start_time), max(high, listed.message_end_time))
 
     def write_kept_records(self, kind: ChunkKind, parts: Iterable[tuple[int, int, memoryview]]) -> None:
         """Write kept records as a new chunk: each with its channel (-1 if it is not a message) and log time."""
@@ -304,7 +319,8 @@ class LogWriter:
 
             compression, data = "zstd", zstandard.ZstdCompressor(_ZSTD_LEVEL[chunk.kind]).compress(content)
         record = records.pack_chunk((first, last, len(content), zlib.crc32(content)), compression, data)
-        entry = ChunkIndexRecord(first, last, 0, len(record), {}, 0, compression, len(data), len(content))
+        sizes = (compression, len(data), len(content))
+        entry = records.chunk_index((first, last), (0, len(record)), {}, 0, sizes)
         self.copy_chunk(record, entry, {channel: entries.tobytes() for channel, entries in indexes.items()})
 
 

@@ -54,7 +54,12 @@ _GROWTH: Final = 3
 
 
 def library(url: Url) -> Any:
-    """The library, if it is installed."""
+    """The library, if it is installed, and if its threads are in this process: in a fork it would wait for ever."""
+    if _first_process() != os.getpid():
+        raise McaptrackError(
+            f"{url} can't be reached: this process was forked from one that has used a store; start processes by "
+            "spawning, as `multiprocessing.get_context('spawn')` does"
+        )
     try:
         import obstore
         import obstore.exceptions
@@ -64,6 +69,12 @@ def library(url: Url) -> Any:
             'pip install "mcaptrack[cloud]"'
         ) from None
     return obstore
+
+
+@lru_cache(1)
+def _first_process() -> int:
+    """The process that asked first; also in those that were forked from it since."""
+    return os.getpid()
 
 
 def store_of(url: Url) -> Any:

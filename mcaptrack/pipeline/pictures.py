@@ -33,7 +33,7 @@ from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import Transform
-from mcaptrack.transforms.protocol import traits_of
+from mcaptrack.transforms.protocol import latency_of, traits_of
 from mcaptrack.transforms.retrack.appearance import Descriptors
 
 MAX_BYTES: Final = 500_000_000
@@ -227,7 +227,7 @@ def with_descriptors(
 
 def _why_not(transform: Transform, frames: Sequence[Frame], keep: Collection[str] | None) -> str:
     """Return why pictures can't be used; "" if they can."""
-    if keep is not None and all(transform.latency_s.get(output) != float("inf") for output in keep):
+    if keep is not None and all(latency_of(transform).get(output) != float("inf") for output in keep):
         return "tracks that use the past alone (online) don't look at pictures"
     if getattr(transform, "leaves_unchanged", False) and not getattr(transform, "links_in_picture", False):
         return "tracks are left as they are"

@@ -169,9 +169,8 @@ def make_plane(
     follow from a calibration. Both results are None if no frame has boxes in pixels.
     """
     chain = _chain(state, source[0])
-    names = next((how.classes for _, how in chain if how and how.classes), {})
     frames = thinned(frames, _MOST_BOXES)
-    seen = _Boxes(*_boxes(frames, names))
+    seen = _Boxes(*_boxes(frames, [how.classes for _, how in chain if how]))
     if not len(seen.xywh):
         return None, None  # without boxes in pixels there is nothing to convert to metres
     camera = camera_at(state.opened, state.prefix)
@@ -365,11 +364,12 @@ def _keys(joined: JoinedFrames) -> Iterator[tuple[int, int]]:
     return zip(joined.row_ns.tolist(), joined.rows["track_id"].tolist(), strict=True)
 
 
-def _boxes(frames: Sequence[Frame], names: Mapping[str, str]) -> tuple[Floats, Ints, Floats, Bools]:
+def _boxes(frames: Sequence[Frame], classes: Sequence[Mapping[str, str]]) -> tuple[Floats, Ints, Floats, Bools]:
     """Return the boxes of rows in pixels, the number of the frame of each, their scores, and which are of people.
 
-    ``names`` are those of classes by number. Boxes of unknown classes are of people if no box is said to be.
+    ``classes`` are the names of classes by number, where channels name them: the first that do count. Boxes of unknown classes are of people if no box is said to be.
     """
+    names = next(filter(None, classes), {})
     rows: Rows = np.concatenate([frame.rows[_BOX_COLUMNS] for frame in frames]) if frames else DETECTIONS.empty()
     number = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
     kept = np.isfinite(columns_to_boxes(rows)).all(axis=1)

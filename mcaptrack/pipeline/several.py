@@ -24,8 +24,8 @@ from mcaptrack.transforms.protocol import traits_of
 if TYPE_CHECKING:
     from mcaptrack.pipeline.summary import Summary
 
-#: Called with the name of a stage, the amount that is done, and the total (None if it is not known).
-Progress = Callable[[str, float, float | None], None]
+#: Called with the name of a stage, the amount that is done, and the total.
+Progress = Callable[[str, int, int], None]
 #: Takes a note.
 Say = Callable[[str], None]
 #: Changes an open log, or a copy of it at the path; returns the prefix of the camera, and what was done.

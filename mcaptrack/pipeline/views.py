@@ -64,6 +64,8 @@ from mcaptrack.transforms import FULL, STAGES
 
 #: The name of the stage, in reports.
 STAGE: Final = "views"
+#: The schemas of channels that get views.
+WITH_VIEWS: Final = (*views.DRAWN, GROUND_PLANE)
 #: Endings of the topics of forecasts, and of the online tracks that they belong to.
 _PREDICTED, _ONLINE = "/predictions", "/online"
 #: Where views look from follows from about so many rows at most.

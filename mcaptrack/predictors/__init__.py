@@ -21,11 +21,20 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.notices import warn
 from mcaptrack.predictors.checked import CheckedPredictor
-from mcaptrack.predictors.forecast import Forecast, PeopleSeen, Predictor, predict_among, predict_together, uses_people
+from mcaptrack.predictors.forecast import (
+    AnyPredictor,
+    Forecast,
+    PeopleSeen,
+    Predictor,
+    predict_among,
+    predict_together,
+    uses_people,
+)
 from mcaptrack.registry import BUILT_IN, Entry, find, is_installed
 
 __all__ = [
     "NAMES",
+    "AnyPredictor",
     "Forecast",
     "PeopleSeen",
     "Predictor",

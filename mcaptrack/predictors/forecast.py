@@ -71,36 +71,28 @@ def uses_people(predictor: Any) -> bool:
     return bool(getattr(predictor, "uses_people", False))
 
 
-class Predictor(Protocol):
-    """A predictor on a regular clock.
+class AnyPredictor(Protocol):
+    """A predictor on a regular clock, as a class of another package has to be.
 
     A predictor that looks at other people has the attribute ``uses_people = True``. Its ``predict`` has a third
     parameter, ``people: PeopleSeen | None = None``, without which every track is alone. Others never get it.
 
     Attributes
     ----------
-    name : str
-        Name in messages and tables.
     past : int
         Number of past positions that it uses, the current one included.
     steps : int
         Number of future steps that it predicts.
     step_s : float
         Length of a step in seconds, in the past and in the future.
-    weights_sha256 : str or None
-        Digest of the learned weights; None if nothing is learned.
     """
 
-    @property
-    def name(self) -> str: ...
     @property
     def past(self) -> int: ...
     @property
     def steps(self) -> int: ...
     @property
     def step_s(self) -> float: ...
-    @property
-    def weights_sha256(self) -> str | None: ...
 
     def predict(self, xy_m: Floats, valid: NDArray[np.bool_]) -> Forecast:
         """Predict a batch of tracks.
@@ -121,7 +113,24 @@ class Predictor(Protocol):
         ...
 
 
-def predict_among(predictor: Predictor, xy_m: Floats, valid: Bools, people: PeopleSeen | None) -> Forecast:
+class Predictor(AnyPredictor, Protocol):
+    """A predictor that says what it is.
+
+    Attributes
+    ----------
+    name : str
+        Name in messages and tables.
+    weights_sha256 : str or None
+        Digest of the learned weights; None if nothing is learned.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def weights_sha256(self) -> str | None: ...
+
+
+def predict_among(predictor: AnyPredictor, xy_m: Floats, valid: Bools, people: PeopleSeen | None) -> Forecast:
     """The forecasts of a batch; a predictor that uses other people gets them."""
     if people is not None and uses_people(predictor):
         return predictor.predict(xy_m, valid, people=people)  # type: ignore[call-arg]

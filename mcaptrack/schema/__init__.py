@@ -55,16 +55,24 @@ class Schema:
     ``alternatives`` are groups of optional columns: each row has all columns of at least one group, and none in part.
     """
 
-    def __init__(self, name: str, *alternatives: tuple[str, ...]) -> None:
+    def __init__(self, name: str, *alternatives: tuple[str, ...], definition: Definition | None = None) -> None:
         self.name = name
         self.alternatives = alternatives
+        self._own = definition
 
     def __repr__(self) -> str:
         return f"Schema({self.name!r})"
 
+    @property
+    def is_own(self) -> bool:
+        """Whether a user has defined it, as ``mcaptrack.schema_of`` does."""
+        return self._own is not None
+
     @cached_property
     def definition(self) -> Definition:
-        """The parsed schema file."""
+        """The parsed schema file, or what a user has defined."""
+        if self._own is not None:
+            return self._own
         path = _folder() / f"{self.name.rpartition('.')[2]}.proto"
         return parse(path.read_text(encoding="utf-8"), path.name)
 

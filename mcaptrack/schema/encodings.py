@@ -6,18 +6,20 @@ A channel of rows is read by its own encoding. Digests don't depend on it: they 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
+from mcap.well_known import SchemaEncoding
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Bytes, Ints
 from mcaptrack.geometry.ragged import ragged_range
-from mcaptrack.schema import SCHEMAS, Frame, Rows, Schema
+from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.codec import RowCodec
+from mcaptrack.schema.own import schema_of_channel
 from mcaptrack.schema.proto import KINDS, Definition
 
 Encoding = Literal["protobuf", "cdr"]
@@ -25,8 +27,6 @@ PROTOBUF: Final = "protobuf"
 CDR: Final = "cdr"
 #: Encodings of messages with rows.
 ROW_ENCODINGS: Final = (PROTOBUF, CDR)
-#: The encoding of the definitions of ROS 2 messages.
-ROS2MSG: Final = "ros2msg"
 #: The number of frames that are encoded together.
 _BATCH: Final = 256
 
@@ -114,8 +114,10 @@ def ros_definition(definition: Definition) -> str:
     lines = [f"# {definition.doc}", f"{row}[] rows", _LINE, f"MSG: {row}"]
     width = max(len(_TYPES[column.kind]) + len(column.name) for column in definition.columns) + 1
     for column in definition.columns:
-        missing = "" if not column.optional else "; NaN if missing" if column.is_nullable else "; -1 if missing"
-        lines.append(f"{_TYPES[column.kind]} {column.name}".ljust(width) + f" # {column.doc}{missing}")
+        missing = "" if not column.optional else "NaN if missing" if column.is_nullable else "-1 if missing"
+        unit = f"in {column.stated_unit}" if column.stated_unit else ""
+        comment = "; ".join(filter(None, (column.doc, unit, missing)))
+        lines.append(f"{_TYPES[column.kind]} {column.name}".ljust(width) + (f" # {comment}" if comment else ""))
     return "\n".join(lines) + "\n"
 
 
@@ -296,14 +298,14 @@ def _swapped(values: NDArray[Any], which: Bools) -> NDArray[Any]:
 def record_of(schema: Schema, encoding: Encoding) -> tuple[str, str, bytes]:
     """Name, encoding and data of the schema record of a channel with rows in this encoding."""
     if encoding == CDR:
-        return ros_name(schema.name), ROS2MSG, ros_definition(schema.definition).encode()
+        return ros_name(schema.name), SchemaEncoding.ROS2, ros_definition(schema.definition).encode()
     return schema.name, PROTOBUF, schema.descriptor
 
 
-def schema_name_of(name: str, schema_encoding: str, message_encoding: str) -> str:
+def schema_name_of(name: str, schema_encoding: str, message_encoding: str, metadata: Mapping[str, str] = {}) -> str:
     """The name of the schema of a channel: mcaptrack.Tracks also for its rows as ROS messages."""
-    rows = schema_of_ros(name) if (schema_encoding, message_encoding) == (ROS2MSG, CDR) else ""
-    return rows if rows in SCHEMAS else name
+    rows = schema_of_ros(name) if (schema_encoding, message_encoding) == (SchemaEncoding.ROS2, CDR) else ""
+    return rows if schema_of_channel(rows, metadata) else name
 
 
 def reader_of(schema: Schema, message_encoding: str, definition: bytes) -> RowReader:

@@ -43,7 +43,8 @@ class Column:
     A whole number that is missing is -1, in tables, too, as ids of other columns are.
 
     ``since`` is the version that added the column, "" for those that were there from the beginning; ``group`` counts
-    the comments that say so up to it, because columns are added in groups.
+    the comments that say so up to it, because columns are added in groups. ``stated_unit`` is the unit of a column
+    with a name that doesn't say it.
     """
 
     name: str
@@ -53,10 +54,13 @@ class Column:
     doc: str
     since: str = ""
     group: int = 0
+    stated_unit: str = ""
 
     @property
     def unit(self) -> str:
-        """The unit in the suffix of the name ("px", "m", "m^2", "m/s"), "" if there is none."""
+        """The unit as it is stated, or in the suffix of the name ("px", "m", "m^2", "m/s"), "" if there is none."""
+        if self.stated_unit:
+            return self.stated_unit
         endings = [ending for ending in UNITS if self.name.endswith(f"_{ending}")]
         return UNITS[max(endings, key=len)] if endings else ""
 
@@ -96,11 +100,13 @@ class Definition:
             type_name=f".{self.name}.Row",
         )
         row = message.nested_type.add(name="Row")
-        for column in self.columns:
-            head, *tail = column.name.split("_")
+        json_names = [_json_name(column.name) for column in self.columns]
+        if len(set(json_names)) < len(json_names):  # of a_1 and a1, which protobuf refuses
+            json_names = [column.name for column in self.columns]
+        for column, json_name in zip(self.columns, json_names, strict=True):
             field = row.field.add(
                 name=column.name,
-                json_name=head + "".join(word.capitalize() for word in tail),
+                json_name=json_name,
                 number=column.number,
                 label=FieldDescriptorProto.LABEL_OPTIONAL,
                 type=FieldDescriptorProto.Type.ValueType(KINDS[column.kind][3]),
@@ -110,6 +116,12 @@ class Definition:
                 field.oneof_index = len(row.oneof_decl)
                 row.oneof_decl.add(name=f"_{column.name}")
         return files
+
+
+def _json_name(name: str) -> str:
+    """The name of a field in protobuf's JSON: x_px -> xPx."""
+    head, *tail = name.split("_")
+    return head + "".join(word.capitalize() for word in tail)
 
 
 def parse(text: str, origin: str) -> Definition:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, Self, TypeVar
@@ -14,6 +15,8 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 from mcaptrack import __version__
 from mcaptrack.notices import known_code, warn
 
+#: Halves of characters (surrogates).
+_HALVES: Final = re.compile("[\ud800-\udfff]")
 T = TypeVar("T", dict[str, Any], list[Any])
 _PREFIX: Final = "mcaptrack."
 #: ``transform`` of channels that were ingested, of views, of scenes, and of corrected ground planes.
@@ -21,6 +24,8 @@ INGEST, VIEW, FUSE, REFINE = "ingest", "view", "fuse", "calibrate"
 #: Ends of the topics of views: on pictures, and on the ground.
 VIEW_SUFFIX: Final = "/view/image"
 SCENE_SUFFIX: Final = "/view/scene"
+#: The parameter of channels that a user wrote, and may replace: the program that did.
+WRITTEN_BY: Final = "written_by"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
 #: Beginnings of older versions: their results are read, but not made again with the same parameters.
@@ -50,6 +55,7 @@ class Provenance:
     out to be. ``warnings`` are the warnings when it was made, with code and message. ``continued`` says from which
     channel of the log before its ids go on (``after``, a digest), and the largest id so far (``last_id``).
     ``output`` is the end of the topic of an output that only the class of another package has, below its main output.
+    ``columns`` are those of a schema of a user's own (see ``schema.own``).
     """
 
     transform: str
@@ -69,6 +75,12 @@ class Provenance:
     zones: Mapping[str, str] = field(default_factory=dict)
     continued: Mapping[str, str] = field(default_factory=dict)
     output: str = ""
+    columns: str = ""
+
+    @property
+    def written_by(self) -> str:
+        """The program of a user that wrote the channel with ``Recording.write``; "" for others."""
+        return str(self.parameters.get(WRITTEN_BY, "")) if self.transform == INGEST else ""
 
     @property
     def is_of_older_version(self) -> bool:
@@ -101,6 +113,7 @@ class Provenance:
             "class_id": self.class_id,
             "frame_id": self.frame_id,
             "zones": json.dumps(dict(self.zones), ensure_ascii=False),
+            "columns": self.columns,
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
             "continued": json.dumps(dict(self.continued), sort_keys=True),
@@ -143,6 +156,9 @@ def _read(text: str, kind: type[T]) -> T:
         return kind()
     try:
         value = json.loads(text)
+        if "\\ud" in text.lower():  # half a character, which no table can hold, stays as it is written
+            whole = json.dumps(value, ensure_ascii=False)
+            value = json.loads(_HALVES.sub(lambda half: f"\\\\u{ord(half[0]):x}", whole))
     except (ValueError, RecursionError):
         return kind()
     return value if isinstance(value, kind) else kind()

@@ -228,13 +228,24 @@ def cameras(opened: log.Log) -> list[Camera]:
     return _CACHE[opened]
 
 
+def has_own_rows(channel: log.Channel) -> bool:
+    """Return whether a channel has rows of a user's own schema: they may be about anything, and have no camera."""
+    return channel.schema is not None and channel.schema.is_own
+
+
 def names_by_topic(opened: log.Log) -> dict[str, str]:
-    """Return the name above the source of each channel of pictures, rows and views, without reading a message."""
-    return {
+    """Return the name above the source of each channel of pictures, rows and views, without reading a message.
+
+    Rows of a user's own schema stand by the channels of that name, if there are any.
+    """
+    own = {topic for topic, channel in opened.channels.items() if has_own_rows(channel)}
+    names = {
         topic: name_above(chain_of(opened, topic)[-1])[1:]
         for topic, channel in opened.channels.items()
         if channel.schema_name in SCHEMAS or provenance_of(opened, topic) or foreign.holds_pictures(channel)
     }
+    others = {name for topic, name in names.items() if topic not in own}
+    return {topic: name for topic, name in names.items() if name in others}
 
 
 class _Channels:
@@ -248,6 +259,8 @@ class _Channels:
         self._topics: dict[str, set[str]] = {}
         self._source: dict[str, str] = {}
         for topic, channel in opened.channels.items():
+            if has_own_rows(channel):
+                continue
             is_ours = self._provenance[topic] is not None or channel.schema_name in SCHEMAS
             if is_ours or foreign.holds_pictures(channel) or holds_boxes(opened, topic):
                 self._source[topic] = chain_of(opened, topic)[-1]
@@ -261,14 +274,17 @@ class _Channels:
         }
 
     def cameras(self) -> list[Camera]:
-        """Group names to cameras: names with labels or detections alone join the nearest camera with pictures."""
+        """Group names to cameras: those with labels, detections or what users wrote alone join the nearest camera with
+        pictures.
+        """
         labels = {
             name for name, topics in self._topics.items() if all(_is_label(self._source[topic]) for topic in topics)
         }
         joined = {name: [name] for name in self._topics}
         for name in sorted(set(self._topics) - self._with_pictures - self._in_space):
             others = self._with_pictures or (set(self._topics) - labels)
-            target = _nearest(name, others) if name in labels or self._detection_topics([name]) else None
+            is_joined = name in labels or self._detection_topics([name]) or self._are_written([name])
+            target = _nearest(name, others) if is_joined else None
             if (
                 target in joined
                 and target != name
@@ -325,6 +341,11 @@ class _Channels:
             return is_made_by_stage(channel) and channel.schema_name != CAMERA_MOTION.name
 
         return [topic for name in names for topic in self._select([name], is_result) if topic.startswith(name + "/")]
+
+    def _are_written(self, names: list[str]) -> bool:
+        """Return whether all channels below these names were written by programs of users, or are views of such."""
+        sources = {self._source[topic] for name in names for topic in self._topics[name]}
+        return all(how is not None and how.written_by for how in map(self._provenance.get, sources))
 
     def _label_topic(self, names: list[str], label: str) -> str | None:
         """Return the first topic below one of the names for a label, unless a stage made it; None if there is none."""

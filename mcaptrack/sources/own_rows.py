@@ -6,6 +6,7 @@ All are checked. Letters: N rows.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
 from operator import index as as_index
 from typing import Any, Final, Literal
 
@@ -15,17 +16,35 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.notices import warn
-from mcaptrack.schema import BOX_PX, DETECTIONS, SCORES_NEEDED, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import (
+    BOX_PX,
+    DETECTIONS,
+    EVENTS,
+    PLACE_M,
+    PREDICTIONS,
+    SCORES_NEEDED,
+    TRACKS,
+    Frame,
+    Rows,
+    Schema,
+)
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.schema.impossible import first_impossible
+from mcaptrack.sources.own_schemas import BESIDE, ColumnOfUser, of_columns
 
 BoxFormat = Literal["xyxy", "xywh"]
 #: The frame number of a frame that was not numbered; ``Recording.write`` gives it one.
 UNNUMBERED: Final = -1
 #: The largest frame number of a message.
 _LAST_INDEX: Final = 2**32 - 1
-#: Columns of tables and arrays that are not part of rows. pandas names an index that has no name so.
-_BESIDE: Final = ("t", "t_ns", "frame", "index", "row", "topic", "recording", "__index_level_0__")
+#: Values of required columns that may be left out.
+_DEFAULTS: Final[Mapping[Schema, Mapping[str, int | bool]]] = {
+    DETECTIONS: {"class_id": UNKNOWN},
+    TRACKS: {"observed": True, "source_id": -1},
+    EVENTS: {"track_id": -1, "truth_id": -1, "previous_id": -1, "source_id": -1, "frames": 0},
+}
+#: The schemas that rows are of without a word if they have their columns and no others.
+OURS: Final = (TRACKS, DETECTIONS, PREDICTIONS, EVENTS)
 #: Parameters of ``mcaptrack.detections`` by the columns that they give.
 _IN_SPACE: Final = {
     **dict.fromkeys(("x_m", "y_m", "z_m"), "positions_m"),
@@ -34,6 +53,7 @@ _IN_SPACE: Final = {
     "heading_rad": "headings_rad",
     "source_id": "source_ids",
 }
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _IN_NS: Final = "whole nanoseconds, such as `round(seconds * 1e9)`"
 
 
@@ -88,27 +108,72 @@ def columns_in_space(arrays: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
     return out
 
 
-def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[Schema, list[Frame]]:
-    """Frames of a table: rows of the same ``t_ns`` and ``frame`` are a frame."""
-    columns = {name: _unmasked(values) for name, values in columns.items()}
+def schema_of_columns(name: str, columns: Sequence[ColumnOfUser]) -> Schema:
+    """Return the schema of mcaptrack that has these columns, or else one of its own with this name.
+
+    What keeps rows with a box or a position from being detections or tracks is named in a warning.
+    """
+    names = {column.name for column in columns}
+    fitting = next((schema for schema in OURS if _fits(schema, names)), None)
+    if fitting is not None:
+        return fitting
+    schema = of_columns(name, columns)
+    parts = [group for group in (BOX_PX, PLACE_M) if names & {*group}]
+    if parts:
+        near = TRACKS if "track_id" in names else DETECTIONS
+        strange = sorted(names - {column.name for column in near.columns})
+        lacking = [column for column in parts[0] if column not in names]
+        why = f"has no column {', '.join(strange)}" if strange else f"needs {', '.join(lacking)}, too"
+        warn(f"rows are of {schema.name}, because {near.name} {why}; `schema=` says what rows are", "other")
+    return schema
+
+
+def _fits(schema: Schema, names: set[str]) -> bool:
+    """Whether a schema has all of these columns, and they are all that rows of it need."""
+    needed = {column.name for column in schema.columns if not column.optional and not column.since}
+    is_placed = schema not in (DETECTIONS, TRACKS) or _is_placed(names)
+    own = {column.name for column in schema.columns}
+    return is_placed and needed - set(_DEFAULTS.get(schema, ())) <= names <= own
+
+
+def _is_placed(names: set[str]) -> bool:
+    """Whether rows have a box or a position."""
+    return any(names.issuperset(group) for group in (BOX_PX, PLACE_M))
+
+
+def frames_of_columns(
+    columns: dict[str, Any], schema: Schema | None, name: str, about: Sequence[ColumnOfUser] = ()
+) -> tuple[Schema, list[Frame]]:
+    """Frames of a table: rows of the same ``t_ns`` and ``frame`` are a frame.
+
+    Without a schema, their columns decide; ``name`` is that of one of its own, ``about`` what is known of its columns.
+    """
+    columns = {column: _unmasked(values) for column, values in columns.items()}
     if "t_ns" not in columns:
         raise McaptrackError(f"the table has no column t_ns (times in nanoseconds); it has {', '.join(columns)}")
-    schema = schema or (TRACKS if "track_id" in columns else DETECTIONS)
+    if schema is None:
+        facts = {column.name: column for column in about}
+        given = [
+            ColumnOfUser(column, np.dtype((values.dtype, values.shape[1:])), *facts.get(column, ("", ""))[-2:])
+            for column, values in columns.items()
+            if column not in BESIDE
+        ]
+        schema = schema_of_columns(name, given)
     own = {column.name for column in schema.columns}
-    strange = sorted(set(columns) - own - set(_BESIDE))
+    strange = sorted(set(columns) - own - {*BESIDE, "index"})
     if strange:
         raise McaptrackError(f"{schema.name} has no column {', '.join(strange)}; it has {', '.join(sorted(own))}")
-    for name in ("topic", "recording"):
-        different = sorted({str(value) for value in columns.get(name, ())})
+    for beside in ("topic", "recording"):
+        different = sorted({str(value) for value in columns.get(beside, ())})
         if len(different) > 1:
             raise McaptrackError(
-                f"the table has rows of {len(different)} {name}s: {', '.join(different)}; their ids and times do not "
-                f"go together: select one {name}"
+                f"the table has rows of {len(different)} {beside}s: {', '.join(different)}; their ids and times do not "
+                f"go together: select one {beside}"
             )
     t_ns = times_of(columns["t_ns"], "the column t_ns")
     if len(t_ns):
         time_of(t_ns.min())
-    rows = _rows(schema, {name: values for name, values in columns.items() if name in own}, len(t_ns), "the table")
+    rows = _rows(schema, {column: columns[column] for column in columns if column in own}, len(t_ns), "the table")
     numbers = _numbers(columns["frame"]) if "frame" in columns else np.full(len(t_ns), UNNUMBERED)
     order = np.lexsort((numbers, t_ns))
     begins = np.flatnonzero((np.diff(t_ns[order]) != 0) | (np.diff(numbers[order]) != 0)) + 1
@@ -119,11 +184,7 @@ def frames_of_columns(columns: dict[str, Any], schema: Schema | None) -> tuple[S
 def _rows(schema: Schema, inputs: Mapping[str, Any], count: int, where: str) -> Rows:
     """Return the rows of columns; columns with a default may be left out."""
     columns = {name: _whole(values) if schema.dtype[name].kind in "iu" else values for name, values in inputs.items()}
-    if schema is TRACKS:
-        columns.setdefault("observed", np.ones(count, bool))
-        columns.setdefault("source_id", np.full(count, -1))
-    else:
-        columns.setdefault("class_id", np.zeros(count, np.uint32))
+    columns = {name: np.full(count, value) for name, value in _DEFAULTS.get(schema, {}).items()} | columns
     try:
         return schema.rows(**columns)
     except ValueError as error:
@@ -138,6 +199,8 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
         at, reason = impossible
         number = at - int(np.searchsorted(of, of[at]))
         raise McaptrackError(f"the frame at {frames[of[at]].t_ns} ns: in row {number} {reason}")
+    if schema not in (DETECTIONS, TRACKS):
+        return
     odd = (rows["score"] < 0) | (rows["score"] > 1)
     if odd.any():
         low, high = np.nanmin(rows["score"]), np.nanmax(rows["score"])
@@ -146,8 +209,28 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
 
 def time_of(t_ns: Any) -> int:
     """Return a time in whole nanoseconds. Raises McaptrackError for anything else, such as seconds."""
-    value = t_ns.astype("datetime64[ns]").astype(np.int64) if isinstance(t_ns, np.datetime64) else t_ns
+    value = nanoseconds_of(t_ns, "`t_ns=`") if isinstance(t_ns, datetime | np.datetime64) else t_ns
     return _whole_number(value, 0, LAST_NS, f"`t_ns=` needs {_IN_NS}, since 1970 from 0 to {LAST_NS}")
+
+
+def nanoseconds_of(time: Any, name: str) -> int:
+    """Return a time in whole nanoseconds since 1970, also from a timestamp. Raises McaptrackError with ``name``."""
+    value = time
+    if isinstance(time, datetime):
+        if hasattr(time, "to_datetime64"):  # of pandas, to the nanosecond
+            value = time.to_datetime64()
+        elif time.tzinfo is None:
+            raise McaptrackError(f"{name} needs a time zone, such as `datetime(..., tzinfo=UTC)`; {time} has none")
+        else:
+            value = (time - _EPOCH) // timedelta(microseconds=1) * 1000
+    if isinstance(value, np.datetime64):
+        if np.isnat(value):
+            raise McaptrackError(f"{name} needs a time, not NaT")
+        value = value.astype("datetime64[ns]").astype(np.int64)
+    try:
+        return as_index(value)
+    except TypeError:
+        raise McaptrackError(f"{name} needs {_IN_NS}, not {kind_of(time)}") from None
 
 
 def times_of(values: Any, name: str) -> Ints:
@@ -312,6 +395,8 @@ def numbered_columns(columns: Mapping[str, Any]) -> tuple[dict[str, Any], dict[i
     texts = out.pop(_NAME, None)
     if texts is None:
         return out, {}
+    if np.asarray(texts).dtype.kind in "biufc" and np.asarray(texts).size:
+        raise McaptrackError(f"the column {_NAME} holds names of classes; call a column of their numbers {_NUMBER}")
     names = [name if isinstance(name, str) and name.strip() else "" for name in np.asarray(texts).tolist()]
     if _NUMBER not in out:
         others = sorted({name for name in names if name and not is_person(name)})

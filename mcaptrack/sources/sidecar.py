@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
 
+from mcap.well_known import Profile
+
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location, Url
@@ -22,7 +24,7 @@ from mcaptrack.schema.provenance import Provenance
 #: The file beside the logs of a rosbag2 folder that counts their messages.
 METADATA: Final = "metadata.yaml"
 #: The profiles of the MCAP registry that ROS tools read, and their names in messages.
-_PROFILES: Final = {"ros1": "ROS 1", "ros2": "ROS 2"}
+_PROFILES: Final = {Profile.ROS1: "ROS 1", Profile.ROS2: "ROS 2"}
 
 
 @dataclass
@@ -120,7 +122,7 @@ def encoding_for(opened: log.Log) -> Encoding:
                 "would not be, and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
             )
     profile, library = log.header(opened)
-    is_ros1 = profile == "ros1" and not library.startswith(log.LIBRARY)
+    is_ros1 = profile == Profile.ROS1 and not library.startswith(log.LIBRARY)
     return PROTOBUF if is_ros1 else CDR
 
 

@@ -26,7 +26,9 @@ from mcaptrack.tables import text
 from mcaptrack.tables.build import (
     Pointers,
     TablePieces,
+    as_arrow,
     columns_of,
+    columns_of_arrow,
     frames_table,
     records_table,
     rows_of_topic,

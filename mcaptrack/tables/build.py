@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import Schema
-from mcaptrack.tables.fields import RECORDING, TABLES, Table
+from mcaptrack.sources.own_schemas import ColumnOfUser, facts_of
+from mcaptrack.tables.fields import RECORDING, TABLES, Table, of_rows
+
+#: Whole numbers up to this are exact as float64.
+_EXACT: Final = 2**53
 
 
 class Pointers(NamedTuple):
@@ -33,7 +37,7 @@ class Pointers(NamedTuple):
 
 def table_of(schema: Schema) -> Table:
     """The table for rows of a schema."""
-    return next(table for table in TABLES.values() if table.rows_of is schema)
+    return next((table for table in TABLES.values() if table.rows_of is schema), None) or of_rows(schema)
 
 
 def frames_table(channels: Mapping[str, Pointers], names: Sequence[str] = ()) -> Any:
@@ -114,8 +118,8 @@ def table_to_array(table: Any) -> NDArray[Any]:
     return out
 
 
-def columns_of(rows: Any) -> dict[str, NDArray[Any]]:
-    """The columns (N,) of a table of any library that speaks Arrow: pyarrow, pandas, Polars, DuckDB.
+def as_arrow(rows: Any) -> Any:
+    """A table of any library that speaks Arrow (pyarrow, pandas, Polars, DuckDB) as one of pyarrow.
 
     Raises McaptrackError for what Arrow cannot hold.
     """
@@ -127,11 +131,45 @@ def columns_of(rows: Any) -> dict[str, NDArray[Any]]:
         raise McaptrackError(f"the table cannot be read as Arrow: {' '.join(str(error).split())}") from None
     if len(set(table.column_names)) < len(table.column_names):
         raise McaptrackError(f"the table has columns of the same name: {', '.join(table.column_names)}")
-    is_decimal = {field.name: pa.types.is_decimal(field.type) for field in table.schema}
-    return {
-        name: (column.cast(pa.float64()) if is_decimal[name] else column).to_numpy()
-        for name, column in zip(table.column_names, table.columns, strict=True)
-    }
+    return table
+
+
+def columns_of(table: Any) -> dict[str, NDArray[Any]]:
+    """The columns (N,) of a table of Arrow; whole numbers of which some are missing become float64, exactly.
+
+    Raises McaptrackError if they can't, because they are too large.
+    """
+    import pyarrow as pa
+
+    out = {}
+    for field, column in zip(table.schema, table.columns, strict=True):
+        out[field.name] = (column.cast(pa.float64()) if pa.types.is_decimal(field.type) else column).to_numpy()
+        if pa.types.is_boolean(field.type) and column.null_count:
+            raise McaptrackError(
+                f"the column {field.name} has flags, and some are missing, which rows can't say: give numbers"
+            )
+        if pa.types.is_integer(field.type) and column.null_count and (np.abs(out[field.name]) > _EXACT).any():
+            raise McaptrackError(
+                f"the column {field.name} has whole numbers above 2^53, and some are missing; rows can't hold both"
+            )
+    return out
+
+
+def columns_of_arrow(schema: Any) -> list[ColumnOfUser]:
+    """The columns of a schema of Arrow, with units and descriptions; those of other types than numbers as objects."""
+    import pyarrow as pa
+
+    def dtype(kind: Any) -> Any:
+        if pa.types.is_decimal(kind):
+            return np.float64
+        is_number = pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)
+        return kind.to_pandas_dtype() if is_number else "M8[ns]" if pa.types.is_temporal(kind) else object
+
+    out = []
+    for field in pa.schema(schema):
+        texts = {key.decode(): value.decode("utf-8", "replace") for key, value in (field.metadata or {}).items()}
+        out.append(ColumnOfUser(field.name, np.dtype(dtype(field.type)), *facts_of(texts)))
+    return out
 
 
 def repeated(names: Sequence[str], counts: Sequence[int], among: Sequence[str] = ()) -> Any:

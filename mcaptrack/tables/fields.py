@@ -5,19 +5,34 @@ Columns are only ever added, and added columns may be missing, so that old files
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
-from mcaptrack.schema import SCHEMAS, Schema
+from mcaptrack.geometry.camera_path import Verdict
+from mcaptrack.schema import (
+    APPEARANCE,
+    CAMERA_MOTION,
+    DECISIONS,
+    EVENT_KINDS,
+    EVENTS,
+    SCHEMAS,
+    SIGHTINGS,
+    ZONE_COUNTS,
+    ZONE_CROSSINGS,
+    ZONE_VISITS,
+    BodyPart,
+    DecisionKind,
+    Schema,
+)
 from mcaptrack.schema.classes import has_classes
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "1.6"
+TABLE_VERSION: Final = "1.7"
 
 #: The unit of counts and ids.
 _NONE: Final = "1"
@@ -77,17 +92,24 @@ class Table:
             fields += [_with_unit(field) for field in self.rows_of.arrow]
             fields += [CLASS.arrow] if has_classes(self.rows_of) else []
             fields += [TRACK_CLASS.arrow] if self.is_of_tracks() else []
-            fields += [ZONE.arrow] if self.is_of_zones() else []
+            fields += [self.code.beside.arrow] if self.code else []
+            fields += [TRACK_TOPIC.arrow] if self.is_of_tracks() else []
         return pa.schema(fields)
+
+    @property
+    def code(self) -> Code | None:
+        """The column of its rows, besides the class, with numbers instead of names."""
+        return None if self.rows_of is None else CODES.get(self.rows_of.name)
 
     def is_of_tracks(self) -> bool:
         """Whether its rows name tracks by their ids, and so have the classes of these."""
-        of = self.rows_of
-        return of is not None and not has_classes(of) and "track_id" in {column.name for column in of.columns}
+        return "track_id" in (names := self._columns_of_ours) and "class_id" not in names
 
-    def is_of_zones(self) -> bool:
-        """Whether its rows name zones by their ids."""
-        return self.rows_of is not None and "zone_id" in {column.name for column in self.rows_of.columns}
+    @property
+    def _columns_of_ours(self) -> set[str]:
+        """The columns of its rows, if they are of a schema of mcaptrack."""
+        of = self.rows_of
+        return {column.name for column in of.columns} if of is not None and of.name in SCHEMAS else set()
 
 
 def _with_unit(field: Any) -> Any:
@@ -96,7 +118,7 @@ def _with_unit(field: Any) -> Any:
 
     metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     unit = "" if pa.types.is_boolean(field.type) else _NONE
-    return field.with_metadata({"unit": unit} | metadata)
+    return field.with_metadata({"unit": unit, "description": ""} | metadata)
 
 
 _TOPIC: Final = Field("topic", _NAME, "channel of the log that the row comes from")
@@ -117,8 +139,46 @@ TRACK_CLASS: Final = Field(
     nullable=True,
 )
 
-#: The last column of each table of rows that name zones or lines.
-ZONE: Final = Field("zone", _NAME, "name of the zone or line; null if it has none", nullable=True)
+#: The column, in the same tables, with the channel of these tracks.
+TRACK_TOPIC: Final = Field(
+    "track_topic", _NAME, "channel of the tracks that track_id names; null if the log has none", nullable=True
+)
+
+
+@dataclass(frozen=True)
+class Code:
+    """A column with numbers instead of names.
+
+    The column ``beside`` it has the ``names``; these are empty if each channel has its own.
+    """
+
+    column: str
+    beside: Field
+    names: Iterable[tuple[int, str]] = ()
+
+    @classmethod
+    def of_kinds(cls, column: str, names: Mapping[int, str]) -> Code:
+        """The code of a column that means the same in each channel."""
+        beside = Field(f"{column}_name", _NAME, f"what {column} stands for", nullable=True)
+        return cls(column, beside, tuple(names.items()))
+
+
+def _in_words(codes: Iterable[BodyPart | DecisionKind | Verdict]) -> dict[int, str]:
+    return {int(code): code.name.lower().replace("_", " ") for code in codes}
+
+
+_ZONE: Final = Code("zone_id", Field("zone", _NAME, "name of the zone or line; null if it has none", nullable=True))
+#: The codes in the rows of schemas, by name of the schema.
+CODES: Final[Mapping[str, Code]] = {
+    EVENTS.name: Code.of_kinds("kind", {int(kind): name for kind, name in EVENT_KINDS.items()}),
+    DECISIONS.name: Code.of_kinds("kind", _in_words(DecisionKind)),
+    APPEARANCE.name: Code.of_kinds("body_part", _in_words(BodyPart)),
+    CAMERA_MOTION.name: Code.of_kinds("verdict", _in_words(Verdict)),
+    SIGHTINGS.name: Code("camera", Field("camera_name", _NAME, "name of the camera", nullable=True)),
+    ZONE_VISITS.name: _ZONE,
+    ZONE_CROSSINGS.name: _ZONE,
+    ZONE_COUNTS.name: _ZONE,
+}
 
 #: The column with the name of the log; in files it is in the name of the folder.
 RECORDING: Final = Field("recording", _NAME, "the log, by name; the same in all tables")
@@ -256,6 +316,27 @@ _CHANNELS: Final = Table(
         Field("encoding", _TEXT, "encoding of its messages", nullable=True),
         Field("weights_sha256", _TEXT, "SHA-256 of the weights it was made with", nullable=True),
         Field("frame_id", _TEXT, "frame of reference of its metres, where the log has frames", nullable=True),
+        Field("camera", _TEXT, "name of the camera that it belongs to; null if it belongs to none", nullable=True),
+        Field(
+            "plugins",
+            _TEXT,
+            "classes of other packages that made it, each with its package and version, as JSON; null without",
+            nullable=True,
+        ),
+    ),
+)
+
+_WARNINGS: Final = Table(
+    "warnings",
+    "One row a warning about results in the log: what was assumed, left out or looks odd. Of several channels with the "
+    "same warning it names the first.",
+    ("camera", "code", "message"),
+    ("topic", "code", "message"),
+    (
+        Field("topic", _TEXT, "channel that it is about"),
+        Field("camera", _TEXT, "name of the camera of that channel; null if it belongs to none", nullable=True),
+        Field("code", _NAME, "what happened, for programs"),
+        Field("message", _TEXT, "what happened, for people"),
     ),
 )
 
@@ -311,7 +392,7 @@ _RECORDINGS: Final = Table(
         Field("IDF1", _FLOAT, "identity: F1 of rows under the best assignment of tracks to people", nullable=True),
         Field("HOTA", _FLOAT, "higher order tracking accuracy, mean over thresholds", nullable=True),
         Field("IDSW", _INT, "identity switches", nullable=True),
-        Field("warnings", _INT, "number of warnings that its channels carry", nullable=True),
+        Field("warnings", _INT, "number of warnings about its results", nullable=True),
         Field("warning_texts", _TEXT, "these warnings as JSON, with code and message; null without", nullable=True),
         Field("versions", _TEXT, "versions of mcaptrack that made its channels, with commas", nullable=True),
     ),
@@ -327,14 +408,16 @@ def _plural(schema: Schema) -> str:
     return name if name.endswith("s") else name + "s"
 
 
-def _of_rows(schema: Schema) -> Table:
+def of_rows(schema: Schema) -> Table:
+    """The table of rows of a schema."""
     name = _plural(schema)
-    order = ("topic", "track_id", "t_ns") if name in _BY_TRACK else ("topic", "t_ns")
+    is_by_track = schema.name in SCHEMAS and name in _BY_TRACK
+    order = ("topic", "track_id", "t_ns") if is_by_track else ("topic", "t_ns")
     return Table(name, schema.definition.doc, ("topic", "row"), order, (*TIMES, _ROW), schema)
 
 
 def _all_tables() -> Iterator[Table]:
-    yield from (_FRAMES, *(_of_rows(schema) for schema in SCHEMAS.values()), _SUMMARY, _METRICS, _CHANNELS)
+    yield from (_FRAMES, *(of_rows(schema) for schema in SCHEMAS.values()), _SUMMARY, _METRICS, _CHANNELS, _WARNINGS)
     yield _RECORDINGS  # last: its digest says that the others are complete
 
 

@@ -19,17 +19,20 @@ from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts, unique_values
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.tables.build import TablePieces, repeated, table_of, times
-from mcaptrack.tables.fields import CLASS, TABLES, TRACK_CLASS, ZONE, Table
+from mcaptrack.tables.fields import CLASS, TABLES, TRACK_CLASS, TRACK_TOPIC, Table
 
 #: The name of people where a channel names no classes.
 _PERSON: Final = "person"
 
 
 class TrackNames(NamedTuple):
-    """The names of the classes of tracks by their ids: of the tracks that rows are about, and of the ground truth."""
+    """The names of the classes of tracks by their ids: of the tracks that rows are about, and of the ground truth;
+    and the ``topic`` of the tracks that rows are about, "" if the log has none.
+    """
 
     tracks: Mapping[int, str] = {}
     truth: Mapping[int, str] = {}
+    topic: str = ""
 
 
 # The rows of a channel in the order of its table, some at a time: a channel may have more than fit into memory.
@@ -148,23 +151,24 @@ def rows_in_pieces(
     channels: Mapping[str, Sequence[Frame]],
     names: Mapping[str, Mapping[int, str]] = {},
     of_tracks: Mapping[str, TrackNames] = {},
-    zones: Mapping[str, Mapping[int, str]] = {},
+    coded: Mapping[str, Mapping[int, str]] = {},
 ) -> TablePieces:
     """All rows of channels of one schema, piece by piece, in the table's order; missing numbers are null.
 
-    ``names`` and ``zones`` are the names of classes and zones by their number, for each channel that names any;
-    ``of_tracks`` those of tracks, for each channel with rows about tracks of another one.
+    ``names`` and ``coded`` are the names of classes and of ``Table.code`` by their number, for each channel that has
+    its own; ``of_tracks`` what is known of tracks, for each channel with rows about those of another one.
     """
     import pyarrow as pa
 
     table = table_of(schema)
     members = {topic: collect(schema, frames) for topic, frames in sorted(channels.items())}
-    named = {topic: _Names.of(table, names.get(topic, {}), of_tracks.get(topic)) for topic in members}
-    named_zones = {topic: _Names(ZONE.name, (("zone_id", zones.get(topic, {})),)) for topic in members}
-    columns_of = {topic: [named[topic], *([named_zones[topic]] if table.is_of_zones() else [])] for topic in members}
+    named = {
+        topic: _names_of(table, names.get(topic, {}), of_tracks.get(topic, TrackNames()), coded.get(topic, {}))
+        for topic in members
+    }
     places: dict[str, int] = {}
     for topic, frames in members.items():
-        for column_names in columns_of[topic]:
+        for column_names in named[topic]:
             column_names.collect(schema, frames, places)
     dictionary = pa.array(list(places), pa.string())
 
@@ -173,12 +177,11 @@ def rows_in_pieces(
             for part in ordered_rows(schema, frames, "track_id" in table.order):
                 columns = _columns(schema, frames, part)
                 columns["topic"] = repeated([topic], [len(part.rows)], list(members))
-                for column_names in columns_of[topic]:
-                    if column_names.column:
-                        codes = column_names.codes(part.rows, places)
-                        columns[column_names.column] = pa.DictionaryArray.from_arrays(
-                            pa.array(codes, mask=codes < 0), dictionary
-                        )
+                for column_names in named[topic]:
+                    codes = column_names.codes(part.rows, places)
+                    columns[column_names.column] = pa.DictionaryArray.from_arrays(
+                        pa.array(codes, mask=codes < 0), dictionary
+                    )
                 yield pa.table([columns[field.name] for field in table.arrow], schema=table.arrow)
 
     return TablePieces(table.arrow, sum(int(frames.ends[-1]) for frames in members.values()), pieces)
@@ -199,27 +202,19 @@ def _columns(schema: Schema, frames: FrameColumns, part: OrderedRows) -> dict[st
 
 
 class _Names(NamedTuple):
-    """The names in a column of a channel's rows, of classes or zones: the column, and names by the values of others."""
+    """The names in a column of a channel's rows: the column, and names by the values of others.
+
+    Without others, all rows have the name ``same``, or none if it is empty.
+    """
 
     column: str
     by: tuple[tuple[str, Mapping[int, str]], ...]
-
-    @classmethod
-    def of(cls, table: Table, classes: Mapping[int, str], tracks: TrackNames | None) -> _Names:
-        """By the class of each row if it has one, or by its track; for rows without a track, by the ground truth."""
-        if table.is_of_tracks():
-            tracks = tracks or TrackNames()
-            has_truth = "truth_id" in table.arrow.names
-            return cls(
-                TRACK_CLASS.name,
-                (("track_id", tracks.tracks), *((("truth_id", tracks.truth),) if has_truth else ())),
-            )
-        if CLASS.name in table.arrow.names:
-            return cls(CLASS.name, (("class_id", {PERSON: _PERSON, **classes}),))
-        return cls("", ())
+    same: str = ""
 
     def collect(self, schema: Schema, frames: FrameColumns, places: dict[str, int]) -> None:
         """Add the names that occur to ``places``."""
+        if self.same:
+            places.setdefault(self.same, len(places))
         for column, names in self.by:
             if names:
                 for number in unique_values(schema, frames, column).tolist():
@@ -228,11 +223,31 @@ class _Names(NamedTuple):
 
     def codes(self, rows: NDArray[np.void], places: Mapping[str, int]) -> NDArray[np.int32]:
         """The places in ``places`` of the names of rows (N,); -1 for those without a name."""
+        if not self.by:
+            return np.full(len(rows), places.get(self.same, -1), np.int32)
         (column, names), *others = self.by
         out = _codes(rows[column], names, places)
         for other, of_other in others:
             out = np.where(rows[column] >= 0, out, _codes(rows[other], of_other, places))
         return out
+
+
+def _names_of(table: Table, classes: Mapping[int, str], tracks: TrackNames, coded: Mapping[int, str]) -> list[_Names]:
+    """The columns of names of a channel's rows.
+
+    The class is that of each row if it has one, or of its track; for rows without a track, of the ground truth.
+    """
+    columns = []
+    if table.is_of_tracks():
+        has_truth = "truth_id" in table.arrow.names
+        of_truth = (("truth_id", tracks.truth),) if has_truth else ()
+        columns.append(_Names(TRACK_CLASS.name, (("track_id", tracks.tracks), *of_truth)))
+        columns.append(_Names(TRACK_TOPIC.name, (), tracks.topic))
+    elif CLASS.name in table.arrow.names:
+        columns.append(_Names(CLASS.name, (("class_id", {PERSON: _PERSON, **classes}),)))
+    if table.code:
+        columns.append(_Names(table.code.beside.name, ((table.code.column, {**dict(table.code.names), **coded}),)))
+    return columns
 
 
 def _codes(numbers: NDArray[Any], names: Mapping[int, str], places: Mapping[str, int]) -> NDArray[np.int32]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mcaptrack.notices import collected
-from mcaptrack.predictors import PeopleSeen, Predictor, predict_among
+from mcaptrack.predictors import AnyPredictor, PeopleSeen, predict_among
 from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.registry.guard import Guard
 from mcaptrack.testing.transforms import LAWS, LawError, check_transform, sample_frames
@@ -22,7 +22,7 @@ __all__ = ["LAWS", "LawError", "check_predictor", "check_transform", "sample_fra
 # The laws that hold for every predictor.
 
 
-def check_predictor(predictor: Predictor, *, rotates: bool = False, seed: int = 0) -> None:
+def check_predictor(predictor: AnyPredictor, *, rotates: bool = False, seed: int = 0) -> None:
     """Check a predictor against the laws that hold for every predictor.
 
     The laws: forecasts are finite, of the declared number of steps, with symmetric covariances and variances above
@@ -32,7 +32,7 @@ def check_predictor(predictor: Predictor, *, rotates: bool = False, seed: int = 
 
     Parameters
     ----------
-    predictor : Predictor
+    predictor : AnyPredictor
         The predictor; it gets other people if it has ``uses_people``.
     rotates : bool, default False
         Also check that forecasts rotate with the positions.

@@ -20,7 +20,7 @@ from mcaptrack.registry import Entry
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.transforms.guarded import guarded
-from mcaptrack.transforms.protocol import Colour, Transform, check_options, traits_of
+from mcaptrack.transforms.protocol import Colour, Transform, check_options, latency_of, traits_of
 
 
 class LawError(AssertionError):
@@ -219,9 +219,10 @@ def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
             raise LawError(f"declares: {name}.{attribute} is no {kind.__name__}")
     if "" not in transform.writes:
         raise LawError(f"declares: {name}.writes has no main output; it needs the key ''")
-    if set(transform.latency_s) != set(transform.writes):
-        raise LawError(f"declares: {name}.latency_s is of {[*transform.latency_s]}, writes is of {[*transform.writes]}")
-    for suffix, latency_s in transform.latency_s.items():
+    latencies_s = latency_of(transform)
+    if set(latencies_s) != set(transform.writes):
+        raise LawError(f"declares: {name}.latency_s is of {[*latencies_s]}, writes is of {[*transform.writes]}")
+    for suffix, latency_s in latencies_s.items():
         if not latency_s >= 0:
             raise LawError(f"declares: {name}.latency_s of '{suffix}' is {latency_s}; it is 0 or more, in seconds")
     check_options(transform)
@@ -270,7 +271,7 @@ def causal(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     for cut in sorted({1, len(frames) // 2, len(frames) - 1} - {0}):
         prefix = list(frames[:cut])
         whole, part = _outputs(transform, frames), _outputs(transform, prefix)
-        for (suffix, latency), of_whole, of_part in zip(transform.latency_s.items(), whole, part, strict=True):
+        for (suffix, latency), of_whole, of_part in zip(latency_of(transform).items(), whole, part, strict=True):
             if latency == float("inf"):
                 continue
             certain = prefix[-1].t_ns - latency * NS_PER_S

@@ -7,9 +7,9 @@ which are imported when they are first used. ``mcaptrack.registry`` finds transf
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
+from mcaptrack import _lazily
 from mcaptrack.transforms.protocol import Transform
 from mcaptrack.transforms.stages import FULL, FUSION, STAGES, Stage
 
@@ -59,15 +59,15 @@ _ROOMS: Final = {
     "sample": ("Sample",),
     "sort": ("ByteTrack", "OcSort", "Sort"),
 }
-_ROOM_OF: Final = {name: room for room, names in _ROOMS.items() for name in names}
+_MODULES: Final = {name: f"{__name__}.{room}" for room, names in _ROOMS.items() for name in names}
 
+if not TYPE_CHECKING:  # with it a type checker would take any name for one of this package
+    _imported = _lazily(__name__, _MODULES)
 
-def __getattr__(name: str) -> Any:
-    """Import a transform when it is first used: what only asks for topics of stages loads none."""
-    if name in _ROOM_OF:
-        return getattr(import_module(f"{__name__}.{_ROOM_OF[name]}"), name)
-    if name == "TRANSFORMS":
-        return {name: stage.default for name, stage in STAGES.items()}
-    if name == "TRACKERS":
-        return {name: kind for name, kind in STAGES["track"].built_in().items() if name != "ground"}
-    raise AttributeError(f"module {__name__} has no attribute {name!r}")
+    def __getattr__(name: str) -> object:
+        """Import a transform when it is first used: what only asks for topics of stages loads none."""
+        if name == "TRANSFORMS":
+            return {name: stage.default for name, stage in STAGES.items()}
+        if name == "TRACKERS":
+            return {name: kind for name, kind in STAGES["track"].built_in().items() if name != "ground"}
+        return _imported(name)

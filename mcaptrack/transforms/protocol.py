@@ -71,17 +71,20 @@ class Transform(WithOptions, Protocol):
         Schema of each output by the suffix of its topic; "" is the main output.
     latency_s : Mapping[str, float]
         For each output, how far it depends on later input, in seconds: 0 if it is causal, infinity for the whole log.
+        A class attribute, or a property if it depends on parameters; ``latency_of`` gives it.
     """
 
+    # latency_s isn't declared: no declaration lets type checkers take both a class attribute and a property.
     reads: ClassVar[Schema]
     writes: ClassVar[Mapping[str, Schema]]
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]: ...
 
-    @property
-    def latency_s(self) -> Mapping[str, float]:
-        """For each output, how far it depends on later input, in seconds."""
-        ...
+
+def latency_of(transform: Transform) -> Mapping[str, float]:
+    """For each output of a transform, how far it depends on later input, in seconds: its ``latency_s``."""
+    latency_s: Mapping[str, float] = transform.latency_s  # type: ignore[attr-defined]
+    return latency_s
 
 
 class ModelCard(NamedTuple):

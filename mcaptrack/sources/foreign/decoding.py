@@ -18,6 +18,7 @@ from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
@@ -27,7 +28,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 Unpack = Callable[[bytes], Any]
 
 #: The supported message encodings.
-ENCODINGS: Final = ("protobuf", "json", "ros1", "cdr")
+ENCODINGS: Final = (MessageEncoding.Protobuf, MessageEncoding.JSON, MessageEncoding.ROS1, MessageEncoding.CDR)
 #: Longer definitions are refused, because parsing them takes long.
 _MAX_DEFINITION: Final = 2**20
 _ROS_NAME: Final = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)", re.ASCII)
@@ -79,11 +80,11 @@ def decoder_with_errors(
 
 def unpacker(kind: MessageType) -> Unpack:
     """A function that decodes messages of this type. Raises McaptrackError if the type is not supported."""
-    if kind.encoding == "protobuf" and kind.name.startswith("foxglove."):
+    if kind.encoding == MessageEncoding.Protobuf and kind.name.startswith("foxglove."):
         return lambda payload: foxglove.unpack(kind.name, payload)
-    if kind.encoding == "json":
+    if kind.encoding == MessageEncoding.JSON:
         return lambda payload: json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
-    if kind.encoding in ("ros1", "cdr"):
+    if kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR):
         return _ros_unpacker(kind)
     raise McaptrackError(
         f"{kind.name} in the encoding {kind.encoding or 'unknown'!r} is not read; {', '.join(ENCODINGS)} are"
@@ -92,7 +93,7 @@ def unpacker(kind: MessageType) -> Unpack:
 
 def _ros_unpacker(kind: MessageType) -> Unpack:
     store, name = ros_types(kind)
-    read = store.deserialize_ros1 if kind.encoding == "ros1" else store.deserialize_cdr
+    read = store.deserialize_ros1 if kind.encoding == MessageEncoding.ROS1 else store.deserialize_cdr
 
     def unpack(payload: bytes) -> Any:
         # A sequence can't have more members than the message has bytes; one of an empty type could be endless.
@@ -110,8 +111,9 @@ def ros_types(kind: MessageType) -> tuple[Any, str]:
     if not match:
         raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
     name = "{}/msg/{}".format(*match.groups())
+    standard = Stores.ROS1_NOETIC if kind.encoding == MessageEncoding.ROS1 else Stores.LATEST
     # Each reader sets the longest sequence of its own store; what was compiled for the type is shared.
-    return copy(_typestore(name, kind, Stores.ROS1_NOETIC if kind.encoding == "ros1" else Stores.LATEST)), name
+    return copy(_typestore(name, kind, standard)), name
 
 
 @lru_cache(maxsize=64)
@@ -215,7 +217,7 @@ def _types(name: str, kind: MessageType) -> Any:
         raise ValueError(f"it has {len(text)} characters")
     if not text.strip():
         return {}
-    if kind.schema_encoding in ("ros2idl", "omgidl"):
+    if kind.schema_encoding in (SchemaEncoding.ROS2IDL, "omgidl"):
         types: dict[str, Any] = {}
         for part in _IDL_HEAD.split(text):
             if part.strip():

@@ -9,9 +9,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from graphlib import TopologicalSorter
 from typing import Any, Final
 
 import numpy as np
+from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -48,6 +50,14 @@ def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
     return decoder_with_errors(message_type_of(opened, topic), lambda message: message)
 
 
+def recorded_decoder(kind: MessageType) -> Callable[[bytes], Any]:
+    """A function that decodes messages by their definition in the log: messages of protobuf and of ROS, dicts of JSON.
+
+    Raises McaptrackError as ``unpacker`` does; so does the returned function for malformed payloads.
+    """
+    return decoder_with_errors(kind, lambda message: message, _unpacker(kind))
+
+
 def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
     """A function that flattens a payload to a row: path of each field -> value.
 
@@ -58,9 +68,9 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
 
 
 def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
-    if kind.encoding == "json":
+    if kind.encoding == MessageEncoding.JSON:
         return json.loads
-    if kind.encoding == "protobuf":
+    if kind.encoding == MessageEncoding.Protobuf:
         return _protobuf(kind)
     return unpacker(kind)
 
@@ -74,9 +84,14 @@ def _protobuf(kind: MessageType) -> Callable[[bytes], Any]:
     try:
         if len(kind.schema) > _MAX_DESCRIPTOR:
             raise ValueError(f"it has {len(kind.schema)} bytes")
+        listed = FileDescriptorSet.FromString(kind.schema).file
+        files = {file.name: file for file in listed}
+        if len(files) < len(listed):
+            raise ValueError("it has two files of the same name")
+        imports = {name: [other for other in file.dependency if other in files] for name, file in files.items()}
         pool = DescriptorPool()
-        for file in FileDescriptorSet.FromString(kind.schema).file:
-            pool.Add(file)
+        for name in TopologicalSorter(imports).static_order():  # the order of the files in a log is free
+            pool.Add(files[name])
         message_class: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
     except Exception as error:  # a third-party parser that raises various exceptions
         why = " ".join(str(error).split())[:120] or type(error).__name__

@@ -83,8 +83,6 @@ _TABLE: Final = "recordings"
 _PREFIX: Final = "recording="
 #: Digests of so many recorded channels are kept: channels with pictures first, then by their number of messages.
 _MOST_CHANNELS: Final = 16
-#: The parameter of channels that a user has written and may replace.
-_REPLACEABLE: Final = "written_with"
 
 
 class _Owner(NamedTuple):
@@ -178,7 +176,7 @@ def _recorded(opened: log.Log) -> dict[str, str]:
     channels = []
     for channel in opened.channels.values():
         how = Provenance.from_metadata(channel.metadata)
-        if channel.messages and (how is None or (how.transform == INGEST and _REPLACEABLE not in how.parameters)):
+        if channel.messages and (how is None or (how.transform == INGEST and not how.written_by)):
             channels.append((not foreign.holds_pictures(channel), -channel.messages, channel.topic, how))
     channels.sort(key=lambda row: row[:3])
     return {
@@ -239,7 +237,8 @@ def export(
         Called with a text, the number of finished tables and their total.
     form : {"parquet", "arrow", "csv", "jsonl"}
     topics : sequence of str
-        Foreign channels that get tables of their own. Existing ones are updated, and removed if their channel is gone.
+        Foreign channels that get tables of their own, as those with rows of a user's own schema always do.
+        Existing ones are updated, and removed if their channel is gone.
     blobs : bool
         Whether these tables have fields of bytes.
     force : bool
@@ -274,13 +273,14 @@ def _write_all(job: _Job, topics: Sequence[str], blobs: bool, progress: Callable
     opened = job.contents.opened
     *names, last = TABLES
     topics_before = job.known_topics()
-    wanted = sorted({*topics, *(topic for topic in topics_before if topic in opened.channels)})
+    kept = (topic for topic in topics_before if topic in opened.channels)
+    wanted = sorted({*topics, *kept, *job.contents.own_topics()})
     total = len(TABLES) + len(wanted)
     for count, name in enumerate(names, start=1):
         job.table(name)
         progress("export", count, total)
     for count, topic in enumerate(wanted, start=len(TABLES)):
-        job.messages(topic, blobs if topic in topics else topics_before[topic])
+        job.messages(topic, blobs if topic in topics else topics_before.get(topic, False))
         progress("export", count, total)
     job.remove([topic for topic in topics_before if topic not in wanted])
     job.table(last)

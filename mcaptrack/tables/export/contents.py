@@ -9,7 +9,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.location import Location, shortened
-from mcaptrack.schema import DETECTIONS, TRACKS, Frame
+from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts
@@ -31,7 +31,7 @@ from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
 
 #: Tables about the places of messages, or about the whole log.
-_OF_THE_WHOLE: Final = ("frames", "channels", "recordings")
+_OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
 
 
 # Names of logs and channels as names of folders: they can't leave the folder, and do not collide.
@@ -103,16 +103,32 @@ def best_tracks(camera: Camera, topics: Iterable[str]) -> str | None:
     return next((name for below in _BEST if (name := f"{camera.prefix}/{below}") in available), None)
 
 
-def about_channels(opened: log.Log) -> dict[str, Any]:
-    """The warnings that the channels of a log carry, and the versions that made them."""
-    provenances = [Provenance.from_metadata(channel.metadata) for _, channel in sorted(opened.channels.items())]
-    warnings = list(dict.fromkeys((code, message) for how in provenances if how for code, message in how.warnings))
-    versions = sorted({how.version for how in provenances if how})
-    said = [{"code": code, "message": message} for code, message in warnings]
+class LogWarning(NamedTuple):
+    """A warning about results in a log: the channel, the name of its camera ("" for none), code and message."""
+
+    topic: str
+    camera: str
+    code: str
+    message: str
+
+
+def warnings_of(topic: str, camera: str, how: Provenance) -> Iterator[LogWarning]:
+    """The warnings that a channel carries, and those that follow from its parameters."""
+    yield from (LogWarning(topic, camera, code, message) for code, message in how.warnings)
+    if how.parameters.get("poor_scale") and not how.parameters.get("side_view"):
+        is_linked = how.parameters.get("retracker", "likelihood") == "likelihood" and how.parameters.get("link_s") != 0
+        done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
+        message = f"tracks were {done}: the ground plane was not measured, and the camera looks along the ground"
+        yield LogWarning(topic, camera, "held-back", message)
+
+
+def in_one_row(warnings: Sequence[LogWarning]) -> dict[str, Any]:
+    """The columns of ``recordings`` about warnings."""
+    said = dict.fromkeys((warning.code, warning.message) for warning in warnings)
+    texts = [{"code": code, "message": message} for code, message in said]
     return {
-        "warnings": len(warnings),
-        "warning_texts": json.dumps(said, ensure_ascii=False) if said else None,
-        "versions": ", ".join(versions) or None,
+        "warnings": len(texts),
+        "warning_texts": json.dumps(texts, ensure_ascii=False) if texts else None,
     }
 
 
@@ -154,10 +170,7 @@ class LogTables:
         """As ``table``, but a table with many rows comes as ``TablePieces``, which are made while they are read."""
         table = TABLES[name]
         if table.rows_of is not None:
-            channels = {topic: self._frames(topic) for topic in self.topics(name)}
-            of_tracks = {topic: self._track_names(topic) for topic in channels} if table.is_of_tracks() else {}
-            zones = {topic: self._zone_names(topic) for topic in channels} if table.is_of_zones() else {}
-            return tables.rows_in_pieces(table.rows_of, channels, self._class_names, of_tracks, zones)
+            return self._rows(table.rows_of, self.topics(name))
         makers: Mapping[str, Callable[[], Any]] = {
             "frames": self._places,
             "track_summary": lambda: tables.summary_table(
@@ -165,20 +178,35 @@ class LogTables:
             ),
             "metrics": lambda: tables.records_table(table, sorted(self._scores, key=_order_of_scores)),
             "channels": lambda: tables.records_table(
-                table, [_channel(channel) for _, channel in sorted(self.opened.channels.items())]
+                table, [_channel(channel, self._cameras) for _, channel in sorted(self.opened.channels.items())]
+            ),
+            "warnings": lambda: tables.records_table(
+                table, [warning._asdict() | {"camera": warning.camera or None} for warning in self._warnings]
             ),
             "recordings": lambda: tables.records_table(table, [self._recording()]),
         }
         return makers[name]()
 
+    def _rows(self, schema: Schema, topics: Sequence[str]) -> TablePieces:
+        """The rows of channels of a schema, with the names of their classes, tracks and zones."""
+        table, channels = tables.table_of(schema), {topic: self._frames(topic) for topic in topics}
+        of_tracks = {topic: self._track_names(topic) for topic in channels} if table.is_of_tracks() else {}
+        coded = {topic: self._code_names(topic) for topic in channels} if table.code else {}
+        return tables.rows_in_pieces(schema, channels, self._class_names, of_tracks, coded)
+
+    def own_topics(self) -> list[str]:
+        """The channels with rows of a user's own schemas: none of ``TABLES`` has them."""
+        schemas = {channel.topic: channel.schema for channel in self.opened.channels.values()}
+        return sorted(topic for topic, schema in schemas.items() if schema and schema.name not in SCHEMAS)
+
     def topics(self, name: str) -> list[str]:
         """The channels from which a table is made, in order."""
-        if name in ("channels", "recordings"):
+        if name in ("channels", "warnings", "recordings"):
             return sorted(self.opened.channels)
         if name == "frames":
             pictures = {c.topic for c in self.opened.channels.values() if foreign.holds_pictures(c)}
             of_rows = (self.topics(table.name) for table in TABLES.values() if table.rows_of is not None)
-            return sorted(pictures.union(*of_rows))
+            return sorted(pictures.union(self.own_topics(), *of_rows))
         if name == "track_summary":
             return self.topics("tracks")
         if name == "metrics":
@@ -210,6 +238,7 @@ class LogTables:
             how = Provenance.from_metadata(channel.metadata) if channel and topic not in out else None
             if how and how.transform != "view":
                 out[topic] = {"transform": how.transform, "input": how.input, "parameters": how.parameters}
+                out[topic] |= {"plugins": _plugins(how)} if how.plugins else {}
                 todo.append(how.input)
         return json.dumps(out, sort_keys=True, separators=(",", ":"))
 
@@ -228,10 +257,13 @@ class LogTables:
         return pieces.table(), left_out
 
     def message_pieces(self, topic: str, blobs: bool = False) -> tuple[TablePieces, list[str]]:
-        """The messages of any channel as a flat table in pieces, and the fields that were left out.
+        """The rows of a channel, or the messages of any other as a flat table; in pieces, and the fields left out.
 
         Raises McaptrackError, with topic and time, for messages that can't be read.
         """
+        schema = self.opened.channel(topic).schema
+        if schema is not None:
+            return self._rows(schema, [topic]), []
         places = self._pointers(topic, of_rows=False)
         kind = message_type_of(self.opened, topic)
         try:
@@ -265,11 +297,9 @@ class LogTables:
             if holds_boxes(self.opened, topic):
                 self._kept[topic] = self._boxes(topic)
                 return self._kept[topic]
-            schema = next(
-                table.rows_of
-                for table in TABLES.values()
-                if table.rows_of is not None and table.rows_of.name == self.opened.channel(topic).schema_name
-            )
+            schema = self.opened.channel(topic).schema
+            if schema is None:
+                raise KeyError(topic)
             self._kept[topic] = self.opened.frame_columns(topic, schema)
             self._class_names[topic] = class_names(self.opened.channel(topic).metadata)
         return self._kept[topic]
@@ -301,12 +331,16 @@ class LogTables:
         def names(of: str) -> dict[int, str]:
             return tables.names_by_track(self._frames(of), self._class_names.get(of, {})) if of else {}
 
-        return TrackNames(names(tracks), names(truth))
+        return TrackNames(names(tracks), names(truth), tracks)
 
-    def _zone_names(self, topic: str) -> dict[int, str]:
-        """The names of the zones that the rows of a channel are about."""
+    def _code_names(self, topic: str) -> dict[int, str]:
+        """The names, by number, of the zones or of the cameras that the rows of a channel are about."""
         how = provenance_of(self.opened, topic)
-        return {int(number): name for number, name in how.zones.items() if number.isdecimal()} if how else {}
+        if how is None:
+            return {}
+        named_cameras = how.parameters.get("cameras")
+        zones = {int(number): name for number, name in how.zones.items() if number.isdecimal()}
+        return zones or dict(enumerate(map(str, named_cameras if isinstance(named_cameras, list) else ())))
 
     def _note(self, name: str, note: str) -> None:
         self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), note])
@@ -351,6 +385,46 @@ class LogTables:
                 row |= {f"class_mean_{name}": value for name, value in row.pop("class_means", {}).items()}
                 yield row | forecasts | {"topic": result.tracks, "truth": camera.truth}
 
+    @cached_property
+    def _cameras(self) -> dict[str, str]:
+        """The name of the camera of each channel that belongs to one."""
+        return {topic: camera.prefix[1:] for camera in cameras(self.opened) for topic in camera.topics}
+
+    @cached_property
+    def _warnings(self) -> list[LogWarning]:
+        """All warnings about results, those of each channel first."""
+        found = [
+            warning
+            for topic in sorted(self.opened.channels)
+            if (how := provenance_of(self.opened, topic))
+            for warning in warnings_of(topic, self._cameras.get(topic, ""), how)
+        ]
+        found += (warning for camera in cameras(self.opened) for warning in self._warnings_of_camera(camera))
+        first = {warning[1:]: warning for warning in reversed(found)}
+        return sorted(first.values())
+
+    def _warnings_of_camera(self, camera: Camera) -> Iterator[LogWarning]:
+        """Warn of a ground plane that was not measured, and of scores that re-tracking made worse."""
+        name = camera.prefix[1:]
+        planes = self._frames(camera.ground_plane).rows() if camera.ground_plane in self.topics("ground_planes") else ()
+        origins = {_origin_of_plane(row) for row in planes}
+        if origins == {"estimated"}:
+            message = "no ground plane is known; one was estimated from boxes of people"
+            yield LogWarning(camera.ground_plane, name, "estimated-ground-plane", message)
+        elif origins and "given" not in origins:
+            message = "no ground plane is known; the scale was guessed from the heights of boxes"
+            yield LogWarning(camera.ground_plane, name, "assumed-ground-plane", message)
+        before, after = (
+            _headline([row for row in self._scores if row["topic"] == f"{camera.prefix}/{below}"])
+            for below in ("samples", "retracks")
+        )
+        if before and after and after["IDF1"] < before["IDF1"]:
+            message = (
+                f"re-tracking made it worse: IDF1 {before['IDF1']:.1%} before, {after['IDF1']:.1%} after, against "
+                f"{after['truth']}"
+            )
+            yield LogWarning(str(after["topic"]), name, "worse", message)
+
     def _recording(self) -> dict[str, Any]:
         opened = self.opened
         messages = sum(sum(part.index.counts.values()) for part in opened.parts)
@@ -386,12 +460,14 @@ class LogTables:
         """The columns that tell a log from thousands of others."""
         topics = self.topics("tracks")
         best = [topic for camera in cameras(self.opened) if (topic := best_tracks(camera, topics))]
+        versions = {how.version for topic in self.opened.channels if (how := provenance_of(self.opened, topic))}
         return {
             "location": location_of(self.opened.path),
             "cameras": len(cameras(self.opened)),
             "tracks": sum(map(self._count_tracks, best)) if best else None,
             **worst_score(best, self._scores),
-            **about_channels(self.opened),
+            **in_one_row(self._warnings),
+            "versions": ", ".join(sorted(versions)) or None,
         }
 
     def _count_tracks(self, topic: str) -> int:
@@ -412,19 +488,26 @@ def _order_of_scores(row: Mapping[str, Any]) -> tuple[Any, ...]:
     return (*(row[name] for name in TABLES["metrics"].order), row["class"] or "")
 
 
-def _channel(channel: log.Channel) -> dict[str, object]:
+def _plugins(how: Provenance) -> dict[str, dict[str, str]]:
+    """The classes of other packages that made a channel: of its transform, and of its predictor."""
+    return {part: plugin._asdict() for part, plugin in how.plugins.items()}
+
+
+def _channel(channel: log.Channel, named_cameras: Mapping[str, str]) -> dict[str, object]:
     how = Provenance.from_metadata(channel.metadata)
     out: dict[str, object] = {
         "topic": channel.topic,
         "schema": channel.schema_name or None,
         "messages": channel.messages,
         "encoding": channel.message_encoding or None,
+        "camera": named_cameras.get(channel.topic),
     }
     if how:
         names = ("transform", "input", "version", "digest", "input_digest", "weights_sha256", "frame_id")
         out |= {name: getattr(how, name) or None for name in names}
         out["parameters"] = json.dumps(how.parameters, sort_keys=True, separators=(",", ":"))
         out["compared_with"] = json.dumps(dict(how.references), sort_keys=True) if how.references else None
+        out["plugins"] = json.dumps(_plugins(how), sort_keys=True) if how.plugins else None
     return out
 
 

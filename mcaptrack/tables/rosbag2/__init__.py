@@ -27,8 +27,9 @@ from mcaptrack.foxglove.views.people import base_heights, bodies_of
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.location import Location, local_name, shortened
-from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import class_name, class_names
+from mcaptrack.schema.encodings import CDR, encoded, ros_definition, ros_name
 from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.fixed_frame import transforms_of
@@ -52,12 +53,13 @@ class WrittenBag:
 
 
 class _Stream(NamedTuple):
-    """The messages of a topic of the bag, sorted by time in ns."""
+    """The messages of a topic of the bag, sorted by time in ns; as bytes if their ``definition`` is not one of ROS."""
 
     topic: str
     kind: str
     messages: Iterator[tuple[int, Any]]
     is_latched: bool = False
+    definition: str = ""
 
 
 #: How much of a name the name of a temporary folder begins with, in bytes; files in it have longer ones.
@@ -385,6 +387,7 @@ def _write(
 ) -> None:
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import get_types_from_msg
 
     forever = QosTime(2**31 - 1, 2**32 - 1)
     latched = Qos(
@@ -396,6 +399,8 @@ def _write(
     with Writer(folder, version=_VERSION, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         pending = []
         for stream in streams:
+            if stream.definition:
+                store.register(get_types_from_msg(stream.definition, stream.kind))
             profiles = [latched] if stream.is_latched else []
             connection = writer.add_connection(
                 stream.topic, stream.kind, typestore=store, offered_qos_profiles=profiles
@@ -403,7 +408,8 @@ def _write(
             done.messages[stream.topic] = 0
             pending.append(_with(stream, connection))
         for t_ns, stream, connection, content in heapq.merge(*pending, key=lambda item: item[0]):
-            writer.write(connection, t_ns, store.serialize_cdr(content, stream.kind))
+            payload = content if stream.definition else store.serialize_cdr(content, stream.kind)
+            writer.write(connection, t_ns, payload)
             done.messages[stream.topic] += 1
             count += 1
             progress(count)
@@ -422,18 +428,21 @@ class _Job:
         self.total = 0
 
     def channels(self) -> list[tuple[str, Schema]]:
-        """The channels with rows to write."""
-        wanted = (DETECTIONS, TRACKS, PREDICTIONS)
-        channels = log.topics_with_schema(self._opened, [schema.name for schema in wanted])
+        """The channels with rows to write: detections, tracks, forecasts, and rows of a user's own."""
         return [
-            (channel.topic, SCHEMAS[channel.schema_name])
-            for channel in sorted(channels, key=lambda channel: channel.topic)
-            if channel.holds(SCHEMAS[channel.schema_name])
+            (topic, channel.schema)
+            for topic, channel in sorted(self._opened.channels.items())
+            if channel.schema is not None
+            and (channel.schema.is_own or channel.schema in (DETECTIONS, TRACKS, PREDICTIONS))
         ]
 
     def streams(self, topic: str, schema: Schema) -> list[_Stream]:
         """The topics of the bag for a channel."""
         frames = [self._checked(topic, frame) for frame in self._opened.frames(topic, schema)]
+        if schema.is_own:
+            self.total += len(frames)
+            messages = ((t_ns, payload) for t_ns, _, payload in encoded(schema, frames, CDR))
+            return [_Stream(topic, ros_name(schema.name), messages, definition=ros_definition(schema.definition))]
         metadata = self._opened.channel(topic).metadata
         names, prefix = class_names(metadata), self._prefixes.get(topic, "")
         in_metres = frame_id_of(metadata) or ground.frame_of(prefix)

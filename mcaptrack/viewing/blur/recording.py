@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from mcap.well_known import MessageEncoding
 
 from mcaptrack import __version__, foxglove, log
 from mcaptrack.errors import McaptrackError, call
@@ -143,11 +144,11 @@ def picture_replacer(kind: MessageType) -> Replace:
     Raises McaptrackError if the type is not supported; the returned function takes only payloads that have been
     decoded before.
     """
-    if kind.encoding == "protobuf" and kind.name.startswith("foxglove."):
+    if kind.encoding == MessageEncoding.Protobuf and kind.name.startswith("foxglove."):
         return lambda payload, data, word: _protobuf(kind.name, payload, data, word)
-    if kind.encoding == "json":
+    if kind.encoding == MessageEncoding.JSON:
         return _json
-    if kind.encoding in ("ros1", "cdr"):
+    if kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR):
         return _ros(kind)
     raise McaptrackError(f"{kind.name} in the encoding {kind.encoding or 'unknown'!r} is not written")
 
@@ -173,7 +174,7 @@ def _ros(kind: MessageType) -> Replace:
     store, name = ros_types(kind)
     read, write = (
         (store.deserialize_ros1, store.serialize_ros1)
-        if kind.encoding == "ros1"
+        if kind.encoding == MessageEncoding.ROS1
         else (store.deserialize_cdr, store.serialize_cdr)
     )
 

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
+from mcap.well_known import Profile
+
 from mcaptrack import log
 from mcaptrack.sources.foreign.decoding import MessageType
 
@@ -41,7 +43,7 @@ class RecordingReader:
     a log if it is a single MCAP file. ``closing`` closes its files.
     """
 
-    profile = "ros2"
+    profile = Profile.ROS2
     as_log: log.Log | None = None
     declared_counts: Mapping[Connection, int] | None = None
     #: All connections, including those without messages.

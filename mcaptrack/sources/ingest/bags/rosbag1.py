@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
+
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -42,7 +44,7 @@ class _Record(NamedTuple):
 class Bag1(RecordingReader):
     """A ROS 1 bag, open for reading."""
 
-    profile = "ros1"
+    profile = Profile.ROS1
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -255,13 +257,17 @@ def _connection(fields: Fields, published: Mapping[bytes, bytes]) -> Connection:
     topic = _text(fields.get(b"topic", b""))
     if not topic or not published.get(b"type"):
         raise _InvalidRecord("a connection has no topic or no type")
-    schema = (_text(published.get(b"type", b"")), "ros1msg", _text(published.get(b"message_definition", b"")).encode())
+    schema = (
+        _text(published.get(b"type", b"")),
+        SchemaEncoding.ROS1,
+        _text(published.get(b"message_definition", b"")).encode(),
+    )
     metadata = {
         _text(name): _text(value) for name, value in published.items() if name not in (b"type", b"message_definition")
     }
     if "latching" in metadata:  # as the ros1 profile of the MCAP registry has it
         metadata["latching"] = "true" if metadata["latching"].strip() == "1" else "false"
-    return Connection(topic, schema, "ros1", metadata)
+    return Connection(topic, schema, MessageEncoding.ROS1, metadata)
 
 
 def _text(data: bytes) -> str:

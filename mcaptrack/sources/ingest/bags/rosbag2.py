@@ -14,6 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+from mcap.well_known import MessageEncoding, SchemaEncoding
+
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
@@ -290,16 +292,16 @@ class Databases(_Files):
         return {
             kind: ((kind, encoding, text.encode()), type_hash)
             for kind, encoding, text, type_hash, *_ in rows
-            if encoding in ("ros2msg", "ros2idl") and (text or kind.endswith("/Empty"))
+            if encoding in (SchemaEncoding.ROS2, SchemaEncoding.ROS2IDL) and (text or kind.endswith("/Empty"))
         }
 
     def _schema(self, kind: str, digest: str) -> tuple[str, str, bytes]:
         """The schema record of a message type that the database does not define."""
         text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
-        return (kind, "ros2msg", text.encode()) if self._undefined[kind] else (kind, "", b"")
+        return (kind, SchemaEncoding.ROS2, text.encode()) if self._undefined[kind] else (kind, "", b"")
 
     def _is_packed(self, connection: Connection, payload: bytes) -> bool:
-        return payload.startswith(_ZSTD) and connection.encoding == "cdr"  # CDR starts with a zero byte
+        return payload.startswith(_ZSTD) and connection.encoding == MessageEncoding.CDR  # CDR starts with a zero byte
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         connections, path = self._topics[number], self.paths[number]

@@ -1,0 +1,108 @@
+"""Every public name of mcaptrack, as the script of a user has it: type checkers read it, and nobody runs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import mcaptrack
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import ByteTrack, Retrack
+
+
+def say(stage: str, done: int, total: int) -> None:
+    print(f"{stage}: {100 * done // total} %")
+
+
+def say_roughly(stage: str, done: float, total: float | None) -> None:
+    print(stage, done, total)
+
+
+def make(folder: Path) -> str:
+    drawn: mcaptrack.DemoResult = mcaptrack.demo(folder / "demo", scene="walkers", seed=1, force=True, progress=say)
+    made: mcaptrack.IngestResult = mcaptrack.ingest(
+        "video.mp4", folder / "log.mcap", fps=25, ground_plane=folder / "h.txt", classes=None
+    )
+    joined: mcaptrack.RunResult = mcaptrack.fuse(
+        made.log, cameras=["east", "west"], clock_offset_s={"east": 0.3}, progress=say
+    )
+    moved: mcaptrack.CalibrateResult = mcaptrack.calibrate(made.log, cameras=("east", "west"), dry_run=True)
+    corrections: dict[str, mcaptrack.CameraCorrection] = dict(moved.cameras)
+    network: Path = mcaptrack.get_model("yolox-nano")
+    catalogue: tuple[mcaptrack.Model, ...] = mcaptrack.models()
+    print(drawn, joined.channels, corrections, network, [model.name for model in catalogue])
+    return str(made.log)
+
+
+def compute(log: str) -> mcaptrack.RunResult:
+    steps: list[mcaptrack.RunResult] = [
+        mcaptrack.detect(log, detector="knn", progress=say_roughly),
+        mcaptrack.motion(log),
+        mcaptrack.track(log, tracker=ByteTrack(max_age_s=1.0), output="a.mcap", force=True),
+        mcaptrack.track(log, tracker="sort", max_age_s=1.0, stages={"track": ByteTrack()}),
+        mcaptrack.sample(log, rate_hz=2.5),
+        mcaptrack.predict(log, predictor="social"),
+        mcaptrack.retrack(log, retracker=Retrack(), mode="offline"),
+        mcaptrack.events(log, similarity="metres", gate_m=1.0),
+        mcaptrack.zones(log, zones={"type": "FeatureCollection", "features": []}, max_gap_s=1.0),
+    ]
+    best: mcaptrack.TuneResult = mcaptrack.tune([log], search={"min_iou": (0.1, 0.4)}, trials=2)
+    weights: mcaptrack.TrainResult = mcaptrack.train(["tracks.parquet"], "weights.safetensors", epochs=1)
+    steps.append(mcaptrack.track(log, output="tuned.mcap", **best.settings))
+    print(mcaptrack.draw_zones(log).name, weights)
+    whole: mcaptrack.RunResult = mcaptrack.run(log, tracker=ByteTrack(), class_limits=None, tables=True, progress=say)
+    people = 0 if whole.summary is None else whole.summary.tracks
+    said: tuple[mcaptrack.Notice, ...] = tuple(notice for step in (*steps, whole) for notice in step.warnings)
+    print(people, [(notice.code, notice.message) for notice in said], whole.tracks["/camera/tracks"])
+    return whole
+
+
+def read(log: str) -> None:
+    with mcaptrack.open(log) as recording:
+        opened: mcaptrack.Recording = recording
+        print(opened.name, opened.path, opened.tables, opened.topics)
+        steps = np.diff(opened.array("tracks", "/camera/tracks")["x_m"])
+        rows = opened.table("tracks").to_pylist()
+        picture: Frame = next(opened.frames("video", times=[0], colour="rgb"))
+        message: mcaptrack.FetchedMessage = opened.fetch(opened.table("frames").to_pylist()[0])
+        boxes = [(t_ns, found.xyxy) for t_ns, found in opened.supervision("detections")]
+        player: mcaptrack.Player = opened.show(end_s=1.0)
+        box: Frame = mcaptrack.detections([[10, 20, 30, 40]], [0.9], [1], picture.t_ns, box_format="xyxy")
+        opened.write("/own/detections", [box])
+        print(steps.max(), rows, message.payload, boxes, player.pictures)
+    about: mcaptrack.LogInfo = mcaptrack.info(log, frames=True)
+    channels: list[mcaptrack.ChannelInfo] = list(about.channels)
+    frames: list[mcaptrack.FrameInfo] = list(about.frames or ())
+    listed: mcaptrack.TableList = mcaptrack.list_tables(log)
+    tables: list[mcaptrack.TableInfo] = list(listed.tables)
+    columns: list[mcaptrack.ColumnInfo] = [column for table in tables for column in table.columns]
+    print(channels, frames, columns, mcaptrack.query(log, "from tracks").num_rows)
+
+
+def use(log: str) -> None:
+    scores: mcaptrack.Scores = mcaptrack.evaluate(log, similarity="metres", gate_m=1.0)
+    idf1: float = scores.score("IDF1", "retracks")
+    tables: mcaptrack.ExportResult = mcaptrack.export(log, form="parquet")
+    video: mcaptrack.RenderResult = mcaptrack.render(log, "walk.mp4", max_fps=5.0, compare=False)
+    page: mcaptrack.ReportResult = mcaptrack.report(log)
+    server: mcaptrack.LogServer = mcaptrack.view(log).start()
+    server.close()
+    print(idf1, [row["MOTA"] for row in scores.rows()], tables, video, page, server.links["Lichtblick"])
+
+
+def repair(log: str) -> None:
+    health: mcaptrack.DoctorResult = mcaptrack.doctor()
+    dropped: mcaptrack.DropResult = mcaptrack.drop(log, ["/camera/tracks"], output="less.mcap")
+    found: mcaptrack.LogCheck = mcaptrack.check(log, progress=say)
+    kept: mcaptrack.LogRecovery | None = None if found.is_sound else mcaptrack.recover(log, "sound.mcap")
+    print(health.to_json(), dropped, [finding.words for finding in found.findings], kept)
+
+
+if __name__ == "__main__":
+    try:
+        whole = compute(make(Path("out")))
+        for step in (read, use, repair):
+            step(str(whole.log))
+    except mcaptrack.McaptrackError as error:
+        raise SystemExit(str(error)) from mcaptrack.McaptrackWarning("it failed")
