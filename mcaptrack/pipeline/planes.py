@@ -367,7 +367,8 @@ def _keys(joined: JoinedFrames) -> Iterator[tuple[int, int]]:
 def _boxes(frames: Sequence[Frame], classes: Sequence[Mapping[str, str]]) -> tuple[Floats, Ints, Floats, Bools]:
     """Return the boxes of rows in pixels, the number of the frame of each, their scores, and which are of people.
 
-    ``classes`` are the names of classes by number, where channels name them: the first that do count. Boxes of unknown classes are of people if no box is said to be.
+    ``classes`` are the names of classes by number, where channels name them: the first that do count. Boxes of unknown
+    classes are of people if no box is said to be.
     """
     names = next(filter(None, classes), {})
     rows: Rows = np.concatenate([frame.rows[_BOX_COLUMNS] for frame in frames]) if frames else DETECTIONS.empty()
