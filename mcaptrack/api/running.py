@@ -19,7 +19,7 @@ from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.api.products import Products, refuse_foreign_products, write_products
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call, did_you_mean
-from mcaptrack.files import is_same_file, refuse_overwrite
+from mcaptrack.files import refuse_overwrite
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice
@@ -153,8 +153,6 @@ class Where:
             raise McaptrackError(
                 f"`sidecar={self.sidecar}` and `output=` are two places for the same results; give one"
             )
-        if is_same_file(output, path):
-            raise McaptrackError(f"{path} is both input and output; leave `output=` out to add to it in place")
         refuse_overwrite(output, self.force)
         return path, output
 

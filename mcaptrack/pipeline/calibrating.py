@@ -34,7 +34,7 @@ from mcaptrack.geometry.ground_correction import (
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace
-from mcaptrack.pipeline.fusing import Gathered, Source, compared_cameras, fusable, read_sources
+from mcaptrack.pipeline.fusing import Gathered, Source, compared_cameras, fusable, read_sources, set_back
 from mcaptrack.pipeline.staleness import digest_of
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import GROUND_PLANE, Frame
@@ -48,8 +48,6 @@ from mcaptrack.transforms.fuse import FootFuser, Places, group, means
 
 #: Cameras are compared by at most so many frames.
 _COMPARED: Final = 200
-#: The end of the reason why cameras can't be compared, if there is but one.
-_SINCE: Final = "since "
 #: The reason why a reference stays as it is.
 REFERENCE: Final = "it is the reference"
 #: How often clocks and planes are estimated in turn.
@@ -418,8 +416,6 @@ def _compared(opened: log.Log, names: Sequence[str]) -> tuple[list[Camera], dict
         )
     chosen, why = fusable(opened, wanted)
     if not chosen:
-        if not why or why.endswith(_SINCE):
-            why = f"it has {', '.join(sorted(set(names_of.values()))) or 'no camera'} alone"
         raise McaptrackError(
             f"{opened.path}: two cameras with detections and measured ground planes are compared at least: {why}"
         )
@@ -485,9 +481,7 @@ def _in_turns(
             progress(1, 1)
             break
         offset_s |= late
-        sources = [
-            source._replace(t_ns=source.t_ns - round(late.get(source.view.name, 0.0) * NS_PER_S)) for source in sources
-        ]
+        sources = set_back(sources, late)
     return refined, offset_s, {camera.name: planes[camera.name] for camera in refined if camera.model}
 
 

@@ -309,14 +309,12 @@ def read_sources(opened: log.Log, chosen: Sequence[Camera], clock_offset_s: Mapp
         frames_of[name] = frame_of_plane(opened, camera)
         view = CameraView(name=name, planes=tuple(read_planes(opened, camera.prefix) or ()))
         view = view.with_heights_in(named_frames.frames)
-        t_ns = frame_times(named_frames.frames)
-        offset_ns = round(clock_offset_s.get(name, 0.0) * NS_PER_S)
-        sources.append(Source(topic, named_frames.frames, t_ns - offset_ns, view))
+        sources.append(Source(topic, named_frames.frames, frame_times(named_frames.frames), view))
     if not sources:
         raise McaptrackError(f"{opened.path} has no detections to fuse: all channels are empty")
     if len(set(frames_of.values())) > 1:
         raise McaptrackError(f"{opened.path}: the ground planes are in different frames: {frames_in_words(frames_of)}")
-    return Detected(sources, references, classes, next(iter(frames_of.values())))
+    return Detected(set_back(sources, clock_offset_s), references, classes, next(iter(frames_of.values())))
 
 
 class Compared(NamedTuple):
@@ -327,6 +325,12 @@ class Compared(NamedTuple):
     offsets: tuple[Offset, ...]
     offset_s: dict[str, float]
     shared: Shared
+
+
+def set_back(sources: Sequence[Source], late_s: Mapping[str, float]) -> list[Source]:
+    """Take from the times of cameras how late they are."""
+    late_ns = [round(late_s.get(source.view.name, 0.0) * NS_PER_S) for source in sources]
+    return [source._replace(t_ns=source.t_ns - late) for source, late in zip(sources, late_ns, strict=True)]
 
 
 def compared_cameras(sources: list[Source], fuser: FootFuser, given_offset_s: Mapping[str, float]) -> Compared:
@@ -350,10 +354,7 @@ def compared_cameras(sources: list[Source], fuser: FootFuser, given_offset_s: Ma
             break
         # One camera at a time, the worst first, because those that are right look late beside it.
         offset_s[worst] = round(offset_s[worst] + late[worst], 3)
-        shift_ns = round(late[worst] * NS_PER_S)
-        sources = [
-            source._replace(t_ns=source.t_ns - shift_ns) if source.view.name == worst else source for source in sources
-        ]
+        sources = set_back(sources, {worst: late[worst]})
     return Compared(gathered, replace(fuser, views=views), offsets, offset_s, shared)
 
 
@@ -404,7 +405,8 @@ def fusable(opened: log.Log, names: Sequence[str] = (), scene: str = "/world") -
     frames = {camera.prefix[1:]: frame_of_plane(opened, camera) for camera in able}
     why = "; ".join(f"{name} {reason}" for name, reason in lacks.items())
     if len(frames) < 2:
-        return [], f"only {next(iter(frames))} can be fused, since {why}" if frames else why
+        only = f"only {next(iter(frames))} can be fused" if frames else ""
+        return [], ", since ".join(filter(None, (only, why))) or "it has no camera"
     if len(set(frames.values())) > 1:
         return [], f"their ground planes are in different frames, {frames_in_words(frames)}"
     return [*frames], why

@@ -192,9 +192,9 @@ def make_plane(
             parameters["refused"] = str(error)
     if uncalibrated:
         parameters[_UNCALIBRATED] = uncalibrated
-    transform = _ASSUME if plane is None else _ESTIMATE
+    transform = _ESTIMATE
     if plane is None:
-        plane = assumed_plane(seen.heights(), width, height, person_m)
+        plane, transform = assumed_plane(seen.heights(), width, height, person_m), _ASSUME
     start = frames[0].t_ns
     made = Made.of(GROUND_PLANE, [Frame(start, 0, plane_to_rows(plane))], Provenance(transform, parameters, *source))
     return [(start, plane)], made
