@@ -254,7 +254,8 @@ def test_names_go_from_detections_to_tables(tmp_path):
     with mcaptrack.open(tmp_path / "b.mcap", create=True) as back:
         for topic, rows in (("/a/tracks", table), ("/b/tracks", array), ("/c/tracks", table.to_pandas())):
             back.write(topic, rows)
-            assert json.loads(back._log.channel(topic).metadata["mcaptrack.classes"]) == {"1": "person", "7": name}
+            with log.read(tmp_path / "b.mcap") as raw:
+                assert json.loads(raw.channel(topic).metadata["mcaptrack.classes"]) == {"1": "person", "7": name}
     mcaptrack.export(path, tmp_path / "t", form="csv")
     assert "自転車" in next((tmp_path / "t").glob("tracks/*/*.csv")).read_text()
     assert mcaptrack.query(path, "select class, count(*) as n from tracks group by class").num_rows == 2

@@ -14,6 +14,7 @@ from pyarrow import feather
 from scipy.spatial.transform import Rotation
 
 import mcaptrack
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_corners, columns_to_oriented_boxes
 from mcaptrack.schema import DETECTIONS, TRACKS
@@ -40,13 +41,13 @@ def table(folder: Path, *lines: str, header: str = HEADER, name: str = "truth.cs
 def ingested(source: Path, role: str = "truth", **options):
     """The result of ``ingest``, and of the log the rows with their times, the times of frames, and the metadata."""
     result = mcaptrack.ingest(source, source.parent / "log.mcap", role=role, force=True, **options)
-    with mcaptrack.open(result.log) as log:
+    with log.read(result.log) as opened:
         topic = f"/camera/{role}"
-        frames = log._log.frames(topic, DETECTIONS if role == "detections" else TRACKS)
+        frames = opened.frames(topic, DETECTIONS if role == "detections" else TRACKS)
         return (
             result,
             join_frames(DETECTIONS if role == "detections" else TRACKS, frames),
-            log._log.channel(topic).metadata,
+            opened.channel(topic).metadata,
         )
 
 
