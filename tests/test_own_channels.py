@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
@@ -434,6 +436,26 @@ class TestWriting:
         assert str(tmp_path) not in path.read_bytes().decode("latin-1")
         out = done("info", path).out
         assert "/a  written by my_tool 1.2" in out
+
+    @pytest.mark.parametrize(
+        ("file", "module", "name"),
+        [
+            ("/home/me/tool.py", None, "tool.py"),
+            ("/venv/bin/pytest", None, f"pytest {pytest.__version__}"),
+            ("/venv/bin/own", None, "own"),
+            ("x", "pytest.__main__", f"pytest {pytest.__version__}"),
+            ("x", "my_tool.cli", "my_tool.cli"),
+            (None, None, "Python"),
+        ],
+    )
+    def test_the_running_program_is_the_writer(self, tmp_path, monkeypatch, file, module, name):
+        main = SimpleNamespace(__spec__=module and SimpleNamespace(name=module), __file__=file)
+        monkeypatch.setitem(sys.modules, "__main__", main)
+        monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/a", cars())
+        (channel,) = mcaptrack.info(tmp_path / "a.mcap").channels
+        assert channel.written_by == name
 
     def test_rows_about_anything_make_no_camera_and_run_goes_on(self, tmp_path):
         path = tmp_path / "a.mcap"

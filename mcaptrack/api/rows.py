@@ -361,16 +361,23 @@ def _of_frames(
     """The schema and the frames of their members; adds the names of classes that they give to ``names``."""
     frames = [_frame(item, schema, names) for item in members]
     if schema is None:
-        layouts = {frame.rows.dtype for frame in [frame for frame in frames if len(frame.rows)] or frames}
-        fitting = [kind for kind in OURS if layouts and all(kind.has_columns(layout.names) for layout in layouts)]
-        if not fitting and (len(layouts) != 1 or not next(iter(layouts)).names):
-            raise McaptrackError(
-                "it is not clear whether these are detections or tracks; all frames have to be of one kind, and "
-                "without frames the topic has to end in detections or tracks, or `schema=` says what they are"
-            )
-        schema = fitting[0] if fitting else schema_of_columns(own_name, columns_of_dtype(layouts.pop()))
+        schema = _schema_of_frames(frames, own_name)
         frames = [frame if len(frame.rows) else frame._replace(rows=schema.empty()) for frame in frames]
     return schema, [_checked(schema, frame) for frame in frames]
+
+
+def _schema_of_frames(frames: Sequence[Frame], own_name: str) -> Schema:
+    """The schema of frames by the columns of their rows, of which those of empty frames count only if all are empty."""
+    layouts = {frame.rows.dtype for frame in [frame for frame in frames if len(frame.rows)] or frames}
+    fitting = [kind for kind in OURS if layouts and all(kind.has_columns(layout.names) for layout in layouts)]
+    if fitting:
+        return fitting[0]
+    if len(layouts) != 1 or not next(iter(layouts)).names:
+        raise McaptrackError(
+            "it is not clear whether these are detections or tracks; all frames have to be of one kind, and without "
+            "frames the topic has to end in detections or tracks, or `schema=` says what they are"
+        )
+    return schema_of_columns(own_name, columns_of_dtype(layouts.pop()))
 
 
 def _checked(schema: Schema, frame: Frame) -> Frame:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -21,7 +19,7 @@ from mcaptrack.foxglove import views
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.location import Location
 from mcaptrack.pipeline.write import Made, RunState, write
-from mcaptrack.registry import distribution_of, entry_points, package_of
+from mcaptrack.registry import running_program
 from mcaptrack.schema import DETECTIONS, EVENTS, GROUND_PLANE, PREDICTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import has_classes
 from mcaptrack.schema.own import columns_in_metadata, name_for
@@ -74,6 +72,7 @@ def write_rows(
         names = {str(number): class_name for number, class_name in sorted((names_in_rows | names_by_number).items())}
         if names_by_number and not has_classes(schema):
             raise McaptrackError(f"`classes=` names classes of rows, and {schema.name} has no column class_id")
+        _refuse_other_columns(opened, name, schema)
         _refuse_to_replace(opened, name, schema, replace)
         detail(f"{name}: rows of {schema.name}, with {', '.join(map(_described, schema.columns))}")
         planes = pipeline.read_planes(opened, prefix) or ()
@@ -122,26 +121,15 @@ def _write_undrawn(opened: logs.Log, name: str, channel: Made) -> None:
 
 
 def _program(by: str | None) -> str:
-    """Return the name of the program that writes: as it is given, or that of the running one, without its place."""
-    if by is not None:
-        if not isinstance(by, str) or not by.strip() or not by.isprintable() or len(by) > _LONGEST_NAME:
-            raise McaptrackError(
-                f"`by=` is the name of a program, such as 'my_tool 1.2', of at most {_LONGEST_NAME} characters, not "
-                f"{by!r:.60}"
-            )
-        return by
-    main = sys.modules.get("__main__")
-    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
-    if spec is not None:
-        module = spec.name.removesuffix(".__main__")
-        return " ".join(filter(None, distribution_of(module))) or module
-    if not file:
-        return "a notebook" if "ipykernel" in sys.modules else "Python"
-    script = Path(file)
-    points = entry_points("console_scripts") if not script.suffix else []
-    package = next((package_of(point) for point in points if point.name == script.name), ())
-    plain = "".join(character if character.isprintable() else "?" for character in script.name)[:_LONGEST_NAME]
-    return " ".join(filter(None, package)) or plain
+    """Return the name of the program that writes: as it is given, or that of the running one."""
+    if by is None:
+        return running_program()[:_LONGEST_NAME]
+    if not isinstance(by, str) or not by.strip() or not by.isprintable() or len(by) > _LONGEST_NAME:
+        raise McaptrackError(
+            f"`by=` is the name of a program, such as 'my_tool 1.2', of at most {_LONGEST_NAME} characters, not "
+            f"{by!r:.60}"
+        )
+    return by
 
 
 def _schema_of(name: str, schema: Schema | None) -> Schema | None:
@@ -177,16 +165,22 @@ def _topic(opened: logs.Log, topic: str) -> str:
     return name
 
 
+def _refuse_other_columns(opened: logs.Log, name: str, schema: Schema) -> None:
+    """Raise McaptrackError if another channel has other columns of a user's own schema: its name stands for one set."""
+    if not schema.is_own:
+        return
+    columns = columns_in_metadata(schema)
+    for channel in opened.channels.values():
+        is_other = channel.topic != name and channel.schema_name == schema.name
+        if is_other and (channel.schema is None or columns_in_metadata(channel.schema) != columns):
+            raise McaptrackError(
+                f"{opened.path}: {channel.topic} has other columns of {schema.name}; give this schema another name, as "
+                "in `schema=mcaptrack.schema_of(name, columns)`"
+            )
+
+
 def _refuse_to_replace(opened: logs.Log, name: str, schema: Schema, replace: bool) -> None:
     """Raise McaptrackError if there is a channel of this name that has to stay."""
-    alike = (c for c in opened.channels.values() if c.topic != name and schema.is_own and c.schema_name == schema.name)
-    columns = columns_in_metadata(schema)
-    other = next((c.topic for c in alike if c.schema is None or columns_in_metadata(c.schema) != columns), None)
-    if other is not None:
-        raise McaptrackError(
-            f"{opened.path}: {other} has other columns of {schema.name}; give this schema another name, as in "
-            "`schema=mcaptrack.schema_of(name, columns)`"
-        )
     channel = opened.channels.get(name)
     if channel is None:
         return

@@ -154,6 +154,22 @@ def package_of(point: EntryPoint) -> tuple[str, str]:
     return _name_and_version(point.dist)
 
 
+def running_program() -> str:
+    """The program that runs, without its place: its distribution with the version, or else the name of its script."""
+    main = sys.modules.get("__main__")
+    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+    if spec is not None:
+        module = str(spec.name).removesuffix(".__main__")
+        return " ".join(filter(None, distribution_of(module))) or module
+    if not file:
+        return "a notebook" if "ipykernel" in sys.modules else "Python"
+    script = Path(file)
+    points = [] if script.suffix else entry_points("console_scripts")
+    package = next((package_of(point) for point in points if point.name == script.name), ())
+    plain = "".join(character if character.isprintable() else "?" for character in script.name)
+    return " ".join(filter(None, package)) or plain
+
+
 def _places() -> tuple[tuple[str, int], ...]:
     """The folders of ``sys.path`` and when each last changed: they tell whether something was installed."""
     return tuple((place, _changed_ns(place)) for place in sys.path)
