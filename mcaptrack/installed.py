@@ -61,6 +61,26 @@ def distribution_of(module: str) -> tuple[str, str]:
     return (names[0], metadata.version(names[0])) if names else ("", "")
 
 
+def running_program() -> str:
+    """The program that runs, without its place: its package with the version, or else the name of its script."""
+    from importlib import metadata
+
+    main = sys.modules.get("__main__")
+    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
+    if spec is not None:
+        module = str(spec.name).removesuffix(".__main__")
+        return " ".join(filter(None, distribution_of(module))) or module
+    if not file:
+        return "a notebook" if "ipykernel" in sys.modules else "Python"
+    script = Path(file)
+    try:
+        points = () if script.suffix else metadata.entry_points(group="console_scripts", name=script.name)
+        package = next((f"{point.dist.name} {point.dist.version}" for point in points if point.dist), "")
+    except Exception:  # metadata of another package that can't be read
+        package = ""
+    return package or "".join(character if character.isprintable() else "?" for character in script.name)
+
+
 def _places() -> tuple[tuple[str, int], ...]:
     """The folders of ``sys.path`` and when each last changed: they tell whether something was installed."""
     return tuple((place, _changed_ns(place)) for place in sys.path)

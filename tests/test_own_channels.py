@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.own import columns_in_metadata
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import cameras as cameras_of
 from tests.bags import T0
 from tests.commands import done
 from tests.test_ros_in_place import check_whole, drive, raw
@@ -435,6 +437,26 @@ class TestWriting:
         out = done("info", path).out
         assert "/a  written by my_tool 1.2" in out
 
+    @pytest.mark.parametrize(
+        ("file", "module", "name"),
+        [
+            ("/home/me/tool.py", None, "tool.py"),
+            ("/venv/bin/pytest", None, f"pytest {pytest.__version__}"),
+            ("/venv/bin/own", None, "own"),
+            ("x", "pytest.__main__", f"pytest {pytest.__version__}"),
+            ("x", "my_tool.cli", "my_tool.cli"),
+            (None, None, "Python"),
+        ],
+    )
+    def test_the_running_program_is_the_writer(self, tmp_path, monkeypatch, file, module, name):
+        main = SimpleNamespace(__spec__=module and SimpleNamespace(name=module), __file__=file)
+        monkeypatch.setitem(sys.modules, "__main__", main)
+        monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/a", cars())
+        (channel,) = mcaptrack.info(tmp_path / "a.mcap").channels
+        assert channel.written_by == name
+
     def test_rows_about_anything_make_no_camera_and_run_goes_on(self, tmp_path):
         path = tmp_path / "a.mcap"
         write_clip(tmp_path / "clip.mp4", frames=20)
@@ -444,10 +466,10 @@ class TestWriting:
             opened.write("/camera/speed", cars())
             opened.write("/own/events", cars(kind=[5, 6], track_id=[1, 1]))
             own = {topic: opened.array(topic).tobytes() for topic in ("/gps/speed", "/camera/speed")}
-        with warnings.catch_warnings():
-            warnings.filterwarnings("error", ".*several", mcaptrack.McaptrackWarning)
-            assert "track" in mcaptrack.run(path).stages
-            assert mcaptrack.run(path).stages == ()
+        assert "track" in mcaptrack.run(path).stages
+        assert mcaptrack.run(path).stages == ()
+        with log.read(path) as opened:
+            assert [camera.names for camera in cameras_of(opened)] == [("/camera", "/own")]
         cameras = {channel.topic: channel.camera for channel in mcaptrack.info(path).channels}
         assert (cameras["/camera/speed"], cameras["/gps/speed"]) == ("camera", None)
         assert mcaptrack.check(path).findings == ()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +16,7 @@ from mcaptrack.api.rows import frames_of
 from mcaptrack.api.running import warn_stale
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes, plane_at
-from mcaptrack.installed import distribution_of
+from mcaptrack.installed import running_program
 from mcaptrack.location import Location
 from mcaptrack.pipeline.views import WITH_VIEWS, make_views
 from mcaptrack.pipeline.write import Made, RunState, write
@@ -71,6 +69,7 @@ def write_rows(
         names = {str(number): class_name for number, class_name in sorted((names_in_rows | names_by_number).items())}
         if names_by_number and not has_classes(schema):
             raise McaptrackError(f"`classes=` names classes of rows, and {schema.name} has no column class_id")
+        _refuse_other_columns(opened, name, schema)
         _refuse_to_replace(opened, name, schema, replace)
         detail(f"{name}: rows of {schema.name}, with {', '.join(map(_described, schema.columns))}")
         planes = pipeline.read_planes(opened, prefix) or ()
@@ -104,33 +103,15 @@ def _described(column: Column) -> str:
 
 
 def _program(by: str | None) -> str:
-    """Return the name of the program that writes: as it is given, or that of the running one, without its place."""
+    """Return the name of the program that writes: as it is given, or that of the running one."""
     if by is None:
-        return _running_program()
+        return running_program()[:_LONGEST_NAME]
     if not isinstance(by, str) or not by.strip() or not by.isprintable() or len(by) > _LONGEST_NAME:
         raise McaptrackError(
             f"`by=` is the name of a program, such as 'my_tool 1.2', of at most {_LONGEST_NAME} characters, not "
             f"{by!r:.60}"
         )
     return by
-
-
-def _running_program() -> str:
-    """Return the name of the running program, with the version of its package."""
-    from importlib import metadata
-
-    main = sys.modules.get("__main__")
-    spec, file = getattr(main, "__spec__", None), getattr(main, "__file__", None)
-    if spec is not None:
-        module = spec.name.removesuffix(".__main__")
-        return " ".join(filter(None, distribution_of(module))) or module
-    if not file:
-        return "a notebook" if "ipykernel" in sys.modules else "Python"
-    script = Path(file)
-    points = [] if script.suffix else metadata.entry_points(group="console_scripts", name=script.name)
-    package = next(((point.dist.name, point.dist.version) for point in points if point.dist), ())
-    plain = "".join(character if character.isprintable() else "?" for character in script.name)[:_LONGEST_NAME]
-    return " ".join(filter(None, package)) or plain
 
 
 def _schema_of(name: str, schema: Schema | None) -> Schema | None:
@@ -171,16 +152,22 @@ def _is_reserved(opened: logs.Log, name: str) -> bool:
     return is_beside or name.endswith(tuple(f"/{end}" for end in USUAL if end not in _HOLDS))
 
 
+def _refuse_other_columns(opened: logs.Log, name: str, schema: Schema) -> None:
+    """Raise McaptrackError if another channel has other columns of a user's own schema: its name stands for one set."""
+    if not schema.is_own:
+        return
+    columns = columns_in_metadata(schema)
+    for channel in opened.channels.values():
+        is_other = channel.topic != name and channel.schema_name == schema.name
+        if is_other and (channel.schema is None or columns_in_metadata(channel.schema) != columns):
+            raise McaptrackError(
+                f"{opened.path}: {channel.topic} has other columns of {schema.name}; give this schema another name, as "
+                "in `schema=mcaptrack.schema_of(name, columns)`"
+            )
+
+
 def _refuse_to_replace(opened: logs.Log, name: str, schema: Schema, replace: bool) -> None:
     """Raise McaptrackError if there is a channel of this name that has to stay."""
-    alike = (c for c in opened.channels.values() if c.topic != name and schema.is_own and c.schema_name == schema.name)
-    columns = columns_in_metadata(schema)
-    other = next((c.topic for c in alike if c.schema is None or columns_in_metadata(c.schema) != columns), None)
-    if other is not None:
-        raise McaptrackError(
-            f"{opened.path}: {other} has other columns of {schema.name}; give this schema another name, as in "
-            "`schema=mcaptrack.schema_of(name, columns)`"
-        )
     channel = opened.channels.get(name)
     if channel is None:
         return

@@ -81,24 +81,27 @@ def own_schema(name: str, columns: Iterable[OwnColumn]) -> Schema:
         raise McaptrackError(f"{whole} has {len(listed)} columns beside the time; a schema has 1 to {_MOST_COLUMNS}")
     names = [column.name for column in listed]
     for column in listed:
-        where = f"{whole}.{column.name}"
-        if column.name in RESERVED:
-            raise McaptrackError(
-                f"{where} is a column that tables have beside those of rows; rename it, or leave it out"
-            )
-        if not _COLUMN.fullmatch(column.name) or len(column.name) > _LONGEST:
-            raise McaptrackError(
-                f"{column.name!r:.60} can't name a column of {whole}; names have lower-case letters, digits and single "
-                "underscores, and begin with a letter: rename it"
-            )
+        _check(whole, column)
         if names.count(column.name) > 1:
             raise McaptrackError(f"{whole} has two columns {column.name}; rename one")
-        for what, text in (("unit", column.unit), ("description", column.doc)):
-            if not isinstance(text, str) or (text and not text.isprintable()) or len(text) > _LONGEST:
-                raise McaptrackError(
-                    f"the {what} of {where} is printable text of at most {_LONGEST} characters, not {text!r:.60}"
-                )
     return _schema(Definition(whole, _DOC, tuple(map(_column, listed, range(1, len(listed) + 1)))))
+
+
+def _check(schema: str, column: OwnColumn) -> None:
+    """Raise McaptrackError if a column of a schema has a name, a unit or a description that can't be one."""
+    where = f"{schema}.{column.name}"
+    if column.name in RESERVED:
+        raise McaptrackError(f"{where} is a column that tables have beside those of rows; rename it, or leave it out")
+    if not _COLUMN.fullmatch(column.name) or len(column.name) > _LONGEST:
+        raise McaptrackError(
+            f"{column.name!r:.60} can't name a column of {schema}; names have lower-case letters, digits and single "
+            "underscores, and begin with a letter: rename it"
+        )
+    for what, text in (("unit", column.unit), ("description", column.doc)):
+        if not isinstance(text, str) or (text and not text.isprintable()) or len(text) > _LONGEST:
+            raise McaptrackError(
+                f"the {what} of {where} is printable text of at most {_LONGEST} characters, not {text!r:.60}"
+            )
 
 
 def _column(own: OwnColumn, number: int) -> Column:

@@ -151,25 +151,12 @@ def frames_of_columns(
     columns = {column: _unmasked(values) for column, values in columns.items()}
     if "t_ns" not in columns:
         raise McaptrackError(f"the table has no column t_ns (times in nanoseconds); it has {', '.join(columns)}")
-    if schema is None:
-        facts = {column.name: column for column in about}
-        given = [
-            ColumnOfUser(column, np.dtype((values.dtype, values.shape[1:])), *facts.get(column, ("", ""))[-2:])
-            for column, values in columns.items()
-            if column not in BESIDE
-        ]
-        schema = schema_of_columns(name, given)
+    schema = schema or schema_of_columns(name, _described(columns, about))
     own = {column.name for column in schema.columns}
     strange = sorted(set(columns) - own - {*BESIDE, "index"})
     if strange:
         raise McaptrackError(f"{schema.name} has no column {', '.join(strange)}; it has {', '.join(sorted(own))}")
-    for beside in ("topic", "recording"):
-        different = sorted({str(value) for value in columns.get(beside, ())})
-        if len(different) > 1:
-            raise McaptrackError(
-                f"the table has rows of {len(different)} {beside}s: {', '.join(different)}; their ids and times do not "
-                f"go together: select one {beside}"
-            )
+    _refuse_several(columns)
     t_ns = times_of(columns["t_ns"], "the column t_ns")
     if len(t_ns):
         time_of(t_ns.min())
@@ -179,6 +166,27 @@ def frames_of_columns(
     begins = np.flatnonzero((np.diff(t_ns[order]) != 0) | (np.diff(numbers[order]) != 0)) + 1
     parts = np.split(order, begins) if len(order) else []
     return schema, [Frame(int(t_ns[part[0]]), int(numbers[part[0]]), rows[part]) for part in parts]
+
+
+def _described(columns: Mapping[str, Any], about: Sequence[ColumnOfUser]) -> list[ColumnOfUser]:
+    """The columns of rows, with what is known about them."""
+    facts = {column.name: (column.unit, column.doc) for column in about}
+    return [
+        ColumnOfUser(name, np.dtype((values.dtype, values.shape[1:])), *facts.get(name, ("", "")))
+        for name, values in columns.items()
+        if name not in BESIDE
+    ]
+
+
+def _refuse_several(columns: Mapping[str, Any]) -> None:
+    """Raise McaptrackError if a table has rows of several channels or logs."""
+    for name in ("topic", "recording"):
+        different = sorted({str(value) for value in columns.get(name, ())})
+        if len(different) > 1:
+            raise McaptrackError(
+                f"the table has rows of {len(different)} {name}s: {', '.join(different)}; their ids and times do not "
+                f"go together: select one {name}"
+            )
 
 
 def _rows(schema: Schema, inputs: Mapping[str, Any], count: int, where: str) -> Rows:

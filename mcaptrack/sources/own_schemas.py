@@ -66,15 +66,7 @@ def derived(
     """Return a schema of its own; see ``mcaptrack.schema_of``."""
     columns = [column for column in listed if column.name not in BESIDE]
     names = [column.name for column in columns]
-    facts: list[dict[str, str]] = []
-    for parameter, texts in (("units", units), ("doc", doc)):
-        if not isinstance(texts or {}, Mapping):
-            raise McaptrackError(f"`{parameter}=` is a mapping of columns to texts, not {texts!r:.60}")
-        strange = sorted(str(column) for column in texts or () if column not in names)
-        if strange:
-            raise McaptrackError(f"`{parameter}=` has {', '.join(strange)}, and the columns are {', '.join(names)}")
-        facts.append(dict(texts or {}))
-    units_of, docs_of = facts
+    units_of, docs_of = _by_column("units", units, names), _by_column("doc", doc, names)
     return of_columns(
         name,
         [
@@ -82,6 +74,14 @@ def derived(
             for column in columns
         ],
     )
+
+
+def _by_column(parameter: str, texts: Mapping[str, str] | None, names: Sequence[str]) -> Mapping[str, str]:
+    """The texts of columns. Raises McaptrackError if there is no such column."""
+    strange = sorted(str(column) for column in texts or () if column not in names)
+    if strange:
+        raise McaptrackError(f"`{parameter}=` has {', '.join(strange)}, and the columns are {', '.join(names)}")
+    return texts or {}
 
 
 def of_columns(name: str, columns: Iterable[ColumnOfUser]) -> Schema:
