@@ -27,7 +27,7 @@ _PARTS = {
     "running": ["RunResult"],
     "scoring": ["Scores", "evaluate"],
     "reading": ["FetchedMessage"],
-    "stages": ["detect", "motion", "predict", "retrack", "sample", "track"],
+    "stages": ["detect", "motion", "predict", "retrack", "sample", "stage", "track"],
     "training": ["train"],
     "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],

@@ -45,6 +45,7 @@ from mcaptrack.api.stages import motion as motion
 from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack
 from mcaptrack.api.stages import sample as sample
+from mcaptrack.api.stages import stage as stage
 from mcaptrack.api.stages import track as track
 from mcaptrack.api.training import train as train
 from mcaptrack.api.tuning import TuneResult as TuneResult
@@ -127,6 +128,7 @@ __all__ = [
     "run",
     "sample",
     "schema_of",
+    "stage",
     "track",
     "train",
     "tune",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated, Literal
 
@@ -14,6 +14,8 @@ from mcaptrack.api.options import (
     Force,
     Frame,
     Output,
+    PathLike,
+    Progress,
     Reports,
     Sidecar,
     To,
@@ -25,7 +27,7 @@ from mcaptrack.api.options import (
 )
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import Transform
+from mcaptrack.transforms import STAGES, Transform
 
 # Run a stage that reads pictures: detect, motion.
 
@@ -395,3 +397,98 @@ def retrack(
     return run_stage(
         "retrack", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, mode=mode, views=views
     )
+
+
+def stage(
+    name: str,
+    log: PathLike,
+    *,
+    topic: str | None = None,
+    to: str | None = None,
+    camera: str | None = None,
+    output: PathLike | None = None,
+    sidecar: bool | None = None,
+    force: bool = False,
+    stages: Mapping[str, str | Transform] | None = None,
+    progress: Progress = no_progress,
+    **options: Value,
+) -> mcaptrack.RunResult:
+    """Run a stage by its name: one of an installed package, or of mcaptrack.
+
+    Parameters
+    ----------
+    name : str
+        Its name, as that of the command.
+    log : path
+        The log, or its URL.
+    topic, to, camera, output, sidecar, force, stages, progress
+        As for ``track``.
+    **options
+        Parameters of its transform.
+
+    Returns
+    -------
+    RunResult
+        What was made.
+
+    Raises
+    ------
+    McaptrackError
+        If there is no such stage, if the log cannot be read or written, or for an option that does not exist.
+
+    Examples
+    --------
+    >>> import mcaptrack
+    >>> mcaptrack.stage("sample", "log.mcap", output="samples.mcap").channels
+    ('/camera/samples',)
+
+    """
+    from mcaptrack.api.running import run_stage, transform_of
+    from mcaptrack.registry import find
+
+    if name not in STAGES:
+        find("stage", name)  # which says what there is
+    chosen = transform_of(name, None, options)
+    return run_stage(name, chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
+
+
+def declaration_of(name: str) -> Callable[..., mcaptrack.RunResult]:
+    """Return the declaration of the command of a stage of another package, whose class says what it does."""
+    own = STAGES[name]
+
+    def command(
+        log: EachLog,
+        *,
+        topic: Topic = None,
+        to: To = None,
+        camera: Camera = None,
+        output: Output = None,
+        sidecar: Sidecar = None,
+        force: Force = False,
+        stages: Stages = None,
+        progress: Reports = no_progress,
+        **options: Value,
+    ) -> mcaptrack.RunResult:
+        return stage(
+            name, log, topic=topic, to=to, camera=camera, output=output, sidecar=sidecar, force=force, stages=stages,
+            progress=progress, **options,
+        )  # fmt: skip
+
+    summary = (own.default.__doc__ or "").strip().partition("\n\n")[0]
+    reads, writes = f"/camera/{own.input_topic}", f"/camera/{own.output_topic}"
+    command.__doc__ = f"""{summary or f"Run the stage {name}."}
+
+    Reads {reads}, writes {writes}. A stage of {" ".join(own.package)}.
+
+    Parameters
+    ----------
+    **options
+        Options of the stage.
+
+    Returns
+    -------
+    RunResult
+        What was made.
+    """
+    command.__name__ = name
+    return declared()(command)

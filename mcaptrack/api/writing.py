@@ -77,8 +77,7 @@ def write_rows(
             opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
         )
         own_frame = frame_id or (_FRAME if _is_in_space(schema, frames) else "")
-        columns = columns_in_metadata(schema)
-        how = Provenance(INGEST, {WRITTEN_BY: program}, classes=names, frame_id=own_frame, columns=columns)
+        how = Provenance(INGEST, {WRITTEN_BY: program}, classes=names, frame_id=own_frame)
         channel = Made.of(schema, frames, how)
         state = RunState(opened, prefix, {name: channel})
         write(state, None, make_views(state, planes) if schema in WITH_VIEWS else None)

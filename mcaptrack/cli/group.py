@@ -124,16 +124,36 @@ class OfPackage(Listed):
         return class_of(self.name)
 
 
-def of_packages() -> dict[str, OfPackage]:
-    """The commands of installed packages by name. Imports none of them.
+class StageOfPackage(OfPackage):
+    """The command of a stage of an installed package."""
+
+    @property
+    def summary(self) -> str:
+        """Its line in the help: the package."""
+        return f"A stage of {self.place}."
+
+    @property
+    def command(self) -> Any:
+        """The class of the command."""
+        from mcaptrack.cli.stages import StageCommand
+
+        return StageCommand
+
+
+def of_packages() -> dict[str, Listed]:
+    """The commands of installed packages by name, and those of their stages. Imports none of them.
 
     Those with a name of ours, or one that is no word, are left out.
     """
     from mcaptrack.installed import entry_points
 
-    points = sorted(entry_points("mcaptrack.commands"), key=lambda point: point.name)
-    named = {point.name: " ".join(point.package).strip() or point.value for point in points}
-    return {name: OfPackage(name, _OF_PACKAGES, place) for name, place in named.items() if _is_free(name)}
+    out: dict[str, Listed] = {}
+    for group, kind in (("mcaptrack.commands", OfPackage), ("mcaptrack.stages", StageOfPackage)):
+        for point in sorted(entry_points(group), key=lambda point: point.name):
+            if _is_free(point.name):
+                place = " ".join(point.package).strip() or point.value
+                out.setdefault(point.name, kind(point.name, _OF_PACKAGES, place))
+    return out
 
 
 def _is_free(name: str) -> bool:

@@ -49,6 +49,15 @@ class StageCommand(RunsStages):
         self.kinds = kinds
         self._transform: Transform | None = None
 
+    @classmethod
+    def declaration(cls, name: str) -> Callable[..., RunResult]:
+        """Return the function that declares the command: that of a package's stage is made from its class."""
+        if not any(STAGES[name].package):
+            return super().declaration(name)
+        from mcaptrack.api.stages import declaration_of
+
+        return declaration_of(name)
+
     @property
     def function(self) -> Callable[..., RunResult]:
         """The function, with the transform that ``arguments`` has made."""

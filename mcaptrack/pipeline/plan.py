@@ -264,6 +264,11 @@ class _Planner:
         if provenance is None or provenance.transform not in STAGES:
             if usual in self.sources and topic != self.sources[usual]:
                 raise McaptrackError(self._not_made(usual, topic))
+            if provenance and "transform" in provenance.plugins and is_stale(self.opened, topic):
+                plugin = provenance.plugins["transform"]
+                package = f"{plugin.distribution} {plugin.version}".strip() or "the package that has it"
+                why = f"the stage {provenance.transform} made it, which is not installed; install {package}"
+                warn(f"{topic} is out of date and stays as it is: {why}", "out-of-date")
             return False  # no stage makes recorded and ingested channels
         return self._make_again(provenance, provenance.transform, topic)
 

@@ -139,6 +139,9 @@ def _class_of(
     if users is not None and stage.entry(type(users)).implementation == plugin.implementation:
         _compare_versions(stage.entry(type(users)), plugin)
         return type(users)
+    if stage.kind is None and any(stage.package):
+        own: type[Transform] = _installed("stage", plugin, find).cls
+        return own
     if stage.kind is None:
         raise MissingPluginError(
             f"{_name_with_package(stage.name, plugin)} made it; run it again from Python, with that class"

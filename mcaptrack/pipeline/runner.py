@@ -318,7 +318,8 @@ def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     outdated = []
     for topic, channel in sorted(opened.channels.items()):
         provenance = Provenance.from_metadata(channel.metadata)
-        if topic not in digests and provenance and provenance.transform in {*STAGES, *FINISHING, FUSE}:
+        is_result = provenance and (provenance.transform in STAGES or provenance.transform in (*FINISHING, FUSE))
+        if topic not in digests and provenance and is_result:
             is_late = any(digests.get(name, then) != then for name, then in provenance.made_from().items())
             outdated += [topic] if is_late else []
     return outdated

@@ -16,6 +16,7 @@ from mcaptrack.schema.classes import class_names, classes_beside_rows, has_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import frame_numbers, joined_parts
+from mcaptrack.schema.own import columns_in_metadata
 from mcaptrack.schema.provenance import VIEW, Provenance, digest
 from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.sidecar import check_topics, encoding_for
@@ -39,7 +40,7 @@ class Made(NamedTuple):
 
     @classmethod
     def of(cls, schema: Schema, frames: Sequence[Frame], provenance: Provenance) -> Made:
-        """Check the rows of frames against the schema, and put classes and digest of the messages into the provenance.
+        """Check the rows of frames against the schema, and put classes, own columns and the digest into the provenance.
 
         ``provenance`` has the names of classes for schemas with classes.
         """
@@ -48,7 +49,8 @@ class Made(NamedTuple):
             schema.check(joined.rows)
         names = provenance.classes if has_classes(schema) else {}
         only = only_class(schema, frames)
-        provenance = replace(provenance, classes=names, class_id=str(only) if only else "")
+        facts = {"class_id": str(only) if only else "", "columns": columns_in_metadata(schema)}
+        provenance = replace(provenance, classes=names, **facts)
         channel = cls(schema, frames, provenance)
         beside = classes_beside_rows(provenance.class_id, names)
         return channel._replace(provenance=replace(provenance, digest=digest(channel.messages(), beside)))

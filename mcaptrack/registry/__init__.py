@@ -39,7 +39,16 @@ from mcaptrack.installed import Point, declared, distribution_of, entry_points
 from mcaptrack.registry.guard import Guard, contained_import
 
 Kind = Literal[
-    "detector", "tracker", "predictor", "retracker", "fuser", "label_format", "message_reader", "exporter", "command"
+    "detector",
+    "tracker",
+    "predictor",
+    "retracker",
+    "fuser",
+    "stage",
+    "label_format",
+    "message_reader",
+    "exporter",
+    "command",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
@@ -55,7 +64,7 @@ _COMMANDS: Final = (
     "evaluate events zones calibrate tune train check recover drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("message_reader", "command")
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -88,6 +97,15 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         },
         "fuser": {
             "feet": "mcaptrack.transforms.fuse:FootFuser",
+        },
+        # The default transform of each; mcaptrack.transforms.stages says the rest.
+        "stage": {
+            "detect": "mcaptrack.transforms.detect.median:MedianDetector",
+            "motion": "mcaptrack.transforms.motion:EstimateMotion",
+            "track": "mcaptrack.transforms.sort:Sort",
+            "sample": "mcaptrack.transforms.sample:Sample",
+            "predict": "mcaptrack.transforms.predict:Predict",
+            "retrack": "mcaptrack.transforms.retrack:Retrack",
         },
         "label_format": {
             "mot": f"{_LABELS}.formats:read_mot",

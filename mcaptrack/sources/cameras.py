@@ -229,8 +229,11 @@ def cameras(opened: log.Log) -> list[Camera]:
 
 
 def has_own_rows(channel: log.Channel) -> bool:
-    """Return whether a channel has rows of a user's own schema: they may be about anything, and have no camera."""
-    return channel.schema is not None and channel.schema.is_own
+    """Return whether a channel has rows of a user's own schema: they may be about anything, and have no camera.
+
+    Those that a stage made belong to the camera of what they were made of.
+    """
+    return channel.schema is not None and channel.schema.is_own and not input_of(channel.metadata)
 
 
 def names_by_topic(opened: log.Log) -> dict[str, str]:

@@ -7,16 +7,16 @@ To add a stage: its transform, and a ``Stage`` in ``STAGES``. To add a transform
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from pkgutil import resolve_name
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, others
 from mcaptrack.schema import (
     APPEARANCE,
     CAMERA_MOTION,
@@ -56,8 +56,6 @@ class Stage:
         The schema of its input.
     writes : Mapping[str, Schema]
         The schemas of its outputs, by the last part of their topics; "" for the main one.
-    place : str
-        Module and class of its default transform, as in ``mcaptrack.transforms.sort:Sort``.
     input_topic, output_topic : str
         Topics below the name of a camera, as in ``tracks``: what it reads, and its main output.
     rows : str
@@ -88,12 +86,13 @@ class Stage:
         Outputs to write, by the name of the mode; empty for all.
     beside : tuple[str, ...]
         Outputs that are made wherever the main one is, also again in logs that lack them.
+    package : tuple[str, str]
+        Name and version of the installed package whose stage it is; ("", "") for those of mcaptrack.
     """
 
     name: str
     reads: Schema
     writes: Mapping[str, Schema]
-    place: str
     input_topic: str
     output_topic: str
     rows: str
@@ -108,11 +107,13 @@ class Stage:
     profiles_place: str = ""
     modes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     beside: tuple[str, ...] = ()
+    package: tuple[str, str] = ("", "")
 
     @cached_property
     def default(self) -> type[Transform]:
         """Its default transform."""
-        cls: type[Transform] = resolve_name(self.place)
+        entry = find(self.kind, next(iter(BUILT_IN[self.kind]))) if self.kind else find("stage", self.name)
+        cls: type[Transform] = entry.cls
         return cls
 
     @cached_property
@@ -157,7 +158,7 @@ class Stage:
     def entry(self, cls: type[Transform]) -> Entry:
         """The entry of a class of transforms of this stage."""
         if self.kind is None and _base(cls) is self.default:
-            return Entry(self.name, self.name, cls, cls.__module__, "", "")
+            return Entry(self.name, "stage", cls, cls.__module__, *self.package)
         return entry_of(self.kind or self.name, cls)
 
     def choose(self, name: str) -> type[Transform]:
@@ -187,7 +188,7 @@ class Stage:
         """Whether a class is a built-in transform of this stage. Only those of its name are imported."""
         base = _base(cls)
         if self.kind is None:
-            return base is self.default
+            return base is self.default and not any(self.package)
         names = (name for name, where in BUILT_IN[self.kind].items() if where.endswith(f":{base.__qualname__}"))
         return any(find(self.kind, name).cls is base for name in names)
 
@@ -235,11 +236,7 @@ class Stage:
     def _check(self, entry: Entry) -> None:
         """Raise McaptrackError if a class of another package can't be a transform of this stage."""
         cls, wanted = entry.cls, self
-        if not inspect.isclass(cls) or not is_dataclass(cls):
-            raise McaptrackError(
-                f"{entry} is no dataclass; the fields of a transform are its parameters: write "
-                "@dataclass(frozen=True, kw_only=True) above the class"
-            )
+        check_class(entry)
         reads, writes = getattr(cls, "reads", None), getattr(cls, "writes", None)
         if reads is not wanted.reads:
             is_schema = getattr(reads, "name", "")
@@ -254,15 +251,13 @@ class Stage:
                 f"{entry} writes {getattr(main, 'name', '') or 'nothing (the class attribute writes)'}; a {entry.kind} "
                 f"writes {wanted.writes[''].name} as its main output, as in writes = {{'': ...}}"
             )
+        _check_suffixes(entry, outputs)
         for suffix, schema in outputs.items():
-            is_name = isinstance(suffix, str) and (not suffix or suffix.isidentifier())
-            if not is_name or schema not in SCHEMAS.values():
+            if schema not in SCHEMAS.values():
                 raise McaptrackError(
                     f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
                     "writes = {'': TRACKS, 'debug': DETECTIONS}"
                 )
-            if suffix in RESERVED:
-                raise McaptrackError(f"{entry} has an output {suffix!r}, which is a name of what is made of results")
             if schema is not wanted.writes.get(suffix, schema):
                 raise McaptrackError(
                     f"{entry} has an output {suffix!r} of {schema.name}; that of a {entry.kind} has "
@@ -271,14 +266,36 @@ class Stage:
         for suffix, schema in wanted.writes.items():
             if self.kind == "fuser" and outputs.get(suffix) is not schema:
                 raise McaptrackError(f"{entry} has no output {suffix!r}; a fuser also writes which boxes it joined")
-        if "__call__" not in dir(cls):
-            raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
         if any(field.name == self.kind for field in fields(cls)):
             raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
-        if problem := trait_problem(cls):
-            raise McaptrackError(f"{entry} {problem}")
-        if problem := option_problem(cls):
-            raise McaptrackError(f"{entry}: {problem}")
+
+
+def check_class(entry: Entry) -> None:
+    """Raise McaptrackError if a class of another package can't be a transform."""
+    cls = entry.cls
+    if not inspect.isclass(cls) or not is_dataclass(cls):
+        raise McaptrackError(
+            f"{entry} is no dataclass; the fields of a transform are its parameters: write "
+            "@dataclass(frozen=True, kw_only=True) above the class"
+        )
+    if "__call__" not in dir(cls):
+        raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
+    if problem := trait_problem(cls):
+        raise McaptrackError(f"{entry} {problem}")
+    if problem := option_problem(cls):
+        raise McaptrackError(f"{entry}: {problem}")
+
+
+def _check_suffixes(entry: Entry, outputs: Mapping[Any, object]) -> None:
+    """Raise McaptrackError if an output can't have its name, the last part of its topic."""
+    for suffix, schema in outputs.items():
+        if not isinstance(suffix, str) or not (not suffix or suffix.isidentifier()):
+            raise McaptrackError(
+                f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
+                "writes = {'': TRACKS, 'debug': DETECTIONS}"
+            )
+        if suffix in RESERVED:
+            raise McaptrackError(f"{entry} has an output {suffix!r}, which is a name of what is made of results")
 
 
 def _base(cls: type[Transform]) -> type[Transform]:
@@ -290,7 +307,6 @@ def _base(cls: type[Transform]) -> type[Transform]:
 _STAGES: Final = (
     Stage(
         name="detect",
-        place="mcaptrack.transforms.detect.median:MedianDetector",
         kind="detector",
         reads=VIDEO,
         writes={"": DETECTIONS},
@@ -300,7 +316,6 @@ _STAGES: Final = (
     ),
     Stage(
         name="motion",
-        place="mcaptrack.transforms.motion:EstimateMotion",
         reads=VIDEO,
         writes={"": CAMERA_MOTION},
         input_topic="video",
@@ -310,7 +325,6 @@ _STAGES: Final = (
     ),
     Stage(
         name="track",
-        place="mcaptrack.transforms.sort:Sort",
         kind="tracker",
         reads=DETECTIONS,
         writes={"": TRACKS},
@@ -322,7 +336,6 @@ _STAGES: Final = (
     ),
     Stage(
         name="sample",
-        place="mcaptrack.transforms.sample:Sample",
         reads=TRACKS,
         writes={"": TRACKS},
         input_topic="tracks",
@@ -333,7 +346,6 @@ _STAGES: Final = (
     ),
     Stage(
         name="predict",
-        place="mcaptrack.transforms.predict:Predict",
         reads=TRACKS,
         writes={"": PREDICTIONS},
         input_topic="samples",
@@ -346,7 +358,6 @@ _STAGES: Final = (
     ),
     Stage(
         name="retrack",
-        place="mcaptrack.transforms.retrack:Retrack",
         kind="retracker",
         reads=TRACKS,
         writes={
@@ -369,13 +380,75 @@ _STAGES: Final = (
         beside=("decisions", "appearance"),
     ),
 )
-#: All stages by name, in the order in which they run.
-STAGES: Final[Mapping[str, Stage]] = MappingProxyType({stage.name: stage for stage in _STAGES})
+
+
+class Stages(Mapping[str, Stage]):
+    """All stages by name: iteration gives those of mcaptrack, in the order in which they run.
+
+    Those of installed packages are found by name only, because this imports them: they are run if they are named, and
+    again where a log has what they made.
+    """
+
+    def __init__(self, built_in: Sequence[Stage]) -> None:
+        self._built_in = {stage.name: stage for stage in built_in}
+        self._of_packages: dict[type[Transform], Stage] = {}
+
+    def __getitem__(self, name: str) -> Stage:
+        if name in self._built_in:
+            return self._built_in[name]
+        if name not in self:
+            raise KeyError(name)
+        entry = find("stage", name)
+        if entry.cls not in self._of_packages:
+            self._of_packages[entry.cls] = _of_package(entry)
+        return self._of_packages[entry.cls]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._built_in or (name not in _NO_STAGES and name in others("stage"))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._built_in)
+
+    def __len__(self) -> int:
+        return len(self._built_in)
+
+
+def _of_package(entry: Entry) -> Stage:
+    """The stage of an installed package, which a class of transforms declares. Raises McaptrackError if it can't."""
+    cls = entry.cls
+    check_class(entry)
+    declared = {name: getattr(cls, name) for name in _DECLARED if hasattr(cls, name)}
+    reads, outputs = (
+        getattr(cls, "reads", None),
+        dict(cls.writes) if isinstance(getattr(cls, "writes", 0), Mapping) else {},
+    )
+    if not isinstance(reads, Schema) or not isinstance(outputs.get(""), Schema):
+        raise McaptrackError(f"{entry} needs the schemas that it reads and writes, as in writes = {{'': TRACKS}}")
+    _check_suffixes(entry, outputs)
+    topics = {name: declared.pop(name, None) for name in ("input_topic", "output_topic")}
+    for name, topic in topics.items():
+        if not isinstance(topic, str) or not topic.strip("/") or not topic.isprintable():
+            raise McaptrackError(
+                f"{entry} has {name} = {topic!r}; it is a topic below the name of a camera, as in 'tracks'"
+            )
+    for name, steps in (("before", get_args(StepBefore)), ("after", get_args(StepAfter))):
+        if unknown := sorted({*map(str, declared.get(name, ()))} - {*steps}):
+            raise McaptrackError(f"{entry} has {name} = {', '.join(unknown)}; there are {', '.join(steps)}")
+    rows = str(declared.pop("rows", "rows"))
+    package = (entry.distribution, entry.version)
+    return Stage(name=entry.name, reads=reads, writes=outputs, rows=rows, package=package, **topics, **declared)
+
+
+#: Names in the provenance of channels that no stage makes.
+_NO_STAGES: Final = frozenset({"ingest", "view", "fuse", "calibrate", *FINISHING})
+#: What a class of another package declares of its stage.
+_DECLARED: Final = ("input_topic", "output_topic", "rows", "before", "after", "also_reads")
+#: All stages by name (see ``Stages``).
+STAGES: Final = Stages(_STAGES)
 
 #: The fusion of several cameras: not a stage of one camera, but its transforms are found and checked like those of one.
 FUSION: Final = Stage(
     name="fuse",
-    place="mcaptrack.transforms.fuse:FootFuser",
     kind="fuser",
     reads=SIGHTINGS,
     writes={"": DETECTIONS, "sightings": SIGHTINGS},
