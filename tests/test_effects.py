@@ -24,6 +24,7 @@ from typing import NamedTuple
 import pytest
 
 from mcaptrack import log
+from mcaptrack.cli.group import Commands
 from mcaptrack.cli.many import NAMES
 from mcaptrack.sources import demo
 from mcaptrack.transforms import STAGES
@@ -59,7 +60,7 @@ def parameters(command: str) -> set[str]:
 
 
 def test_every_option_has_a_case():
-    for command, known in GROUP.commands.items():
+    for command, known in Commands().items():
         if command == "train":  # needs torch: see test_training
             continue
         options = set(known.settings)

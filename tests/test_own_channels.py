@@ -42,6 +42,11 @@ BESIDE = ("t", "t_ns", "frame", "row", "topic", "recording", "class", "zone")
 NAMES = st.sampled_from(ODD) | st.from_regex(r"[a-z][a-z0-9]{0,4}(_[a-z0-9]{1,3}){0,2}", fullmatch=True)
 
 
+def channel_of(recording: mcaptrack.Recording, topic: str) -> log.Channel:
+    with recording._now() as opened:
+        return opened.channel(topic)
+
+
 @st.composite
 def tables(draw) -> np.ndarray:
     """Structured arrays of any columns that rows can hold, with times in any order."""
@@ -135,7 +140,7 @@ class TestRoundTrip:
                 without_text = again if isinstance(again, list) else _without_class(again)
                 opened.write(f"/again/a{number}", without_text, schema=schema)
             for topic in ("/a", "/again/a0", "/again/a1", "/again/a2"):
-                channel = opened._there.channel(topic)
+                channel = channel_of(opened, topic)
                 digests.add(channel.metadata["mcaptrack.digest"])
                 assert channel.schema is schema
         assert len(digests) == 1
@@ -247,7 +252,7 @@ class TestSchemas:
         path = ros_recording(tmp_path / "a.mcap")
         with mcaptrack.open(path) as opened:
             opened.write("/gps", [Fix(1, 2.0), Fix(3, 4.0, 5.0)], sidecar=encoding == "protobuf")
-            assert opened._there.channel("/gps").message_encoding == encoding
+            assert channel_of(opened, "/gps").message_encoding == encoding
             table = opened.table("/gps")
         facts = {f.name: (f.metadata[b"unit"], f.metadata[b"description"]) for f in table.schema}
         assert (facts["lon"], facts["speed_m_per_s"][0]) == ((b"deg", b"east of Greenwich"), b"m/s")
@@ -295,7 +300,7 @@ class TestSchemas:
                 channel = writer.add_channel("/a", record, "protobuf", {"mcaptrack.columns": spoiled})
                 writer.add_message(channel, 5, 0, good.codec.encode(row))
             with mcaptrack.open(path) as opened:
-                assert opened._there.channel("/a").schema is None
+                assert channel_of(opened, "/a").schema is None
                 assert opened.table("/a").num_rows == 1  # of flattened messages
 
 
@@ -353,7 +358,7 @@ class TestWriting:
         ):
             with mcaptrack.open(tmp_path / f"{schema.name}.mcap", create=True) as opened:
                 opened.write("/my/rows", cars(**columns))
-                assert opened._there.channel("/my/rows").schema is schema
+                assert channel_of(opened, "/my/rows").schema is schema
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
             near = cars(track_id=[1, 2], x_m=[1.0, 2.0], y_m=[0.0, 0.0], gait=[1.0, 2.0])
             with pytest.warns(
@@ -489,9 +494,9 @@ class TestWriting:
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
             for topic, rows, frame_id in (("/a/tracks", flat, ""), ("/b/tracks", solid, "map")):
                 opened.write(topic, rows)
-                assert opened._there.channel(topic).metadata.get("mcaptrack.frame_id", "") == frame_id
+                assert channel_of(opened, topic).metadata.get("mcaptrack.frame_id", "") == frame_id
             opened.write("/b/tracks", solid, frame_id="odom", replace=True)
-            assert opened._there.channel("/b/tracks").metadata["mcaptrack.frame_id"] == "odom"
+            assert channel_of(opened, "/b/tracks").metadata["mcaptrack.frame_id"] == "odom"
 
     def test_names_of_classes_are_kept(self, tmp_path):
         rows = pa.table({"t_ns": [0, 1], "wheels": [4, 2], "class": ["car", "bicycle"]})
@@ -551,7 +556,7 @@ class TestOwnForecasts:
             for schema in SCHEMAS.values():
                 topic = f"/mine/{schema.name.rpartition('.')[2].lower()}x"
                 assert opened.write(topic, [Frame(5, 0, schema.empty())], schema=schema) == 1
-                assert opened._there.channel(topic).schema is schema
+                assert channel_of(opened, topic).schema is schema
 
     @pytest.mark.parametrize("above", ["/camera", "/own"])
     @pytest.mark.parametrize("off_m", [0.0, 5.0])

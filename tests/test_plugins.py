@@ -440,7 +440,7 @@ def test_the_help_lists_the_options_of_the_one_that_is_named(place, monkeypatch)
         ("predict --predictor spread --sigma-m 0", 1, "--sigma-m has to be from 0.1 to 1000000, not 0"),
         ("predict --predictor spread --shift west", 2, "invalid value for '--shift'"),
         ("predict --predictor cv --sigma-m 1", 2, "no such option: --sigma-m"),
-        ("predict --predictor spread --predictor cv --sigma-m 1", 1, "--sigma-m is an option of spread, not of cv"),
+        ("predict --predictor spread --predictor cv", 2, "--predictor is given as spread and as cv; give one"),
         ("predict --predictor nearest", 1, "no predictor is called nearest"),
     ],
 )  # fmt: skip

@@ -185,7 +185,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
-    "api/running.py:change:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
+    "api/running.py:products:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
     "cli/train.py:show:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),
@@ -195,6 +195,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/viewing.py:_report:report": lambda s: s.with_an_old_report().says("view", "LOG"),
     "viewing/report/figures.py:identity_events:view": Scene.page,
     "api/viewing.py:_say_trouble:ingest": lambda s: s.says("view", "LOG"),
+    "api/viewing.py:view:run": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says("view", "LOG"),
     "api/viewing.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
         "evaluate", "LOG", "--truth", "truth.txt"
@@ -223,7 +224,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG", "--no-tables", "--zones", str(zones_file(Path()))
     ),
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
-    "pipeline/runner.py:warn_findings:retrack": Scene.side_view,
+    "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
@@ -342,7 +343,7 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, reques
     verb = {"list_tables": "query", "get_model": "models"}.get(verb, verb)
     if verb == "models" or where.startswith("cli/models"):
         stocked(monkeypatch, tmp_path)
-    if where == "api/running.py:change:export":
+    if where == "api/running.py:products:export":
         store = Store()
         request.addfinalizer(store.stop)
         only_in(monkeypatch, store)

@@ -207,7 +207,7 @@ def tracked(tmp_path_factory) -> Path:
     inner["relative_file_paths"].append("drive/drive_1.mcap")
     (folder / "metadata.yaml").write_text(json.dumps(info))  # which is YAML, too
     (folder / "before.yaml").write_bytes((folder / "metadata.yaml").read_bytes())
-    done("track", path, "--topic", "/lidar/boxes", "--in-place")
+    done("track", path, "--views", "--topic", "/lidar/boxes", "--in-place")
     return path
 
 

@@ -260,12 +260,8 @@ def ingest(
     from mcaptrack.sources.ingest import ingest as make_log
     from mcaptrack.sources.ingest.labels.content import WantedClasses
     from mcaptrack.sources.ingest.labels.delimited import parse_columns
-    from mcaptrack.sources.ingest.labels.of_packages import format_of_package
 
-    if into is not None and output is not None:
-        raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
-    if into is None and sidecar is not None:
-        raise McaptrackError(f"`sidecar={sidecar}` needs a log to add to; name it with `into=`")
+    _check_places(output, into, sidecar)
     path, labels = as_path(source), {"detections": detections, "tracks": tracks, "truth": truth}
     options = IngestOptions(
         camera=camera,
@@ -293,7 +289,6 @@ def ingest(
     )
     make = partial(make_log, path, options=options, progress=progress)
     with warnings_about(path) as warnings:
-        format_of_package(label_format)  # refused before anything is read
         if into is None:
             target = default_log(path) if output is None else log_output(output, path)
             refuse_overwrite(target, force or is_same_file(target, path))
@@ -303,6 +298,14 @@ def ingest(
             report = _add_to(target, sidecar, partial(make, force=force))
         changes = _changes(target, report) if role == "corrections" else None
     return IngestResult.of(target, report, warnings, changes)
+
+
+def _check_places(output: PathLike | None, into: PathLike | None, sidecar: bool | None) -> None:
+    """Raise McaptrackError for places of a result that don't go together."""
+    if into is not None and output is not None:
+        raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
+    if into is None and sidecar is not None:
+        raise McaptrackError(f"`sidecar={sidecar}` needs a log to add to; name it with `into=`")
 
 
 def _add_to(log: Path, sidecar: bool | None, make: Callable[..., IngestReport]) -> IngestReport:

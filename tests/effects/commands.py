@@ -70,7 +70,7 @@ CASES: dict[str, dict[str, Case]] = {
         size=("ingest yolo --fps 10", "--size 640x480"),
         classes=("ingest kinds.csv --fps 10 --as tracks", "--classes person,cart"),
         frame=("ingest cubes.csv --as tracks", "--frame odom"),
-        scene=("ingest nuscenes --as tracks --scene a", "--scene b"),
+        scene=("ingest nuscenes --as tracks", "--scene b"),
         first_frame=("ingest truth.txt --fps 10", "--first-frame 0"),
         frames=("ingest truth.txt --fps 10", "--frames 500"),
         **{"as": ("ingest truth.txt --fps 10", "--as truth")},

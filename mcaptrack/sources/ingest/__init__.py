@@ -214,6 +214,7 @@ def ingest(
     McaptrackError
         If a part of the input can't be understood; then nothing is written.
     """
+    format_of_package(options.label_format)  # refused before anything is read
     if not re.fullmatch(r"[A-Za-z0-9_\-/]+", options.camera) or options.camera.strip("/") == "":
         raise McaptrackError(f"a camera's name is made of letters, digits, _, - and /, not {options.camera!r}")
     if not source.exists():

@@ -200,9 +200,10 @@ def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow
     if len(full_topics) == 1 and full_topics[0] in opened.channels and holds_pictures(opened.channels[full_topics[0]]):
         return ToShow([], full_topics[0], opened.times(full_topics[0]))
     without = [topic for topic in full_topics if not _has_view(opened, topic)]
-    if without:
-        for topic in full_topics:
+    for topic in full_topics:
+        if without or (topic in opened.channels and "/view/" not in topic):
             _schema_of(opened, topic)
+    if without:
         return _drawn_now(opened, prefix, full_topics)
     try:
         shown = pipeline.find_views(opened, prefix, full_topics)
