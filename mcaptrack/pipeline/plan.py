@@ -348,6 +348,8 @@ class _Planner:
         had = provenance.input or self.source_of(stage)
         source = self.sources.get(stage, had)
         changed = [self.ensure(used) for used in (source, *provenance.references)]
+        if not any(changed) and source == had and self._is_kept(provenance, stage, topic):
+            return False
         before, why_not = self._before(stage, provenance)
         if isinstance(why_not, OlderVersionError):
             return self._replace_older(provenance, stage, topic)
@@ -378,6 +380,19 @@ class _Planner:
         self._notes += filter(None, [self._reason(result, transform, is_due)])
         self.add(Job(stage, transform, source, main, self._kept(result, transform), frame_id=self.frame_id))
         return True
+
+    def _is_kept(self, provenance: Provenance, stage: str, topic: str) -> bool:
+        """Return whether nobody asks for anything else than a channel of the log, which is up to date.
+
+        Then the transform that made it need not be made again, nor imported.
+        """
+        is_asked = self.force or self.shared or self.frame_id or stage in self.defaults or topic in self.renewed
+        if is_asked or provenance.is_of_older_version or provenance.plugins or topic not in self.opened.channels:
+            return False
+        is_usual = main_topic(self.opened, stage, topic) == f"{self.prefix}/{STAGES[stage].output_topic}"
+        is_projected = is_usual and "scale" in STAGES[stage].before
+        is_projected = is_projected and is_plane_due(self.opened, self.prefix, provenance.input, self.plane)
+        return not (is_projected or is_stale(self.opened, topic))
 
     def _with_choices(self, result: _Result) -> _Result:
         """Return a result with the transform of now; one at another topic than the usual one keeps its parameters."""
