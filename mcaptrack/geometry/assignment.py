@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from importlib.machinery import PathFinder
-from importlib.util import module_from_spec
 from typing import Final
 
 import numpy as np
@@ -32,20 +30,10 @@ def solve(cost: Floats) -> Pairs:
 
 @cache
 def _solver() -> Callable[[Floats], Pairs]:
-    """SciPy's solver, imported when it is first needed: if possible alone, because its package takes 0.2 s of CPU."""
-    import scipy
+    """SciPy's solver, imported when it is first needed."""
+    from scipy.optimize import linear_sum_assignment
 
-    spec = PathFinder.find_spec("scipy.optimize._lsap", [f"{folder}/optimize" for folder in scipy.__path__])
-    try:
-        assert spec is not None
-        assert spec.loader is not None
-        module = module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module.linear_sum_assignment  # type: ignore[no-any-return]
-    except (AssertionError, AttributeError, ImportError):  # it is a private module, which another version may lack
-        from scipy.optimize import linear_sum_assignment
-
-        return linear_sum_assignment  # type: ignore[no-any-return]
+    return linear_sum_assignment  # type: ignore[no-any-return]
 
 
 def assign(cost: Floats, gate: float) -> Pairs:
