@@ -7,7 +7,7 @@ from functools import partial
 from typing import Annotated, Literal
 
 import mcaptrack
-from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, declared
+from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, checked, declared
 from mcaptrack.api.options import (
     Camera,
     EachLog,
@@ -399,6 +399,7 @@ def retrack(
     )
 
 
+@checked
 def stage(
     name: str,
     log: PathLike,
@@ -453,7 +454,7 @@ def stage(
 
 
 def declaration_of(name: str) -> Callable[..., mcaptrack.RunResult]:
-    """Return the declaration of the command of a stage of another package, whose class says what it does."""
+    """Return the declaration of the command of a stage of another package, made from the docstring of its class."""
     own = STAGES[name]
 
     def command(

@@ -382,7 +382,7 @@ class _Planner:
         return True
 
     def _is_kept(self, provenance: Provenance, stage: str, topic: str) -> bool:
-        """Return whether nobody asks for anything else than a channel of the log, which is up to date.
+        """Return whether a channel of the log is up to date, and no option asks for another one.
 
         Then the transform that made it need not be made again, nor imported.
         """
