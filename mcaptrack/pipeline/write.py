@@ -49,8 +49,8 @@ class Made(NamedTuple):
             schema.check(joined.rows)
         names = provenance.classes if has_classes(schema) else {}
         only = only_class(schema, frames)
-        facts = {"class_id": str(only) if only else "", "columns": columns_in_metadata(schema)}
-        provenance = replace(provenance, classes=names, **facts)
+        class_id = str(only) if only else ""
+        provenance = replace(provenance, classes=names, class_id=class_id, columns=columns_in_metadata(schema))
         channel = cls(schema, frames, provenance)
         beside = classes_beside_rows(provenance.class_id, names)
         return channel._replace(provenance=replace(provenance, digest=digest(channel.messages(), beside)))
