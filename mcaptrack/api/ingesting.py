@@ -50,6 +50,7 @@ Source = Annotated[
     ),
 ]
 _Labels = Annotated[PathLike | None, Option(LABELS)]
+_Format = Annotated[LabelFormat | str, named("label_format", get_args(LabelFormat), _READING, "format", PLUGIN)]
 
 
 @dataclass(frozen=True)
@@ -128,9 +129,7 @@ def ingest(
     tracks: _Labels = None,
     truth: _Labels = None,
     motion: Annotated[PathLike | None, Option(_PICTURES)] = None,
-    label_format: Annotated[
-        LabelFormat | str, named("label_format", get_args(LabelFormat), _READING, "format", PLUGIN)
-    ] = "auto",
+    label_format: _Format = "auto",
     first_frame: Annotated[int | None, Option(_READING, 0, 10**12, tuning=True)] = None,
     frames: Annotated[int | None, Option(_READING, 1, 10_000_000, tuning=True)] = None,
     columns: Annotated[str | Mapping[str, str] | None, Option(_READING)] = None,
@@ -254,8 +253,7 @@ def ingest(
     ['/camera/ground_plane', '/camera/truth', '/camera/video']
 
     """
-    from mcaptrack.api.common import as_path, log_output, optional_path, paths_of, warnings_about
-    from mcaptrack.files import is_same_file, refuse_overwrite
+    from mcaptrack.api.common import as_path, optional_path, paths_of, warnings_about
     from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
     from mcaptrack.sources.ingest.labels.content import WantedClasses
@@ -290,8 +288,7 @@ def ingest(
     make = partial(make_log, path, options=options, progress=progress)
     with warnings_about(path) as warnings:
         if into is None:
-            target = default_log(path) if output is None else log_output(output, path)
-            refuse_overwrite(target, force or is_same_file(target, path))
+            target = _new_log(path, output, force)
             report = make(target)
         else:
             target = as_path(into)
@@ -306,6 +303,16 @@ def _check_places(output: PathLike | None, into: PathLike | None, sidecar: bool 
         raise McaptrackError("`into=` adds to a log in place; it does not go with `output=`")
     if into is None and sidecar is not None:
         raise McaptrackError(f"`sidecar={sidecar}` needs a log to add to; name it with `into=`")
+
+
+def _new_log(source: Path, output: PathLike | None, force: bool) -> Path:
+    """Return the path of the log of an input. Raises McaptrackError if another file stands there, unless forced."""
+    from mcaptrack.api.common import log_output
+    from mcaptrack.files import is_same_file, refuse_overwrite
+
+    target = default_log(source) if output is None else log_output(output, source)
+    refuse_overwrite(target, force or is_same_file(target, source))
+    return target
 
 
 def _add_to(log: Path, sidecar: bool | None, make: Callable[..., IngestReport]) -> IngestReport:

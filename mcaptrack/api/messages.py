@@ -41,7 +41,7 @@ class DecodedMessage(NamedTuple):
     decoded: Any
 
     @property
-    def decoded_message(self) -> Any:
+    def decoded_message(self) -> object:
         """The same as ``decoded``, by its name in the tuples of ``mcap.reader``."""
         return self.decoded
 

@@ -12,12 +12,12 @@ for frame in log.frames("video"):       # frame.t_ns, frame.index, frame.rows: (
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from mcaptrack import log as logs
 from mcaptrack.api.common import as_location, log_output
 from mcaptrack.api.declared import checked
+from mcaptrack.api.options import PathLike
 from mcaptrack.api.reading import LogReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_overwrite
@@ -116,7 +116,7 @@ class Recording(LogReader):
 
 
 @checked
-def open(path: str | Path, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name
+def open(path: PathLike, *, create: bool = False) -> Recording:  # noqa: A001  # mcaptrack.open is its name
     """Open a log, with its results if they stand beside it.
 
     Parameters

@@ -7,8 +7,9 @@ date loads neither transforms nor views.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from mcaptrack import _lazily
 
 if TYPE_CHECKING:
     from mcaptrack.pipeline.checks import Job
@@ -46,8 +47,5 @@ _NAMES: Final = {
 }
 _MODULES: Final = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__} has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+if not TYPE_CHECKING:  # with it a type checker would take any name for one of this package
+    __getattr__ = _lazily(__name__, _MODULES)

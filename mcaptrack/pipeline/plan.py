@@ -348,19 +348,19 @@ class _Planner:
         had = provenance.input or self.source_of(stage)
         source = self.sources.get(stage, had)
         changed = [self.ensure(used) for used in (source, *provenance.references)]
-        if not any(changed) and source == had and self._is_kept(provenance, stage, topic):
+        is_moved = any(changed) or source != had
+        if not is_moved and self._is_kept(provenance, stage, topic):
             return False
         before, why_not = self._before(stage, provenance)
         if isinstance(why_not, OlderVersionError):
             return self._replace_older(provenance, stage, topic)
         main = main_topic(self.opened, stage, topic)
         result = self._with_choices(_Result(STAGES[stage], topic, main, provenance, had, source, before, before))
-        is_due = any(changed) or source != had or topic in self.renewed or result.is_projected
+        is_due = is_moved or topic in self.renewed or result.is_projected
         is_due = is_due or topic not in self.opened.channels or is_stale(self.opened, topic)
         if result.is_replaced or self.force:
             return self._run_again(result, result.wanted, why_not, is_due)
-        if result.wanted:
-            self._warn_settings(main, differing(before, result.wanted) if before else str(why_not))
+        self._warn_settings(result, why_not)
         return is_due and self._run_again(result, before, why_not, is_due)
 
     def _run_again(
@@ -487,13 +487,15 @@ class _Planner:
         again = call("run", self.opened.path, **options)
         return f"{self.opened.path}: {why}, as in {again}; another name replaces what it made"
 
-    def _warn_settings(self, main: str, differing: str) -> None:
+    def _warn_settings(self, result: _Result, why_not: McaptrackError | None) -> None:
         """Warn, once for all outputs of a stage, that they were made with other settings."""
-        if main in self._differing or not differing:
+        main, before, wanted = result.main, result.before, result.wanted
+        if wanted is None or main in self._differing:
             return
-        self._differing.add(main)
-        force = call("run", self.opened.path, force=True)
-        warn(f"{main} was made with other settings than now ({differing}); {force} takes these", "other-settings")
+        if difference := differing(before, wanted) if before else str(why_not):
+            self._differing.add(main)
+            force = call("run", self.opened.path, force=True)
+            warn(f"{main} was made with other settings than now ({difference}); {force} takes these", "other-settings")
 
     def ensure_motion(self, transform: Transform, source: str) -> None:
         """Plan the motion of the camera if a stage that reads boxes at ``source`` is better with it."""

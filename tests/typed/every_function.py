@@ -42,6 +42,7 @@ def compute(log: str) -> mcaptrack.RunResult:
         mcaptrack.track(log, tracker=ByteTrack(max_age_s=1.0), output="a.mcap", force=True),
         mcaptrack.track(log, tracker="sort", max_age_s=1.0, stages={"track": ByteTrack()}),
         mcaptrack.sample(log, rate_hz=2.5),
+        mcaptrack.stage("speed", log, output="speeds.mcap", max_gap_s=0.5),
         mcaptrack.predict(log, predictor="social"),
         mcaptrack.retrack(log, retracker=Retrack(), mode="offline"),
         mcaptrack.events(log, similarity="metres", gate_m=1.0),
@@ -70,7 +71,12 @@ def read(log: str) -> None:
         player: mcaptrack.Player = opened.show(end_s=1.0)
         box: Frame = mcaptrack.detections([[10, 20, 30, 40]], [0.9], [1], picture.t_ns, box_format="xyxy")
         opened.write("/own/detections", [box])
-        print(steps.max(), rows, message.payload, boxes, player.pictures)
+        speeds = mcaptrack.schema_of("Speed", [("track_id", "i8"), ("speed", "f4")], units={"speed": "m/s"})
+        opened.write("/own/speeds", [box._replace(rows=speeds.rows(track_id=[1], speed=[1.4]))], schema=speeds)
+        decoded: list[mcaptrack.DecodedMessage] = list(opened.messages(["/own/speeds"], decoder_factories=[]))
+        for schema, channel, newest, content in opened.messages("tracks", np.datetime64(0, "ns"), reverse=True):
+            print(schema and schema.name, channel.topic, newest.log_time, content)
+        print(steps.max(), rows, message.payload, boxes, player.pictures, [each.decoded_message for each in decoded])
     about: mcaptrack.LogInfo = mcaptrack.info(log, frames=True)
     channels: list[mcaptrack.ChannelInfo] = list(about.channels)
     frames: list[mcaptrack.FrameInfo] = list(about.frames or ())
