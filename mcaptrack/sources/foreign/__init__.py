@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.schema.provenance import Provenance
@@ -43,6 +46,10 @@ BOXES_READ: Final = (*DETECTIONS_READ, *BOXES_3D_READ)
 PICTURES_READ: Final = (*_COMPRESSED, *_RAW)
 #: Words for video codecs in the format of a compressed picture; other formats are still images.
 _VIDEO_WORDS: Final = {"h264": "h264", "avc": "h264", "h265": "h265", "hevc": "h265", "vp9": "vp9", "av1": "av1"}
+
+
+#: The stamps of pictures of open logs, by topic.
+_STAMPS: Final[WeakKeyDictionary[log.Log, dict[str, Ints]]] = WeakKeyDictionary()
 
 
 class Picture(NamedTuple):
@@ -132,19 +139,57 @@ def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Pictu
 
 
 def stamps(opened: log.Log, topic: str) -> Ints:
-    """The stamps of a channel's pictures in log time order, (M,) ns."""
-    return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
+    """The stamps of a channel's pictures in log time order, (M,) ns; they are kept as long as the log is open."""
+    kept = _STAMPS.setdefault(opened, {})
+    if topic not in kept:
+        kept[topic] = np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
+    return kept[topic]
 
 
 def named_detections(opened: log.Log, topic: str) -> NamedFrames:
     """The boxes of another detector, one frame for each message, with the names of their classes.
 
-    Class names are converted to ids (see ``boxes.Classes``), which a warning lists.
+    Boxes with the stamp of a picture are at the log time of this picture, others at their own. Class names are
+    converted to ids (see ``boxes.Classes``), which a warning lists.
     """
-    classes = Classes()
-    decoded = _decoded(opened, topic, lambda kind: boxes_decoder(kind, classes))
-    frames = [Frame(message.t_ns, index, rows) for index, (message, rows) in enumerate(decoded)]
-    return NamedFrames(frames, settle_classes(opened, topic, classes, [frame.rows for frame in frames]))
+    classes, stamps_ns = Classes(), list[int | None]()
+    decoded = _decoded(opened, topic, lambda kind: boxes_decoder(kind, classes, stamps_ns))
+    read = [(message.t_ns, rows) for message, rows in decoded]
+    names = settle_classes(opened, topic, classes, [rows for _, rows in read])
+    t_ns = _times_of_pictures(opened, topic, [at_ns for at_ns, _ in read], stamps_ns)
+    order = np.argsort(t_ns, kind="stable").tolist()
+    return NamedFrames([Frame(t_ns[at], index, read[at][1]) for index, at in enumerate(order)], names)
+
+
+def _times_of_pictures(
+    opened: log.Log, topic: str, log_ns: Sequence[int], stamps_ns: Sequence[int | None]
+) -> Sequence[int]:
+    """The log times of the pictures that boxes are about, by their stamps; their own if no channel has such pictures.
+
+    A picture that was not recorded is as late as the others.
+    """
+    if all(stamp in (None, at_ns) for stamp, at_ns in zip(stamps_ns, log_ns, strict=True)):
+        return log_ns
+    channels = [channel for channel in opened.channels.values() if holds_pictures(channel) and channel.messages]
+    for channel in sorted(channels, key=lambda channel: (-_shared(channel.topic, topic), channel.topic)):
+        shown_ns = opened.times(channel.topic)
+        taken_ns = shown_ns if Provenance.from_metadata(channel.metadata) else stamps(opened, channel.topic)
+        at = dict(zip(reversed(taken_ns.tolist()), reversed(shown_ns.tolist()), strict=True))
+        if 2 * sum(stamp in at for stamp in stamps_ns) > len(stamps_ns):
+            late_ns = int(np.median(shown_ns - taken_ns))
+            pairs = zip(stamps_ns, log_ns, strict=True)
+            return [own if stamp is None else at.get(stamp, max(stamp + late_ns, 0)) for stamp, own in pairs]
+    if channels:
+        late_s = np.median([(own - stamp) / NS_PER_S for stamp, own in zip(stamps_ns, log_ns, strict=True) if stamp])
+        text = f"boxes are taken at their log times, {late_s:.3g} s after their stamps, which no picture has"
+        warn(f"{opened.path}: {topic}: {text}", "clock")
+    return log_ns
+
+
+def _shared(topic: str, other: str) -> int:
+    """The number of parts of two topics that are the same, from the first on."""
+    pairs = zip(topic.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def settle_classes(opened: log.Log, topic: str, classes: Classes, parts: Sequence[Rows]) -> dict[int, str]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
 from math import cos, isfinite, isnan, nan, sin
+from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -92,17 +93,35 @@ class Classes:
         return list(islice(zip(sorted(self._names), range(self._largest + 1, 2**32), strict=False), _SHOWN))
 
 
-def boxes_decoder(kind: MessageType, classes: Classes) -> Callable[[bytes], Rows]:
+def boxes_decoder(
+    kind: MessageType, classes: Classes, stamps: list[int | None] | None = None
+) -> Callable[[bytes], Rows]:
     """A function that decodes payloads of a channel to rows of detections (N,); raises as ``picture_decoder`` does.
 
-    ``classes`` collects the class names.
+    ``classes`` collects the class names, and ``stamps`` the stamp of the picture that each message is about.
     """
     reader = reader_of(kind.name)
     if reader is None or reader.in_space:
         raise McaptrackError(
             f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} is read"
         )
-    return decoder_with_errors(kind, lambda message: rows_of(reader.read(message), classes))
+
+    def decode(message: Any) -> Rows:
+        if stamps is not None:
+            stamps.append(picture_stamp_of(message))
+        return rows_of(reader.read(message), classes)
+
+    return decoder_with_errors(kind, decode)
+
+
+def picture_stamp_of(message: Any) -> int | None:
+    """The stamp in ns of the picture of a message: of its ``image_header`` (darknet), or its own; None if unset."""
+    about = getattr(message, "image_header", None)
+    try:
+        stamp_ns = stamp_of(message) if about is None else stamp_of(SimpleNamespace(header=about))
+    except (AttributeError, TypeError, ValueError):
+        return None
+    return stamp_ns or None
 
 
 def rows_of(boxes: Sequence[Box], classes: Classes) -> Rows:
