@@ -27,7 +27,7 @@ def taken_s(number: int) -> float:
     return START_S + number / 10
 
 
-def written(path: Path, stamps, pictures=range(COUNT), header="header") -> Path:
+def written(path: Path, stamps, pictures=range(COUNT), header="header", data="YQ==") -> Path:
     """A log with pictures of these numbers, and boxes with these stamps, by their numbers."""
     box = {"center": {"position": {"x": 50, "y": 50}}, "size_x": 20, "size_y": 60}
     messages = [
@@ -46,8 +46,8 @@ def written(path: Path, stamps, pictures=range(COUNT), header="header") -> Path:
             schema = writer.register_schema(name, "jsonschema", b"{}")
             ids.append(writer.register_channel(topic, "json", schema))
         for t_ns, which, message in sorted(messages, key=lambda one: one[0]):
-            data = {"data": "YQ==", **message} if which == 0 else message
-            writer.add_message(ids[which], t_ns, json.dumps(data).encode(), t_ns)
+            whole = {"data": data, **message} if which == 0 else message
+            writer.add_message(ids[which], t_ns, json.dumps(whole).encode(), t_ns)
         writer.finish()
     return path
 
@@ -71,6 +71,12 @@ def test_a_picture_that_was_not_recorded_is_as_late_as_the_others(tmp_path):
     times, said = read(written(tmp_path / "a.mcap", taken_s, pictures=[n for n in range(COUNT) if n % 3]))
     assert times == {number: ns(taken_s(number) + LATE_S) for number in range(COUNT)}
     assert said == []
+
+
+def test_pictures_that_cant_be_read_cost_no_boxes(tmp_path):
+    assert read(written(tmp_path / "a.mcap", taken_s, data="?"))[0] == {
+        number: ns(taken_s(number) + LATE_S + FOUND_S) for number in range(COUNT)
+    }
 
 
 @pytest.mark.parametrize(("stamps", "words"), [(lambda n: None, ""), (lambda n: taken_s(n) + 0.01, "0.27 s after")])

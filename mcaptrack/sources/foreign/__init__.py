@@ -172,8 +172,11 @@ def _times_of_pictures(
         return log_ns
     channels = [channel for channel in opened.channels.values() if holds_pictures(channel) and channel.messages]
     for channel in sorted(channels, key=lambda channel: (-_shared(channel.topic, topic), channel.topic)):
-        shown_ns = opened.times(channel.topic)
-        taken_ns = shown_ns if Provenance.from_metadata(channel.metadata) else stamps(opened, channel.topic)
+        try:
+            shown_ns = opened.times(channel.topic)
+            taken_ns = shown_ns if Provenance.from_metadata(channel.metadata) else stamps(opened, channel.topic)
+        except McaptrackError:
+            continue  # pictures that can't be read have no stamps
         at = dict(zip(reversed(taken_ns.tolist()), reversed(shown_ns.tolist()), strict=True))
         if 2 * sum(stamp in at for stamp in stamps_ns) > len(stamps_ns):
             late_ns = int(np.median(shown_ns - taken_ns))
