@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import recorded
-from mcaptrack.sources.foreign import MessageType
+from mcaptrack.sources.foreign import Classes, MessageType, boxes_decoder
 from mcaptrack.sources.foreign.boxes import Message3d, boxes_3d_decoder
 from tests.ros_messages import BAR, Ros
 from tests.space_logs import (
@@ -399,3 +399,89 @@ def test_definitions_in_idl_have_their_constants_in_a_module_beside():
     found = boxes_3d_decoder(kind)(made.writer.pack(made.message(*objects)))
     assert [box.class_name for box in found.boxes] == ["car", "trailer", "pedestrian"]
     assert found.boxes[0].velocity == pytest.approx((0, 3, 0))
+
+
+HEAD = {"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "odom"}
+PLACE = {"position": {"x": 3, "y": -1, "z": 0.9}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+FAST = {"x": 1, "y": 2, "z": 0}
+#: The same person in several kinds of messages, and the score, the id and the velocity that each states.
+PEOPLE = [
+    (
+        "people_msgs/msg/People",
+        {"people": [{"name": "11", "position": PLACE["position"], "velocity": FAST, "reliability": 0.5}]},
+        (0.5, "11", (1, 2, 0)),
+    ),
+    (
+        "spencer_tracking_msgs/TrackedPersons",
+        {"tracks": [{"track_id": 7, "pose": {"pose": PLACE}, "twist": {"twist": {"linear": FAST}}}]},
+        (None, 7, (1, 2, 0)),
+    ),
+    (
+        "spencer_tracking_msgs/DetectedPersons",
+        {"detections": [{"detection_id": 9, "confidence": 0.5, "pose": {"pose": PLACE}}]},
+        (0.5, None, None),
+    ),
+    (
+        "autoware_perception_msgs/msg/PredictedObjects",
+        {
+            "objects": [
+                {
+                    "object_id": {"uuid": [1] * 16},
+                    "existence_probability": 0.5,
+                    "classification": [{"label": 7, "probability": 1.0}],
+                    "kinematics": {
+                        "initial_pose_with_covariance": {"pose": PLACE},
+                        "initial_twist_with_covariance": {"twist": {"linear": FAST}},
+                    },
+                    "shape": {"type": 0, "dimensions": {"x": 0.5, "y": 0.5, "z": 1.8}, "footprint": {"points": []}},
+                }
+            ]
+        },
+        (0.5, "01" * 16, (1, 2, 0)),
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "message", "stated"), PEOPLE, ids=[one[0] for one in PEOPLE])
+def test_people_of_other_packages_are_read(name, message, stated):
+    kind = MessageType(name, "jsonschema", b"{}", "json")
+    found = boxes_3d_decoder(kind)(json.dumps({"header": HEAD, **message}).encode())
+    assert (found.stamp_ns, found.frame_id) == (1_000_000_005, "odom")
+    (box,) = found.boxes
+    score, source_id, velocity = stated
+    assert box.centre == (3, -1, 0.9)
+    assert box.class_name in ("person", "pedestrian")
+    assert np.isnan(box.score) if score is None else box.score == score
+    assert box.source_id == source_id
+    assert np.isnan(box.velocity[0]) if velocity is None else box.velocity == velocity
+
+
+@pytest.mark.parametrize("class_field", ["Class", "class_id"])
+def test_boxes_of_darknet_and_yolo_are_those_of_vision(class_field):
+    corners = {"xmin": 20, "ymin": 80, "xmax": 44, "ymax": 150, "probability": 0.9, class_field: "person", "id": 0}
+    middle = {"position": {"x": 32, "y": 115}, "theta": 0.0}
+    said = {
+        "darknet_ros_msgs/BoundingBoxes": {"bounding_boxes": [corners]},
+        "yolo_msgs/msg/DetectionArray": {
+            "detections": [
+                {"class_name": "person", "score": 0.9, "bbox": {"center": middle, "size": {"x": 24, "y": 70}}}
+            ]
+        },
+        "vision_msgs/Detection2DArray": {
+            "detections": [
+                {
+                    "bbox": {"center": middle, "size_x": 24, "size_y": 70},
+                    "results": [{"hypothesis": {"class_id": "person", "score": 0.9}}],
+                }
+            ]
+        },
+    }
+    rows = []
+    for name, message in said.items():
+        decode = boxes_decoder(MessageType(name, "jsonschema", b"{}", "json"), Classes())
+        rows.append(decode(json.dumps({"header": HEAD, **message}).encode()).tolist())
+        turned = json.loads(json.dumps(message).replace("24", "-24").replace("44", "4"))
+        with pytest.raises(McaptrackError):
+            decode(json.dumps({"header": HEAD, **turned}).encode())
+    assert str(rows[0]) == str(rows[1]) == str(rows[2])
+    assert rows[0][0][:4] == (20.0, 80.0, 24.0, 70.0)

@@ -122,15 +122,22 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "nuscenes": f"{_LABELS}.nuscenes:read_nuscenes",
             "argoverse": f"{_LABELS}.argoverse:read_argoverse",
         },
-        # By the name of the type of message, as in ROS 1 and Foxglove; the first is of boxes in pictures.
+        # By the name of the type of message, as in ROS 1 and Foxglove; the first three are of boxes in pictures.
         "message_reader": {
             "vision_msgs/Detection2DArray": f"{_BOXES}:detections_2d",
+            "darknet_ros_msgs/BoundingBoxes": f"{_BOXES}:darknet_boxes",
+            "yolo_msgs/DetectionArray": f"{_BOXES}:yolo_boxes",
             "vision_msgs/Detection3DArray": f"{_BOXES}:detections_3d",
             "foxglove.SceneUpdate": f"{_BOXES}:scene_cubes",
             "visualization_msgs/MarkerArray": f"{_BOXES}:marker_cubes",
             "visualization_msgs/Marker": f"{_BOXES}:marker_cubes",
             "jsk_recognition_msgs/BoundingBoxArray": f"{_BOXES}:jsk_boxes",
             "derived_object_msgs/ObjectArray": f"{_BOXES}:derived_objects",
+            "spencer_tracking_msgs/TrackedPersons": f"{_BOXES}:spencer_people",
+            "spencer_tracking_msgs/DetectedPersons": f"{_BOXES}:spencer_people",
+            "people_msgs/People": f"{_BOXES}:people",
+            "autoware_perception_msgs/PredictedObjects": f"{_BOXES}:autoware_objects",
+            "autoware_auto_perception_msgs/PredictedObjects": f"{_BOXES}:autoware_objects",
             "autoware_perception_msgs/DetectedObjects": f"{_BOXES}:autoware_objects",
             "autoware_perception_msgs/TrackedObjects": f"{_BOXES}:autoware_objects",
             "autoware_auto_perception_msgs/DetectedObjects": f"{_BOXES}:autoware_objects",

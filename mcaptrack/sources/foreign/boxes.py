@@ -36,7 +36,7 @@ from mcaptrack.sources.foreign.decoding import (
 
 _KIND: Final = "message_reader"
 #: Schemas of boxes of other software in pictures.
-DETECTIONS_READ: Final = tuple(BUILT_IN[_KIND])[:1]
+DETECTIONS_READ: Final = tuple(BUILT_IN[_KIND])[:3]
 
 _NUMBER: Final = re.compile(r"[0-9]{1,10}")
 _NAME: Final = re.compile(r"[^\W\d_]")
@@ -103,7 +103,7 @@ def boxes_decoder(
     reader = reader_of(kind.name)
     if reader is None or reader.in_space:
         raise McaptrackError(
-            f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} is read"
+            f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} are read"
         )
 
     def decode(message: Any) -> Rows:
@@ -150,6 +150,30 @@ def _box(detection: Any) -> Box:
         w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
     name, score = best_hypothesis(detection.results)
     return Box(x - w / 2, y - h / 2, w, h, score, name or "")
+
+
+def darknet_boxes(message: Any) -> list[Box]:
+    """The boxes of a message of darknet_ros."""
+    return [_darknet_box(box) for box in message.bounding_boxes]
+
+
+def _darknet_box(box: Any) -> Box:
+    left, top, right, bottom = (number(getattr(box, name)) for name in ("xmin", "ymin", "xmax", "ymax"))
+    _check_box(left, top, right - left, bottom - top)
+    name = box.class_id if hasattr(box, "class_id") else box.Class  # in ROS 1
+    return Box(left, top, right - left, bottom - top, number(box.probability), text(name))
+
+
+def yolo_boxes(message: Any) -> list[Box]:
+    """The boxes of a message of yolo_ros."""
+    return [_yolo_box(detection) for detection in message.detections]
+
+
+def _yolo_box(detection: Any) -> Box:
+    place, size = detection.bbox.center.position, detection.bbox.size
+    x, y, w, h = (number(value) for value in (place.x, place.y, size.x, size.y))
+    _check_box(x, y, w, h)
+    return Box(x - w / 2, y - h / 2, w, h, number(detection.score), text(detection.class_name))
 
 
 def _check_box(x: float, y: float, w: float, h: float, theta: float = 0.0) -> None:
@@ -526,7 +550,49 @@ def _object_box(seen: Any, head: tuple[int, str]) -> Box3d:
     )
 
 
-# DetectedObjects and TrackedObjects of Autoware (autoware_perception_msgs, autoware_auto_perception_msgs).
+# People without a size: people_msgs/People, and TrackedPersons and DetectedPersons of spencer_tracking_msgs.
+
+
+def people(message: Any) -> Message3d:
+    """The people of a message."""
+    head = head_of(message)
+    return Message3d(
+        *head,
+        [
+            Box3d(
+                *head,
+                vector(person.position),
+                UNSTATED,
+                UNKNOWN_VECTOR,
+                _PERSON,
+                number(person.reliability),
+                text(person.name) or None,
+                vector(person.velocity),
+                has_heading=False,
+            )
+            for person in message.people
+        ],
+    )
+
+
+def spencer_people(message: Any) -> Message3d:
+    """The tracked or detected people of a message."""
+    head = head_of(message)
+    tracks, detections = part(message, "tracks") or (), part(message, "detections") or ()
+    boxes = [_spencer_person(head, track, integer(track.track_id), nan) for track in tracks]
+    boxes += [_spencer_person(head, seen, None, number(seen.confidence)) for seen in detections]
+    return Message3d(*head, boxes)
+
+
+def _spencer_person(head: tuple[int, str], person: Any, track_id: int | None, score: float) -> Box3d:
+    pose, twist = person.pose.pose, part(person, "twist")
+    velocity = UNKNOWN_VECTOR if twist is None else vector(twist.twist.linear)
+    orientation = quaternion(part(pose, "orientation"))
+    return Box3d(*head, vector(pose.position), orientation, UNKNOWN_VECTOR, _PERSON, score, track_id, velocity)
+
+
+# DetectedObjects, TrackedObjects and PredictedObjects of Autoware (autoware_perception_msgs and
+# autoware_auto_perception_msgs).
 
 
 #: The labels of ObjectClassification, for messages without their definition (JSON). Earlier ones had no bus.
@@ -546,7 +612,9 @@ def autoware_objects(message: Any) -> Message3d:
 
 def _autoware_box(item: Any, head: tuple[int, str]) -> Box3d:
     kinematics, shape = item.kinematics, item.shape
-    pose = kinematics.pose_with_covariance.pose
+    is_predicted = hasattr(kinematics, "initial_pose_with_covariance")
+    now = kinematics.initial_pose_with_covariance if is_predicted else kinematics.pose_with_covariance
+    pose = now.pose
     centre, orientation, size = vector(pose.position), quaternion(part(pose, "orientation")), vector(shape.dimensions)
     if integer(shape.type) == _AUTOWARE_CYLINDER:  # x is the diameter
         size = (size[0], size[0], size[2])
@@ -555,7 +623,8 @@ def _autoware_box(item: Any, head: tuple[int, str]) -> Box3d:
         centre = moved(centre, orientation, middle)
     velocity = UNKNOWN_VECTOR
     if getattr(kinematics, "has_twist", True):  # along the axes of the object
-        velocity = rotated(orientation, vector(kinematics.twist_with_covariance.twist.linear))
+        moves = kinematics.initial_twist_with_covariance if is_predicted else kinematics.twist_with_covariance
+        velocity = rotated(orientation, vector(moves.twist.linear))
     name, probability = _likeliest(item)
     existence = number(item.existence_probability)
     return Box3d(
@@ -567,7 +636,7 @@ def _autoware_box(item: Any, head: tuple[int, str]) -> Box3d:
         existence if existence > 0 else probability,
         _uuid(item),
         velocity,
-        integer(kinematics.orientation_availability) != _HEADING_UNKNOWN,
+        is_predicted or integer(kinematics.orientation_availability) != _HEADING_UNKNOWN,
     )
 
 
@@ -596,7 +665,7 @@ def _uuid(item: Any) -> str | None:
 
 
 #: Schemas of 3D boxes, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
-BOXES_3D_READ: Final = tuple(BUILT_IN[_KIND])[1:]
+BOXES_3D_READ: Final = tuple(BUILT_IN[_KIND])[3:]
 #: Those that are drawings: a channel with such messages need not hold boxes.
 DRAWINGS: Final = ("foxglove.SceneUpdate", "visualization_msgs/MarkerArray", "visualization_msgs/Marker")
 
