@@ -358,7 +358,7 @@ class TestBoxes:
 
     def test_other_channels_are_refused(self):
         with pytest.raises(
-            McaptrackError, match="it holds x, not detections; vision_msgs/Detection2DArray, .* are read"
+            McaptrackError, match=r"it holds x, not detections; vision_msgs/Detection2DArray, .* are read"
         ):
             boxes_decoder(MessageType("x", "", b"", "json"), Classes())
 
