@@ -253,25 +253,26 @@ def run(
             del source
             release_memory()
         own_planes = planes or ()
+        state = state._replace(gone=_gone(opened, jobs, results))  # what follows from it must not be made again
         for step in finishing:
             with part(step.name):
                 made = step.make(state, own_planes, stamps)
             report.add(step.name, made)
             results |= made
-        gone = _gone(opened, jobs, results)
+        state = state._replace(gone=state.gone - {*results})
         drawn = None
         if views:
             from mcaptrack.pipeline.views import STAGE, make_views
 
             with part(STAGE):
-                drawn = make_views(state, own_planes, stamps, boxes.in_space(), gone, is_written=output is not None)
+                drawn = make_views(state, own_planes, stamps, boxes.in_space(), is_written=output is not None)
             report.stages += [STAGE] if drawn and drawn.topics else []
         with part("write"):
-            report.is_written = write(state, output, drawn, gone)
+            report.is_written = write(state, output, drawn)
         provenances = {topic: channel.provenance for topic, channel in results.items()}
         warn_findings(opened, prefix, provenances, own_planes, is_all=bool(finishing) or not jobs)
     late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
-    report.stale = [topic for topic in late if topic not in gone]
+    report.stale = [topic for topic in late if topic not in state.gone]
     report.warnings = list(dict.fromkeys(warnings))
     return report
 

@@ -303,19 +303,19 @@ def order_blind(transform: Transform, frames: Sequence[Frame], seed: int) -> Non
         return  # pictures have no rows
     rng = np.random.default_rng(seed)
     shuffled = [frame._replace(rows=frame.rows[rng.permutation(len(frame.rows))]) for frame in frames]
-    renamed: dict[int, int] = {}
+    tracks: dict[int | None, int] = {}
+    others: dict[int | None, int] = {}
     pairs = zip(_outputs(transform, frames), _outputs(transform, shuffled), strict=True)
     for suffix, (output, other) in zip(transform.writes, pairs, strict=True):
         if len(output) != len(other):
             raise LawError(f"order-blind: output '{suffix}' has another number of frames when rows are shuffled")
         for number, (a, b) in enumerate(zip(output, other, strict=True)):
-            rows_a, rows_b = _without_ids(a.rows), _without_ids(b.rows)
-            ids = [(x, y) for (_, x), (_, y) in zip(rows_a, rows_b, strict=False) if x is not None and y is not None]
-            same_ids = all(renamed.setdefault(x, y) == y for x, y in ids)
-            if [row for row, _ in rows_a] != [row for row, _ in rows_b] or not same_ids:
+            for frame, past in ((a, tracks), (b, others)):
+                for row, track_id in _without_ids(frame.rows):
+                    past[track_id] = hash((past.get(track_id), suffix, number, row))
+            # ids are compared by all their rows so far: of two with equal rows in a frame, either may come first
+            if sorted(tracks.values()) != sorted(others.values()):
                 raise LawError(f"order-blind: {_where(suffix, number, a)} depends on the order of rows in a frame")
-    if len(set(renamed.values())) != len(renamed):
-        raise LawError("order-blind: two ids become one when rows are shuffled")
 
 
 def empties(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
