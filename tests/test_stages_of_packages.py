@@ -111,6 +111,17 @@ def test_a_stage_reads_channels_beside_its_input_and_is_outdated_by_them(site, p
 
 
 @pytest.mark.parametrize(
+    ("schema", "topic"), [("VIDEO", "video"), ("DETECTIONS", "detections"), ("PREDICTIONS", "predictions")]
+)
+def test_a_stage_reads_any_rows(site, path, schema, topic):  # noqa: F811
+    code = COUNTS.replace("reads: ClassVar = TRACKS", f"reads: ClassVar = {schema}").replace('"tracks"', f'"{topic}"')
+    add(site, "stage", "visits", code.replace("import TRACKS", f"import {schema}"))
+    done("visits", path)
+    with mcaptrack.open(path) as recording:
+        assert len(recording.array("/camera/tracks/visits"))
+
+
+@pytest.mark.parametrize(
     ("change", "said"),
     [
         (("@dataclass(frozen=True, kw_only=True)", ""), "is no dataclass"),
@@ -118,10 +129,13 @@ def test_a_stage_reads_channels_beside_its_input_and_is_outdated_by_them(site, p
         (('writes: ClassVar = {"": COUNT}', "writes: ClassVar = {'a': COUNT}"), "needs the schemas that it reads"),
         (('{"": COUNT}', '{"": COUNT, "view": COUNT}'), "has an output 'view', which is a name of what is made"),
         (('input_topic: ClassVar = "tracks"', "input_topic: ClassVar = 3"), "has input_topic = 3; it is a topic below"),
+        (('"tracks/visits"', '"/camera/visits"'), "has output_topic = '/camera/visits'; it is a topic below"),
+        (("    zones: ", "    zone: "), "has also_reads = zones without a field of that name"),
+        (("    zones: ", "    force: bool = False\n    zones: "), "can't have a parameter force"),
         (('    output_topic: ClassVar = "tracks/visits"\n', ""), "has output_topic = None; it is a topic below"),
         (("    also_reads", "    before = ('shake',)\n    also_reads"), "has before = shake; there are memory, planes"),
         (("def __call__", "def call"), "can't be called with frames"),
-        (("COUNT = ", "COUNT = 1 / 0 or "), "can't be imported: ZeroDivisionError"),
+        (("COUNT = ", "COUNT = 1 / 0 or "), "ZeroDivisionError: division by zero (another.py"),
         (
             ("        visits = sum", "        1 / 0\n        visits = sum"),
             "ZeroDivisionError: division by zero (another.py",

@@ -40,7 +40,6 @@ from mcaptrack.evaluation import tuning as searching
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.notices import Notice, collected
 from mcaptrack.registry import Entry, blamed
-from mcaptrack.schema import DETECTIONS
 from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
 from mcaptrack.transforms import STAGES, Transform
 
@@ -175,7 +174,7 @@ def tune(
     ('track',)
 
     """
-    has_tracker = STAGES[stage].reads is DETECTIONS
+    has_tracker = STAGES[stage].kind == "tracker"
     if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})

@@ -22,6 +22,7 @@ from mcaptrack.registry.guard import UNDONE, Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, latency_of, traits_of
+from mcaptrack.transforms.stages import declared_stage
 
 
 class LawError(AssertionError):
@@ -237,6 +238,13 @@ def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
         if not latency_s >= 0:
             raise LawError(f"declares: {name}.latency_s of '{suffix}' is {latency_s}; it is 0 or more, in seconds")
     check_options(transform)
+    if hasattr(transform, "input_topic") or hasattr(transform, "output_topic"):
+        declared_stage(_entry(transform, "stage"))
+
+
+def _entry(transform: Transform, kind: str) -> Entry:
+    cls = type(transform)
+    return Entry(cls.__name__, kind, cls, cls.__module__, "", "")
 
 
 def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
@@ -255,9 +263,8 @@ def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
                 raise LawError(f"conforms: {_where(suffix, number, frame)} is not later than {before} ns before it")
     reads_and_writes = (transform.reads, transform.writes[""])
     kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker"}.get(reads_and_writes, "transform")
-    cls = type(transform)
     try:
-        for _ in guarded(Entry(cls.__name__, kind, cls, cls.__module__, "", ""), transform, frames):
+        for _ in guarded(_entry(transform, kind), transform, frames):
             pass
     except McaptrackError as error:
         raise LawError(f"conforms: {error}") from None
