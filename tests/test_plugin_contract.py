@@ -20,7 +20,7 @@ import pytest
 from mcaptrack import log
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.write import ATTACHMENTS
-from mcaptrack.registry import Entry
+from mcaptrack.registry import Entry, find
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
@@ -245,6 +245,14 @@ def test_what_code_of_others_changes_is_undone_at_once_and_named_once(change):
     with pytest.raises(LawError, match=f"process: it changes {change} of the process"):
         check_transform(cls(change))
     assert state() == before
+
+
+def test_random_numbers_that_an_import_draws_are_undone_without_a_word(place):
+    (place / "draws.py").write_text("import random\nrandom.seed(3)\nclass Part: pass\n")
+    before = random.getstate()
+    with collected() as said:
+        find("tracker", "draws:Part")
+    assert (random.getstate(), said) == (before, [])
 
 
 @pytest.mark.parametrize("change", CHANGES)

@@ -56,6 +56,14 @@ def made(path: Path, topic: str) -> Provenance:
 
 
 @pytest.mark.usefixtures("site")
+def test_settings_of_a_stage_are_its_own_and_no_matter_for_other_commands(path):
+    Path("mcaptrack.toml").write_text("[speed]\nmax-gap-s = 0.5\n")
+    done("info", path)
+    done("speed", path)
+    assert made(path, "/camera/speed").parameters["max_gap_s"] == 0.5
+
+
+@pytest.mark.usefixtures("site")
 def test_the_speed_of_the_page_is_that_of_the_positions(path):
     assert "A stage of my-trackers 1.0." in done("--help").out
     done("speed", path, "--max-gap-s", "0.5")
