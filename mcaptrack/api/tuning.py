@@ -235,13 +235,13 @@ def tune(
 def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -> dict[str, Range]:
     """Return the ranges to search: those that are asked for, or all that are declared; ``entry`` as in ``tune``."""
     declared = declared_ranges(kind)
-    if not search:
+    if not (search and declared):
         return declared
     asked = search if isinstance(search, Mapping) else dict.fromkeys([search] if isinstance(search, str) else search)
     out = {}
     for name, span in asked.items():
         if name not in declared:
-            text = ", ".join(declared) or "none"
+            text = ", ".join(declared)
             raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {text}")
         out[name] = declared[name]
         if span is not None:

@@ -120,8 +120,8 @@ def tune(
     """
     if not ranges:
         raise McaptrackError(
-            f"{entry or type(base).__name__.lower()} declares no ranges to search in; name them with `search=`, or in "
-            "its fields, as in option(0.3, search=(0.1, 0.9))"
+            f"{entry or type(base).__name__.lower()} declares no ranges to search in; a field of the class "
+            "has one with option(0.3, search=(0.1, 0.9))"
         )
     searched = _Study(study, _about(base, tasks, ranges, scoring))
     done = searched.trials
