@@ -121,12 +121,17 @@ def test_the_names_of_options_are_those_of_the_registry():
 
 
 def test_doctor_lists_what_packages_bring_and_what_of_it_fails(site):
+    owners = {("exporter", "csv"): "a built-in exporter csv", ("stage", "longest"): "a command longest"}
+    install(site, {f"mcaptrack.{kind}s": {name: "speeds:Speeds"} for kind, name in owners}, "taken", "2.0")
     add(site, "command", "gone", "raise OSError('no\\nlicence')")
     found = json.loads(done("doctor", "--json").out)["plugins"]
+    for (kind, name), owner in owners.items():
+        ignored = f"{kind} {name} (taken 2.0)"
+        assert found[ignored] == f"{ignored} is ignored: there is {owner}; rename it"
     assert found["command longest (my-trackers 1.0)"] == ""
     assert {"label format semicolons (my-trackers 1.0)", "exporter speeds (my-trackers 1.0)"} <= found.keys()
     assert found["message reader my_msgs/Things (my-trackers 1.0)"] == ""
-    assert found["command gone (another 2.0)"].endswith("can't be imported: OSError: no licence")
+    assert found["command gone (another 2.0)"].endswith("can't be imported: OSError: no licence (another.py, line 1)")
 
 
 # Label formats

@@ -16,6 +16,7 @@ from mcaptrack import foxglove, log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline.plan import check_spaces
+from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DECISIONS, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
@@ -331,7 +332,9 @@ GUESSED = (
 def test_a_guessed_scale_is_said_of_what_is_in_metres(tmp_path, stage, assumed, is_said):
     plane = GroundPlane((0.05, 0, 0, 0, 0.05, 0, 0, 0, 1), 64, 48, assumed=assumed)
     with log.read(write_channels(tmp_path / "a.mcap", finished())) as opened, notices.collected() as said:
-        run.warn_findings(opened, "/camera", {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False)
+        run.warn_findings(
+            RunState(opened, "/camera", {}), {"/camera/other": Provenance(stage, {})}, [(0, plane)], is_all=False
+        )
     assert [(one.message, one.code) for one in said] == [(GUESSED, "assumed-ground-plane")] * is_said
 
 
@@ -352,7 +355,9 @@ def test_tracks_that_are_only_linked_or_passed_on_are_said(tmp_path, parameters,
         f"along the ground. To insist: `mcaptrack.retrack('{path}', side_view=True)`"
     )
     with log.read(path) as opened, notices.collected() as said:
-        run.warn_findings(opened, "/camera", {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False)
+        run.warn_findings(
+            RunState(opened, "/camera", {}), {"/camera/x": Provenance("retrack", parameters)}, (), is_all=False
+        )
     assert [(one.message, one.code) for one in said] == [(words, "held-back")] * bool(done)
 
 

@@ -88,7 +88,7 @@ def test_a_study_of_another_search_is_refused(chance, tmp_path):
     path.write_text("frame,id\n1,2\n")
     with pytest.raises(McaptrackError, match="is no study"):
         tune(Sort(), [scene()], ranges, IOU, trials=2, study=path)
-    with pytest.raises(McaptrackError, match="declares no ranges"):
+    with pytest.raises(McaptrackError, match="sort declares no ranges to search in; a field"):
         tune(Sort(), [scene()], {}, IOU)
 
 

@@ -340,16 +340,19 @@ def _threads(broken: Collection[str]) -> dict[str, str]:
 
 
 def _plugins() -> dict[str, str]:
-    """Import the parts of installed packages; return why each can't be imported, or "", and warn of it."""
-    from mcaptrack.registry import KINDS, find, points, titled
+    """Import the parts of installed packages; return why each can't be used, or "", and warn of it."""
+    from mcaptrack.registry import KINDS, find, ignored, points, titled
 
     reasons = {}
     for kind in KINDS:
+        for name, reason in ignored(kind).items():
+            reasons[name] = reason
+            warn(reason, "other")
         for point in points(kind):
             name = titled(kind, point.name, point.package)
             reasons[name] = ""
             try:
-                find(kind, point.name, point.package[0])
+                find(kind, point.name)
             except McaptrackError as error:
                 reasons[name] = str(error)
                 warn(str(error), "other")

@@ -40,7 +40,6 @@ from mcaptrack.evaluation import tuning as searching
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.notices import Notice, collected
 from mcaptrack.registry import Entry, blamed
-from mcaptrack.schema import DETECTIONS
 from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
 from mcaptrack.transforms import STAGES, Transform
 
@@ -175,7 +174,7 @@ def tune(
     ('track',)
 
     """
-    has_tracker = STAGES[stage].reads is DETECTIONS
+    has_tracker = STAGES[stage].kind == "tracker"
     if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})
@@ -236,13 +235,13 @@ def tune(
 def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -> dict[str, Range]:
     """Return the ranges to search: those that are asked for, or all that are declared; ``entry`` as in ``tune``."""
     declared = declared_ranges(kind)
-    if not search:
+    if not (search and declared):
         return declared
     asked = search if isinstance(search, Mapping) else dict.fromkeys([search] if isinstance(search, str) else search)
     out = {}
     for name, span in asked.items():
         if name not in declared:
-            text = ", ".join(declared) or "none"
+            text = ", ".join(declared)
             raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {text}")
         out[name] = declared[name]
         if span is not None:

@@ -11,7 +11,6 @@ from mcaptrack.cli.command import is_on_command_line, settings_of
 from mcaptrack.cli.settings import found_of, nearest
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import bare_type, member_type
 
@@ -92,7 +91,7 @@ def _read_member(value: str, kind: Any) -> Any:
 
 def is_open(stage: Stage, values: Mapping[str, Any]) -> bool:
     """Return whether the boxes of a log decide which tracker runs, because the user named none."""
-    return stage.reads is DETECTIONS and not values["tracker"]
+    return stage.kind == "tracker" and not values["tracker"]
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,7 @@ def _is_of_package(command: str) -> bool:
     """Whether a command is of an installed package; it isn't imported to check its options unless it is called."""
     from mcaptrack.registry import others
 
-    return command in others("command")
+    return command in (*others("command"), *others("stage"))
 
 
 def found_of(command: str) -> dict[str, tuple[Setting, Given]]:

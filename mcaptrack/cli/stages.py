@@ -21,6 +21,7 @@ from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
 from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import titled
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import choices, member_type
 
@@ -92,7 +93,8 @@ class StageCommand(RunsStages):
         flags = Counter(flag for option in (*own, *more, *parameters_of(OfAll)) for flag in _flags(option))
         flags += Counter(["help", "help-all", "logs"])
         if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
-            text = f"{' and '.join(plugins)} can't have a parameter {' or '.join(sorted(twice))}"
+            owners = " and ".join(plugins) or titled("stage", name, stage.package)
+            text = f"{owners} can't have a parameter {' or '.join(sorted(twice))}"
             raise McaptrackError(f"{text}: that is the name of an option of {name}")
         names = {option.name: option.name for option in own}
         function: Any = command(name, declared, lambda given: cls(name, given, kinds).run(names), more)

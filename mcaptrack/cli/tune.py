@@ -17,7 +17,6 @@ from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import sibling
-from mcaptrack.schema import DETECTIONS
 from mcaptrack.transforms import STAGES
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ class Tune(Once["TuneResult"]):
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)
-        self._has_tracker = STAGES[values["stage"]].reads is DETECTIONS
+        self._has_tracker = STAGES[values["stage"]].kind == "tracker"
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns become files, texts become ranges."""

@@ -119,7 +119,10 @@ def tune(
         If there are no ranges, if ``study`` belongs to another search, or if a transform of another package fails.
     """
     if not ranges:
-        raise McaptrackError(f"{type(base).__name__.lower()} declares no ranges to search in")
+        raise McaptrackError(
+            f"{entry or type(base).__name__.lower()} declares no ranges to search in; a field of the class "
+            "has one with option(0.3, search=(0.1, 0.9))"
+        )
     searched = _Study(study, _about(base, tasks, ranges, scoring))
     done = searched.trials
     propose = _proposer(ranges, metric, seed, done)

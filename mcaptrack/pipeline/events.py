@@ -71,7 +71,7 @@ def make_events(state: RunState, watch: Watch) -> dict[str, Made]:
     Returns the channels that it makes by topic. A channel that can't be compared with the ground truth is left out,
     with a warning. Raises McaptrackError for given topics that hold no tracks.
     """
-    opened, prefix, _ = state
+    opened, prefix, *_ = state
     out: dict[str, Made] = {}
     topics = watch.topics or _default_topics(state)
     if watch.again and not topics:

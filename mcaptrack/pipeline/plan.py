@@ -239,7 +239,7 @@ class _Planner:
 
     def suited_tracker(self, stage: str, source: str) -> str:
         """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""
-        if STAGES[stage].reads is not DETECTIONS:
+        if STAGES[stage].kind != "tracker":
             return ""
         spaces = spaces_of_boxes(self.opened, source)
         if not spaces or traits_of(STAGES["track"].default).space in spaces:
@@ -264,13 +264,19 @@ class _Planner:
         if provenance is None or provenance.transform not in STAGES:
             if usual in self.sources and topic != self.sources[usual]:
                 raise McaptrackError(self._not_made(usual, topic))
-            if provenance and "transform" in provenance.plugins and is_stale(self.opened, topic):
-                plugin = provenance.plugins["transform"]
-                package = f"{plugin.distribution} {plugin.version}".strip() or "the package that has it"
-                why = f"the stage {provenance.transform} made it, which is not installed; install {package}"
-                warn(f"{topic} is out of date and stays as it is: {why}", "out-of-date")
+            if provenance and "transform" in provenance.plugins:
+                self._warn_of_package(provenance, topic)
             return False  # no stage makes recorded and ingested channels
         return self._make_again(provenance, provenance.transform, topic)
+
+    def _warn_of_package(self, provenance: Provenance, topic: str) -> None:
+        """Warn of a channel that is, or will be, out of date, if the package with its stage is not installed."""
+        changed = [self.ensure(used) for used in (provenance.input, *provenance.references)]
+        if any(changed) or is_stale(self.opened, topic):
+            plugin = provenance.plugins["transform"]
+            package = f"{plugin.distribution} {plugin.version}".strip() or "the package that has it"
+            why = f"the stage {provenance.transform} made it, which is not installed; install {package}"
+            warn(f"{topic} is out of date and stays as it is: {why}", "out-of-date")
 
     def _sibling(self, stage: str, topic: str) -> Provenance | None:
         """Return the provenance of another output of the stage that makes ``topic``; None if there is none."""

@@ -240,7 +240,7 @@ def planes_for(
     ``planes`` are those so far. New detections give a new plane; one that was measured is kept. ``source`` is as in
     ``make_plane``.
     """
-    opened, prefix, results = state
+    opened, prefix, results, _ = state
     topic, stage, uncalibrated = camera_at(opened, prefix).ground_plane, STAGES[job.stage], ""
     channel: Made | None = None
     uses_planes = "ground_planes" in {f.name for f in fields(job.transform)} and _has_pixels(frames)

@@ -169,15 +169,13 @@ def warn_no_rows(
     warn(f"no {STAGES[stage].rows} of {source}: {reason}", "nothing-found")
 
 
-def warn_findings(
-    opened: log.Log, prefix: str, results: Mapping[str, Provenance], planes: Planes, is_all: bool
-) -> None:
+def warn_findings(state: RunState, results: Mapping[str, Provenance], planes: Planes, is_all: bool) -> None:
     """Repeat the warnings that channels carry in their provenance, and warn about an estimated scale.
 
     This covers ``results`` and the channels that they were made from; with ``is_all`` all channels of the camera.
     """
-    camera = camera_at(opened, prefix)
-    of_log = {topic: provenance_of(opened, topic) for topic in sorted(camera.topics - results.keys())}
+    opened, camera = state.opened, camera_at(state.opened, state.prefix)
+    of_log = {topic: provenance_of(opened, topic) for topic in sorted(camera.topics - results.keys() - state.gone)}
     provenances = {**results, **{topic: how for topic, how in of_log.items() if how is not None}}
     topics = list(provenances) if is_all else list(results)
     for topic in topics:
@@ -253,25 +251,26 @@ def run(
             del source
             release_memory()
         own_planes = planes or ()
+        state = state._replace(gone=_gone(opened, jobs, results))  # what follows from it must not be made again
         for step in finishing:
             with part(step.name):
                 made = step.make(state, own_planes, stamps)
             report.add(step.name, made)
             results |= made
-        gone = _gone(opened, jobs, results)
+        state = state._replace(gone=state.gone - {*results})
         drawn = None
         if views:
             from mcaptrack.pipeline.views import STAGE, make_views
 
             with part(STAGE):
-                drawn = make_views(state, own_planes, stamps, boxes.in_space(), gone, is_written=output is not None)
+                drawn = make_views(state, own_planes, stamps, boxes.in_space(), is_written=output is not None)
             report.stages += [STAGE] if drawn and drawn.topics else []
         with part("write"):
-            report.is_written = write(state, output, drawn, gone)
+            report.is_written = write(state, output, drawn)
         provenances = {topic: channel.provenance for topic, channel in results.items()}
-        warn_findings(opened, prefix, provenances, own_planes, is_all=bool(finishing) or not jobs)
+        warn_findings(state, provenances, own_planes, is_all=bool(finishing) or not jobs)
     late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
-    report.stale = [topic for topic in late if topic not in gone]
+    report.stale = [topic for topic in late if topic not in state.gone]
     report.warnings = list(dict.fromkeys(warnings))
     return report
 

@@ -145,7 +145,7 @@ class Work:
             if name in taken:
                 values |= self._taken(name, input_of(self))
         self.transform = replace(self.transform, **values)
-        opened, prefix, _ = self.state
+        opened, prefix, *_ = self.state
         self.transform = with_descriptors(self.transform, opened, prefix, self.seen, self.progress, self.job.keep)
 
     def finish(self) -> None:
@@ -360,7 +360,7 @@ def _on_pictures(work: Work) -> None:
 
 def _without_unseen(work: Work) -> None:
     """Leave out rows outside of the picture without a detection."""
-    opened, prefix, _ = work.state
+    opened, prefix, *_ = work.state
     if not traits_of(work.transform).keeps_unseen:
         work.outputs |= without_unseen(work.outputs, lambda: picture_size(opened, camera_at(opened, prefix).pictures))
 

@@ -6,7 +6,7 @@ or shows earlier rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +88,6 @@ def make_views(
     planes: Planes,
     stamps: Mapping[str, Sequence[int]] = {},
     boxes: Mapping[str, foreign.NamedFrames] = {},
-    gone: Collection[str] = (),
     is_written: bool = False,
 ) -> Views | None:
     """Draw the channels of a camera with a view that is due, and make its layouts.
@@ -103,9 +102,6 @@ def make_views(
         Capture times in ns of pictures that stages have read, by topic.
     boxes : mapping of str to NamedFrames
         Recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
-    gone : collection of str
-        Channels that this run drops.
-
     is_written : bool
         Whether the log is written in any case.
 
@@ -121,7 +117,7 @@ def make_views(
         return None
     work = _Work(state, camera, planes, stamps, shown | _boxes_to_draw(state.opened, boxes))
     drawn = Views(*work.views(), work.outdated)
-    return drawn._replace(layouts=layouts.make(work.contents(drawn, gone)))
+    return drawn._replace(layouts=layouts.make(work.contents(drawn)))
 
 
 class _Work:
@@ -180,11 +176,11 @@ class _Work:
         kept = [[view for view in some if view.topic not in self._recorded] for some in drawn]
         return kept[0], kept[1]
 
-    def contents(self, drawn: Views, gone: Collection[str]) -> layouts.CameraChannels:
+    def contents(self, drawn: Views) -> layouts.CameraChannels:
         """Return what layouts have to know of the camera."""
-        opened, prefix, results = self.state
+        opened, prefix, results, gone = self.state
         current = _Current(self.state, {**self.shown, **{topic: _nothing(opened, topic) for topic in gone}})
-        topics = {*opened.channels} - self.outdated - {*gone} | {*results} | drawn.topics
+        topics = {*opened.channels} - self.outdated - gone | {*results} | drawn.topics
         inputs = [channel.provenance.input for channel in results.values()]
         sources = recorded_sources(opened, [*self.camera.topics, *inputs])
         by_viewers = recorded_drawings(opened, sources) if self.frame_id else {}
@@ -210,7 +206,7 @@ class _Work:
 
 def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw]:
     """Return the channels that get views, by topic: those of this run, and others with a view that is due."""
-    opened, _, results = state
+    opened, _, results, gone = state
     shown = {
         topic: ChannelToDraw(
             channel.schema, channel.frames, how.digest, how.transform, class_names(how.to_metadata()), how.frame_id
@@ -219,7 +215,7 @@ def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw
         for how in (channel.provenance,)
     }
     inputs = {topic: channel.provenance.input for topic, channel in results.items()}
-    for topic in sorted(camera.topics - shown.keys()):
+    for topic in sorted(camera.topics - shown.keys() - gone):
         how = Provenance.from_metadata(opened.channels[topic].metadata)
         schema = SCHEMAS.get(opened.channels[topic].schema_name)
         if how is None or schema is None or not _is_due(state, camera, topic, schema, how):
@@ -238,7 +234,7 @@ def _is_due(state: RunState, camera: Camera, topic: str, schema: Schema, how: Pr
     """Return whether a channel of the log is drawn, and its view is missing or shows earlier rows."""
     opened, full = state.opened, topic + FULL
     is_drawn = schema in views.DRAWN or (schema is GROUND_PLANE and topic == f"{camera.prefix}/ground_plane")
-    if not is_drawn or topic.endswith(NOT_SHOWN) or full in {*opened.channels, *state.results}:
+    if not is_drawn or topic.endswith(NOT_SHOWN) or full in {*opened.channels, *state.results} - state.gone:
         return False
     names = [topic + suffix for suffix in views.SUFFIXES]
     names += [view for view in opened.channels if view.startswith(f"{topic}{views.SUFFIX}/")]

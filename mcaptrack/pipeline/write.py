@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -101,12 +101,14 @@ class DrawnMessages(Collection[tuple[int, int, bytes]]):
 class RunState(NamedTuple):
     """A log, the name of a camera in it, and the channels that this run has made so far, by topic.
 
-    What it says about a channel is of this run, or else of the log.
+    ``gone`` are the topics of the log that this run drops. What it says about a channel is of this run, or else of the
+    log.
     """
 
     opened: log.Log
     prefix: str
     results: dict[str, Made]
+    gone: Set[str] = frozenset()
 
     def provenance(self, topic: str) -> Provenance | None:
         """Return how a channel was made; None if it is missing or recorded."""
@@ -117,7 +119,7 @@ class RunState(NamedTuple):
         if topic in self.results:
             return self.results[topic].schema is schema
         channel = self.opened.channels.get(topic)
-        return channel is not None and channel.holds(schema)
+        return channel is not None and topic not in self.gone and channel.holds(schema)
 
     def frames(self, topic: str, schema: Schema = TRACKS) -> Sequence[Frame]:
         """Return the frames of a channel; none if it has no rows of the schema."""
@@ -159,13 +161,12 @@ class Views(NamedTuple):
         return {view.topic for view in (*self.first, *self.last)}
 
 
-def write(state: RunState, output: Path | None, views: Views | None = None, gone: Collection[str] = ()) -> bool:
+def write(state: RunState, output: Path | None, views: Views | None = None) -> bool:
     """Write the channels of a run into the log, or into a copy at ``output``, with their views and layouts.
 
-    Channels at the topics ``gone`` are dropped. Without ``views`` so are those of earlier rows. Returns whether there
-    was anything to write.
+    Without ``views`` those of earlier rows are dropped. Returns whether there was anything to write.
     """
-    opened, _, results = state
+    opened, _, results, gone = state
     if not results and output is None and not (views and views.topics):
         return False
     replaced = {*gone} | ({*views.outdated} if views else _outdated_views(state))

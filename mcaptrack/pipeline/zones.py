@@ -99,7 +99,7 @@ def make_zones(
     ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
     McaptrackError for given topics that hold no tracks, and for zones that none of the tracks can be compared with.
     """
-    opened, prefix, _ = state
+    opened, prefix, *_ = state
     before = _before(opened, prefix)
     zones = watch.zones or before.zones
     if not zones:
@@ -148,7 +148,7 @@ def _counted(
     pictures: PictureClock,
 ) -> dict[str, Made]:
     """Count the zones of one channel of tracks, and return the new channels by topic."""
-    opened, prefix, _ = state
+    opened, prefix, *_ = state
     is_truth = topic == camera_at(opened, prefix).truth
     frames = ground_truth_with(state) if is_truth else state.frames(topic)
     path, motion = path_with(state, topic)

@@ -229,8 +229,21 @@ def names(kind: Kind) -> tuple[str, ...]:
 
 
 def points(kind: Kind) -> list[Point]:
-    """The entry points of a kind; those with the name of a built-in entry don't count."""
-    return [point for point in entry_points(_group(kind)) if point.name not in BUILT_IN[kind]]
+    """The entry points of a kind; those with a name that is taken don't count."""
+    return [point for point in entry_points(_group(kind)) if not _owner(kind, point.name)]
+
+
+def ignored(kind: Kind) -> dict[str, str]:
+    """Why entry points of a kind don't count, by their title. Imports nothing."""
+    owners = {titled(kind, point.name, point.package): _owner(kind, point.name) for point in entry_points(_group(kind))}
+    return {what: f"{what} is ignored: there is {owner}; rename it" for what, owner in owners.items() if owner}
+
+
+def _owner(kind: Kind, name: str) -> str:
+    """What has this name, so that no entry point of the kind can: a built-in entry, or the command of a stage."""
+    if name in BUILT_IN[kind]:
+        return f"a built-in {titled(kind, name)}"
+    return f"a {titled('command', name)}" if kind == "stage" and name in names("command") else ""
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:
@@ -272,9 +285,9 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     named = [point for point in named if point.package[0] == distribution] or named
     if len(named) > 1:
         values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))
-        what = titled(kind, name)
+        what = f"{'an' if kind[0] in 'aeiou' else 'a'} {titled(kind, name)}"
         hint = "remove one of them" if kind in _BY_ENTRY_POINT else "name one as module:Class"
-        raise McaptrackError(f"several installed packages have a {what}: {values}; {hint}")
+        raise McaptrackError(f"several installed packages have {what}: {values}; {hint}")
     package = named[0].package
     implementation = _load(titled(kind, name, package), named[0].value)
     return Entry(name, kind, implementation, implementation.__module__, *package)
@@ -336,13 +349,26 @@ def failure(entry: Entry, what: str, error: BaseException) -> McaptrackError:
     """An exception of the code of another package, as one line with the entry and the place in its source."""
     if isinstance(error, McaptrackError):
         return McaptrackError(f"{entry}: {error}")
-    frames = [frame for frame in extract_tb(error.__traceback__) if _FOLDER not in Path(frame.filename).parents]
-    where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    return McaptrackError(f"{entry} {what}: {_words(error)}{where}")
+    return McaptrackError(f"{entry} {what}: {_words(error)}{_where(error)}")
+
+
+def _where(error: BaseException) -> str:
+    """The last place in the code of another package that an exception passed, as in " (speeds.py, line 3)"."""
+    if isinstance(error, SyntaxError):
+        return ""  # its text names the place
+    places = [(Path(frame.filename), frame.lineno) for frame in extract_tb(error.__traceback__)]
+    theirs = [
+        f" ({path.name}, line {number})"
+        for path, number in places
+        if _FOLDER not in path.parents and path.parent.name != "importlib" and not path.name.startswith("<frozen")
+    ]
+    return theirs[-1] if theirs else ""
 
 
 def _words(error: BaseException) -> str:
     try:
+        if isinstance(error, McaptrackError):
+            return str(error)
         return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     except Exception:  # an exception of others that can't even be printed
         return type(error).__name__
@@ -367,7 +393,7 @@ def _load(what: str, reference: str) -> Any:
     except BaseException as error:  # code of other packages may raise anything
         if is_interruption(error):
             raise
-        raise McaptrackError(f"{what} can't be imported: {_words(error)}") from error
+        raise McaptrackError(f"{what} can't be imported: {_words(error)}{_where(error)}") from error
     for part in parts:
         member = getattr(member, part, None)
     if member is None:

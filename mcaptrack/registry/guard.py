@@ -158,10 +158,13 @@ class Guard:
         Its name in the warning, as in ``tracker nearest (my-package 1.0)``.
     changed : list of str
         What it has changed so far.
+    unsaid : tuple of str
+        Changes that are undone without a warning.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, unsaid: tuple[str, ...] = ()) -> None:
         self.name = name
+        self.unsaid = unsaid
         self.changed: list[str] = []
         self._ours: dict[_Facet, Any] = {}
         self._theirs: dict[_Facet, Any] = {}
@@ -220,20 +223,10 @@ class Guard:
     def end(self) -> None:
         """End the run, and warn of what was changed since the last warning."""
         self._end(_RANDOM if _RANDOM[0] in self._ours else ())
-        if names := self.changed[self._warned :]:
-            self._warned = len(self.changed)
+        names = [name for name in self.changed[self._warned :] if name not in self.unsaid]
+        self._warned = len(self.changed)
+        if names:
             warn(f"{self.name} changed {' and '.join(names)}{UNDONE}")
-
-
-@contextmanager
-def contained(what: str) -> Iterator[None]:
-    """Run code of another package once, and warn of what it changed."""
-    guard = Guard(what)
-    try:
-        with guard.step():
-            yield
-    finally:
-        guard.end()
 
 
 @contextmanager
@@ -243,8 +236,10 @@ def contained_import(what: str) -> Iterator[None]:
     waiting = threading.Timer(_LONG_S, copy_context().run, (warn, text))
     waiting.daemon = True
     waiting.start()
+    guard = Guard(f"the import of {what}", tuple(facet.name for facet in _RANDOM))  # many draw numbers, such as Rich
     try:
-        with contained(f"the import of {what}"):
+        with guard.step():
             yield
     finally:
+        guard.end()
         waiting.cancel()

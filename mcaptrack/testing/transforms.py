@@ -22,6 +22,7 @@ from mcaptrack.registry.guard import UNDONE, Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, latency_of, traits_of
+from mcaptrack.transforms.stages import declared_stage
 
 
 class LawError(AssertionError):
@@ -237,6 +238,13 @@ def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
         if not latency_s >= 0:
             raise LawError(f"declares: {name}.latency_s of '{suffix}' is {latency_s}; it is 0 or more, in seconds")
     check_options(transform)
+    if hasattr(transform, "input_topic") or hasattr(transform, "output_topic"):
+        declared_stage(_entry(transform, "stage"))
+
+
+def _entry(transform: Transform, kind: str) -> Entry:
+    cls = type(transform)
+    return Entry(cls.__name__, kind, cls, cls.__module__, "", "")
 
 
 def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
@@ -255,9 +263,8 @@ def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
                 raise LawError(f"conforms: {_where(suffix, number, frame)} is not later than {before} ns before it")
     reads_and_writes = (transform.reads, transform.writes[""])
     kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker"}.get(reads_and_writes, "transform")
-    cls = type(transform)
     try:
-        for _ in guarded(Entry(cls.__name__, kind, cls, cls.__module__, "", ""), transform, frames):
+        for _ in guarded(_entry(transform, kind), transform, frames):
             pass
     except McaptrackError as error:
         raise LawError(f"conforms: {error}") from None
@@ -303,19 +310,19 @@ def order_blind(transform: Transform, frames: Sequence[Frame], seed: int) -> Non
         return  # pictures have no rows
     rng = np.random.default_rng(seed)
     shuffled = [frame._replace(rows=frame.rows[rng.permutation(len(frame.rows))]) for frame in frames]
-    renamed: dict[int, int] = {}
+    tracks: dict[int | None, int] = {}
+    others: dict[int | None, int] = {}
     pairs = zip(_outputs(transform, frames), _outputs(transform, shuffled), strict=True)
     for suffix, (output, other) in zip(transform.writes, pairs, strict=True):
         if len(output) != len(other):
             raise LawError(f"order-blind: output '{suffix}' has another number of frames when rows are shuffled")
         for number, (a, b) in enumerate(zip(output, other, strict=True)):
-            rows_a, rows_b = _without_ids(a.rows), _without_ids(b.rows)
-            ids = [(x, y) for (_, x), (_, y) in zip(rows_a, rows_b, strict=False) if x is not None and y is not None]
-            same_ids = all(renamed.setdefault(x, y) == y for x, y in ids)
-            if [row for row, _ in rows_a] != [row for row, _ in rows_b] or not same_ids:
+            for frame, past in ((a, tracks), (b, others)):
+                for row, track_id in _without_ids(frame.rows):
+                    past[track_id] = hash((past.get(track_id), suffix, number, row))
+            # ids are compared by all their rows so far: of two with equal rows in a frame, either may come first
+            if sorted(tracks.values()) != sorted(others.values()):
                 raise LawError(f"order-blind: {_where(suffix, number, a)} depends on the order of rows in a frame")
-    if len(set(renamed.values())) != len(renamed):
-        raise LawError("order-blind: two ids become one when rows are shuffled")
 
 
 def empties(transform: Transform, frames: Sequence[Frame], seed: int) -> None:

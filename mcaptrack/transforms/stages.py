@@ -400,11 +400,11 @@ class Stages(Mapping[str, Stage]):
             raise KeyError(name)
         entry = find("stage", name)
         if entry.cls not in self._of_packages:
-            self._of_packages[entry.cls] = _of_package(entry)
+            self._of_packages[entry.cls] = declared_stage(entry)
         return self._of_packages[entry.cls]
 
     def __contains__(self, name: object) -> bool:
-        return name in self._built_in or (name not in _NO_STAGES and name in others("stage"))
+        return name in self._built_in or name in others("stage")
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._built_in)
@@ -413,7 +413,7 @@ class Stages(Mapping[str, Stage]):
         return len(self._built_in)
 
 
-def _of_package(entry: Entry) -> Stage:
+def declared_stage(entry: Entry) -> Stage:
     """The stage of an installed package, which a class of transforms declares. Raises McaptrackError if it can't."""
     cls = entry.cls
     check_class(entry)
@@ -427,20 +427,24 @@ def _of_package(entry: Entry) -> Stage:
     _check_suffixes(entry, outputs)
     topics = {name: declared.pop(name, None) for name in ("input_topic", "output_topic")}
     for name, topic in topics.items():
-        if not isinstance(topic, str) or not topic.strip("/") or not topic.isprintable():
+        if not isinstance(topic, str) or not all(topic.split("/")) or not topic.isprintable():
             raise McaptrackError(
                 f"{entry} has {name} = {topic!r}; it is a topic below the name of a camera, as in 'tracks'"
             )
     for name, steps in (("before", get_args(StepBefore)), ("after", get_args(StepAfter))):
         if unknown := sorted({*map(str, declared.get(name, ()))} - {*steps}):
             raise McaptrackError(f"{entry} has {name} = {', '.join(unknown)}; there are {', '.join(steps)}")
+    parameters = {parameter.name for parameter in fields(cls)}
+    if lacking := sorted({*map(str, declared.get("also_reads", ()))} - parameters):
+        raise McaptrackError(
+            f"{entry} has also_reads = {', '.join(lacking)} without a field of that name, as in "
+            f"{lacking[0]}: tuple = context(tuple, is_recorded=False)"
+        )
     rows = str(declared.pop("rows", "rows"))
     package = (entry.distribution, entry.version)
     return Stage(name=entry.name, reads=reads, writes=outputs, rows=rows, package=package, **topics, **declared)
 
 
-#: Names in the provenance of channels that no stage makes.
-_NO_STAGES: Final = frozenset({"ingest", "view", "fuse", "calibrate", *FINISHING})
 #: What a class of another package declares of its stage.
 _DECLARED: Final = ("input_topic", "output_topic", "rows", "before", "after", "also_reads")
 #: All stages by name (see ``Stages``).
