@@ -7,7 +7,7 @@ or shows earlier rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import layouts
 from mcaptrack.foxglove.views.layouts import ERRORS, PEOPLE, SPREAD
 from mcaptrack.geometry.plane import Planes, moved_planes
+from mcaptrack.location import sibling
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.drawing import (
@@ -105,7 +107,6 @@ def make_views(
         Recorded boxes in space that this run has read, by topic; those that viewers don't draw get a view.
     gone : collection of str
         Channels that this run drops.
-
     is_written : bool
         Whether the log is written in any case.
 
@@ -368,22 +369,38 @@ def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Fram
 def with_views(opened: log.Log) -> Iterator[tuple[log.Log, dict[str, bytes]]]:
     """Yield a log with the views that are due, which are in a temporary file, and the layouts for all of it, by name.
 
-    It yields the log itself, and no layouts, if no view is due. The log on the disk stays as it is.
+    It yields the log itself, and no layouts, if no view is due. The log on the disk stays as it is. Raises
+    McaptrackError if the folder of temporary files has no room.
     """
     due = [camera for camera in cameras(opened) if channels_to_draw(RunState(opened, camera.prefix, {}), camera)]
     if not due:
         yield opened, {}
         return
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(TemporaryDirectory(prefix="mcaptrack-views-"))
+            path = sibling(Path(folder, opened.path.name), ".views.mcap", of=opened.path.name.removesuffix(".mcap"))
+            made_layouts = _write_due(opened, due, path)
+        except (OSError, McaptrackError) as error:
+            if isinstance(error, McaptrackError) and not isinstance(error.__cause__, OSError):
+                raise
+            raise McaptrackError(
+                f"views that {opened.path} lacks can't be drawn in a temporary file ({error}); the variable TMPDIR "
+                f"names another folder, and {call('run', opened.path)} keeps them in the log"
+            ) from error
+        complete = stack.enter_context(log.read(opened.path))
+        complete.attach_results(log.read(path), is_new=False)
+        yield complete, made_layouts
+
+
+def _write_due(opened: log.Log, due: Sequence[Camera], path: Path) -> dict[str, bytes]:
+    """Write the views of these cameras that are due to a file, and return the layouts of the cameras by name."""
     made_layouts: dict[str, bytes] = {}
-    with TemporaryDirectory(prefix="mcaptrack-views-") as folder:
-        path = Path(folder, f"{opened.path.name.removesuffix('.mcap')}.views.mcap")
-        with log.create(path) as writer:
-            streams = []
-            for camera in due:
-                if drawn := make_views(RunState(opened, camera.prefix, {}), read_planes(opened, camera.prefix) or ()):
-                    made_layouts |= drawn.layouts
-                    streams += add_views(writer, (*drawn.first, *drawn.last), PROTOBUF)
-            write_by_time(writer, streams)
-        with log.read(opened.path) as complete:
-            complete.attach_results(log.read(path), is_new=False)
-            yield complete, made_layouts
+    with log.create(path) as writer:
+        streams = []
+        for camera in due:
+            if drawn := make_views(RunState(opened, camera.prefix, {}), read_planes(opened, camera.prefix) or ()):
+                made_layouts |= drawn.layouts
+                streams += add_views(writer, (*drawn.first, *drawn.last), PROTOBUF)
+        write_by_time(writer, streams)
+    return made_layouts
