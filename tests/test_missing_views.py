@@ -64,6 +64,19 @@ def test_logs_of_the_longest_names_are_shown_where_their_tracks_are(without_view
     assert list(temporary.iterdir()) == []
 
 
+def test_no_file_is_served_for_a_view_that_others_recorded(template, temporary, tmp_path):
+    path, topic = tmp_path / "a.mcap", "/camera/detections/view/image"
+    mcaptrack.drop(template, [topic], output=path)
+    with log.read(path) as opened, log.extend(opened) as writer:
+        number = writer.add_channel(topic, ("of.Others", "jsonschema", b'{"type": "object"}'), "json", {})
+        writer.add_message(number, opened.start_ns, 0, b"{}")
+    with mcaptrack.view(path) as server:
+        assert len(server.logs) == 1
+        assert [str(warning) for warning in server.warnings] == [
+            f"no view at {topic}, which was recorded by others (of.Others)"
+        ]
+
+
 @pytest.mark.parametrize("lacks", ["a folder", "room"])
 def test_no_room_for_temporary_files_is_said_in_one_line(without_views, temporary, lacks):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -369,18 +370,22 @@ def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Fram
 def with_views(opened: log.Log) -> Iterator[tuple[log.Log, dict[str, bytes]]]:
     """Yield a log with the views that are due, which are in a temporary file, and the layouts for all of it, by name.
 
-    It yields the log itself, and no layouts, if no view is due. The log on the disk stays as it is. Raises
-    McaptrackError if the folder of temporary files has no room.
+    It yields the log itself, and no layouts, if no view is due, or if others recorded what stands in its place. The log
+    on the disk stays as it is. Raises McaptrackError if the folder of temporary files has no room.
     """
     due = [camera for camera in cameras(opened) if channels_to_draw(RunState(opened, camera.prefix, {}), camera)]
-    if not due:
+    made = [make_views(RunState(opened, at.prefix, {}), read_planes(opened, at.prefix) or ()) for at in due]
+    drawn = [views_of_camera for views_of_camera in made if views_of_camera and views_of_camera.topics]
+    if not drawn:
         yield opened, {}
         return
     with ExitStack() as stack:
         try:
             folder = stack.enter_context(TemporaryDirectory(prefix="mcaptrack-views-"))
             path = sibling(Path(folder, opened.path.name), ".views.mcap", of=opened.path.name.removesuffix(".mcap"))
-            made_layouts = _write_due(opened, due, path)
+            with log.create(path) as writer:
+                streams = [add_views(writer, (*each.first, *each.last), PROTOBUF) for each in drawn]
+                write_by_time(writer, chain.from_iterable(streams))
         except (OSError, McaptrackError) as error:
             if isinstance(error, McaptrackError) and not isinstance(error.__cause__, OSError):
                 raise
@@ -390,17 +395,4 @@ def with_views(opened: log.Log) -> Iterator[tuple[log.Log, dict[str, bytes]]]:
             ) from error
         complete = stack.enter_context(log.read(opened.path))
         complete.attach_results(log.read(path), is_new=False)
-        yield complete, made_layouts
-
-
-def _write_due(opened: log.Log, due: Sequence[Camera], path: Path) -> dict[str, bytes]:
-    """Write the views of these cameras that are due to a file, and return the layouts of the cameras by name."""
-    made_layouts: dict[str, bytes] = {}
-    with log.create(path) as writer:
-        streams = []
-        for camera in due:
-            if drawn := make_views(RunState(opened, camera.prefix, {}), read_planes(opened, camera.prefix) or ()):
-                made_layouts |= drawn.layouts
-                streams += add_views(writer, (*drawn.first, *drawn.last), PROTOBUF)
-        write_by_time(writer, streams)
-    return made_layouts
+        yield complete, {name: layout for each in drawn for name, layout in each.layouts.items()}
