@@ -64,6 +64,19 @@ def test_logs_of_the_longest_names_are_shown_where_their_tracks_are(without_view
     assert list(temporary.iterdir()) == []
 
 
+def test_pictures_that_come_later_are_drawn_on_once(template, tmp_path):
+    """Of a log without image views, as one has that was run before it had pictures, run makes what it makes of others."""
+    path = tmp_path / "a.mcap"
+    images = [topic for topic in our_messages(template) if topic.endswith("/view/image")]
+    mcaptrack.drop(template, images, output=path)
+    assert len(images) > 2
+    mcaptrack.run(path, tables=False)
+    assert our_messages(path) == our_messages(template)
+    content = path.read_bytes()
+    assert mcaptrack.run(path, tables=False).is_up_to_date
+    assert path.read_bytes() == content
+
+
 def test_no_file_is_served_for_a_view_that_others_recorded(template, temporary, tmp_path):
     path, topic = tmp_path / "a.mcap", "/camera/detections/view/image"
     mcaptrack.drop(template, [topic], output=path)

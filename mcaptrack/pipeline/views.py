@@ -224,11 +224,18 @@ def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw
     for topic in sorted(camera.topics - shown.keys()):
         how = Provenance.from_metadata(opened.channels[topic].metadata)
         schema = SCHEMAS.get(opened.channels[topic].schema_name)
-        if how is None or schema is None or not _is_due(state, camera, topic, schema, how):
+        if how is None or schema is None or not _is_drawn(state, camera, topic, schema):
+            continue
+        is_outdated = _is_outdated(opened, topic, how)
+        lacks_image = camera.pictures and schema in views.DRAWN and topic + views.SUFFIX not in opened.channels
+        if not (is_outdated or lacks_image):
             continue
         names, made_by = class_names(opened.channels[topic].metadata), how.transform if how.transform in STAGES else ""
         drawing = ChannelToDraw(schema, opened.frame_columns(topic, schema), how.digest, made_by, names, how.frame_id)
-        if camera.pictures or drawing.is_on_ground():
+        is_due = (
+            camera.pictures or drawing.is_on_ground() if is_outdated else _is_in_pictures(state, topic, drawing, how)
+        )
+        if is_due:
             shown[topic], inputs[topic] = drawing, how.input
     for topic, drawing in shown.items():
         if drawing.schema is PREDICTIONS:
@@ -236,16 +243,25 @@ def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw
     return shown
 
 
-def _is_due(state: RunState, camera: Camera, topic: str, schema: Schema, how: Provenance) -> bool:
-    """Return whether a channel of the log is drawn, and its view is missing or shows earlier rows."""
-    opened, full = state.opened, topic + FULL
+def _is_drawn(state: RunState, camera: Camera, topic: str, schema: Schema) -> bool:
+    """Return whether a channel of the log gets views."""
     is_drawn = schema in views.DRAWN or (schema is GROUND_PLANE and topic == f"{camera.prefix}/ground_plane")
-    if not is_drawn or topic.endswith(NOT_SHOWN) or full in {*opened.channels, *state.results}:
-        return False
+    return is_drawn and not topic.endswith(NOT_SHOWN) and topic + FULL not in {*state.opened.channels, *state.results}
+
+
+def _is_outdated(opened: log.Log, topic: str, how: Provenance) -> bool:
+    """Return whether a channel has no view, or those of earlier rows."""
     names = [topic + suffix for suffix in views.SUFFIXES]
     names += [view for view in opened.channels if view.startswith(f"{topic}{views.SUFFIX}/")]
     drawn = [Provenance.from_metadata(opened.channels[name].metadata) for name in names if name in opened.channels]
     return not any(view is not None and view.input_digest == how.digest for view in drawn)
+
+
+def _is_in_pictures(state: RunState, topic: str, drawing: ChannelToDraw, how: Provenance) -> bool:
+    """Return whether a channel is drawn in the pictures of its camera, which may have come after its other view."""
+    bodies = _bodies(_Current(state, {}), topic, how.input) if drawing.schema is PREDICTIONS else ()
+    is_solid = drawing._replace(bodies=bodies).is_solid()
+    return not is_solid and len(picture_clock(state.opened, state.prefix, {}).t_ns) > 0
 
 
 def _nothing(opened: log.Log, topic: str) -> ChannelToDraw:
