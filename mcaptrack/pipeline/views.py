@@ -223,24 +223,30 @@ def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw
     inputs = {topic: channel.provenance.input for topic, channel in results.items()}
     for topic in sorted(camera.topics - shown.keys()):
         how = Provenance.from_metadata(opened.channels[topic].metadata)
-        schema = SCHEMAS.get(opened.channels[topic].schema_name)
-        if how is None or schema is None or not _is_drawn(state, camera, topic, schema):
-            continue
-        is_outdated = _is_outdated(opened, topic, how)
-        lacks_image = camera.pictures and schema in views.DRAWN and topic + views.SUFFIX not in opened.channels
-        if not (is_outdated or lacks_image):
-            continue
-        names, made_by = class_names(opened.channels[topic].metadata), how.transform if how.transform in STAGES else ""
-        drawing = ChannelToDraw(schema, opened.frame_columns(topic, schema), how.digest, made_by, names, how.frame_id)
-        is_due = (
-            camera.pictures or drawing.is_on_ground() if is_outdated else _is_in_pictures(state, topic, drawing, how)
-        )
-        if is_due:
+        if how is not None and (drawing := _due_of_log(state, camera, topic, how)):
             shown[topic], inputs[topic] = drawing, how.input
     for topic, drawing in shown.items():
         if drawing.schema is PREDICTIONS:
             shown[topic] = drawing._replace(bodies=_bodies(_Current(state, shown), topic, inputs[topic]))
     return shown
+
+
+def _due_of_log(state: RunState, camera: Camera, topic: str, how: Provenance) -> ChannelToDraw | None:
+    """Return a channel of the log if a view of it is due. Its rows are read only if one may be."""
+    channel = state.opened.channels[topic]
+    schema = SCHEMAS.get(channel.schema_name)
+    if schema is None or not _is_drawn(state, camera, topic, schema):
+        return None
+    is_outdated = _is_outdated(state.opened, topic, how)
+    lacks_image = camera.pictures and schema in views.DRAWN and topic + views.SUFFIX not in state.opened.channels
+    if not (is_outdated or lacks_image):
+        return None
+    names, made_by = class_names(channel.metadata), how.transform if how.transform in STAGES else ""
+    frames = state.opened.frame_columns(topic, schema)
+    drawing = ChannelToDraw(schema, frames, how.digest, made_by, names, how.frame_id)
+    if is_outdated:
+        return drawing if camera.pictures or drawing.is_on_ground() else None
+    return drawing if _is_in_pictures(state, topic, drawing, how) else None
 
 
 def _is_drawn(state: RunState, camera: Camera, topic: str, schema: Schema) -> bool:
