@@ -453,7 +453,7 @@ def stage(
 
 
 def declaration_of(name: str) -> Callable[..., mcaptrack.RunResult]:
-    """Return the declaration of the command of a stage of another package, whose class says what it does."""
+    """Return the declaration of the command of a stage of another package; the docstring of its class is its help."""
     own = STAGES[name]
 
     def command(

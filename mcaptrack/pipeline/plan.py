@@ -355,13 +355,17 @@ class _Planner:
             return self._replace_older(provenance, stage, topic)
         main = main_topic(self.opened, stage, topic)
         result = self._with_choices(_Result(STAGES[stage], topic, main, provenance, had, source, before, before))
-        is_due = any(changed) or source != had or topic in self.renewed or result.is_projected
-        is_due = is_due or topic not in self.opened.channels or is_stale(self.opened, topic)
+        is_due = any(changed) or self._is_due(result)
         if result.is_replaced or self.force:
             return self._run_again(result, result.wanted, why_not, is_due)
         if result.wanted:
             self._warn_settings(main, differing(before, result.wanted) if before else str(why_not))
         return is_due and self._run_again(result, before, why_not, is_due)
+
+    def _is_due(self, result: _Result) -> bool:
+        """Return whether a channel is missing or out of date, or gets another input, plane or log before now."""
+        is_other = result.source != result.had or result.topic in self.renewed or result.is_projected
+        return is_other or result.topic not in self.opened.channels or is_stale(self.opened, result.topic)
 
     def _run_again(
         self, result: _Result, transform: Transform | None, why_not: McaptrackError | None, is_due: bool
@@ -382,7 +386,7 @@ class _Planner:
         return True
 
     def _is_kept(self, provenance: Provenance, stage: str, topic: str) -> bool:
-        """Return whether nobody asks for anything else than a channel of the log, which is up to date.
+        """Return whether a channel of the log is up to date, and no option asks for another.
 
         Then the transform that made it need not be made again, nor imported.
         """
