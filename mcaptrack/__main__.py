@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 _SOON_S: Final = 0.01
+#: Windows has none.
+_HANGUP: Final = getattr(signal, "SIGHUP", None)
 
 
 #: The signals that ended this command.
@@ -45,7 +47,9 @@ def _once_more(unraisable: "UnraisableHookArgs") -> None:
 def main() -> None:
     """Run the command line. Ctrl-C is exit 130 from the first moment on, also while modules are still being loaded."""
     signal.signal(signal.SIGTERM, _end)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where the caller ignores it, as nohup does
+    if _HANGUP is not None and signal.getsignal(_HANGUP) is signal.SIG_DFL:  # a terminal that is closed; not with nohup
+        signal.signal(_HANGUP, _end)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where the caller ignores it
         signal.signal(signal.SIGINT, _end)
     sys.unraisablehook = _once_more
     open_streams()
@@ -75,8 +79,9 @@ def main() -> None:
         raise
     finally:
         # All is done: a signal during Python's own goodbye ends the process without a word.
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
-            signal.signal(number, signal.SIG_DFL)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM, _HANGUP):
+            if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, signal.SIG_DFL)
 
 
 if __name__ == "__main__":

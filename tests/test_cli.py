@@ -276,6 +276,20 @@ def test_an_interruption_that_a_library_replaces_by_its_own_error_counts(sent):
     assert (ended.returncode, ended.stderr) == (128 + sent, "")
 
 
+@pytest.mark.parametrize(("before", "wanted"), [("SIG_DFL", 128 + signal.SIGHUP), ("SIG_IGN", 0)], ids=["", "nohup"])
+def test_a_closed_terminal_ends_the_command_after_it_has_cleared_up(tmp_path, before, wanted):
+    code = (
+        f"import os, signal, sys, tempfile, types; signal.signal(signal.SIGHUP, signal.{before})\n"
+        "def app():\n"
+        f"    with tempfile.TemporaryDirectory(dir={str(tmp_path)!r}):\n"
+        "        os.kill(os.getpid(), signal.SIGHUP)\n"
+        "sys.modules['mcaptrack.cli'] = types.SimpleNamespace(app=app)\n"
+        "from mcaptrack.__main__ import main; main()\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600)
+    assert (ended.returncode, ended.stderr, list(tmp_path.iterdir())) == (wanted, "", [])
+
+
 def test_the_demonstration(tmp_path, monkeypatch):
     """The test replaces the scene by a short one."""
     monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(seed=seed))

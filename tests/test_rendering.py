@@ -20,7 +20,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.rendering import draw
+from mcaptrack.viewing.rendering import RenderOptions, draw, render
 from tests.commands import call, printed
 from tests.robots import write_log
 
@@ -235,3 +235,18 @@ def test_a_log_with_pictures_that_cannot_be_decoded_is_processed_and_drawn_witho
     assert len(clip(output)) == 48
     heat_map = call("render", str(path), "--heatmap", "-o", str(tmp_path / "heat.png"))
     assert (heat_map.code, " pictures of /eye/image can't be decoded" in heat_map.err) == (0, True)
+
+
+def test_a_video_of_which_no_picture_can_be_decoded_is_named(template, tmp_path):
+    path = tmp_path / "late.mcap"
+    with log.read(template) as opened, log.create(path) as writer:
+        schema = foxglove.record_in(foxglove.VIDEO, "protobuf")
+        number = writer.add_channel("/eye", schema, "protobuf", {})
+        for message in [*opened.messages("/camera/video")][1:4]:  # without its first picture, on which others depend
+            writer.add_message(number, message.t_ns, message.sequence, message.payload)
+    with (
+        log.read(path) as opened,
+        pytest.raises(McaptrackError, match="no picture of /eye in this time can be decoded"),
+    ):
+        render(opened, "/eye", (), tmp_path / "a.gif", RenderOptions())
+    assert list(tmp_path.iterdir()) == [path]

@@ -93,7 +93,8 @@ def _taking(function: Any, progress: Any) -> dict[str, Any]:
 def serve(handle: int, life: int) -> None:
     """Answer requests on a socket until the parent closes it or ends, which closes the socket ``life``, too."""
     connection: Connection[Any, Any] = Connection(handle)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
+    for number in (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT)):  # Windows has no SIGHUP
+        signal.signal(number, signal.SIG_IGN)  # Ctrl-C and a closed terminal are for the parent, which ends its workers
     signal.signal(signal.SIGTERM, _end)
     faulthandler.enable(sys.stderr)
     hush_libraries()

@@ -362,12 +362,16 @@ class _Planner:
             return self._replace_older(provenance, stage, topic)
         main = main_topic(self.opened, stage, topic)
         result = self._with_choices(_Result(STAGES[stage], topic, main, provenance, had, source, before, before))
-        is_due = is_moved or topic in self.renewed or result.is_projected
-        is_due = is_due or topic not in self.opened.channels or is_stale(self.opened, topic)
+        is_due = is_moved or self._is_due(result)
         if result.is_replaced or self.force:
             return self._run_again(result, result.wanted, why_not, is_due)
         self._warn_settings(result, why_not)
         return is_due and self._run_again(result, before, why_not, is_due)
+
+    def _is_due(self, result: _Result) -> bool:
+        """Return whether a channel is missing or out of date, or gets another input, plane or log before now."""
+        is_other = result.source != result.had or result.topic in self.renewed or result.is_projected
+        return is_other or result.topic not in self.opened.channels or is_stale(self.opened, result.topic)
 
     def _run_again(
         self, result: _Result, transform: Transform | None, why_not: McaptrackError | None, is_due: bool

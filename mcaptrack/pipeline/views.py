@@ -7,8 +7,9 @@ or shows earlier rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -17,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import layouts
 from mcaptrack.foxglove.views.layouts import ERRORS, PEOPLE, SPREAD
 from mcaptrack.geometry.plane import Planes, moved_planes
+from mcaptrack.location import sibling
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import describe_origin, may_replace
 from mcaptrack.pipeline.drawing import (
@@ -217,12 +220,7 @@ def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw
     inputs = {topic: channel.provenance.input for topic, channel in results.items()}
     for topic in sorted(camera.topics - shown.keys() - gone):
         how = Provenance.from_metadata(opened.channels[topic].metadata)
-        schema = SCHEMAS.get(opened.channels[topic].schema_name)
-        if how is None or schema is None or not _is_due(state, camera, topic, schema, how):
-            continue
-        names, made_by = class_names(opened.channels[topic].metadata), how.transform if how.transform in STAGES else ""
-        drawing = ChannelToDraw(schema, opened.frame_columns(topic, schema), how.digest, made_by, names, how.frame_id)
-        if camera.pictures or drawing.is_on_ground():
+        if how is not None and (drawing := _due_of_log(state, camera, topic, how)):
             shown[topic], inputs[topic] = drawing, how.input
     for topic, drawing in shown.items():
         if drawing.schema is PREDICTIONS:
@@ -230,16 +228,44 @@ def channels_to_draw(state: RunState, camera: Camera) -> dict[str, ChannelToDraw
     return shown
 
 
-def _is_due(state: RunState, camera: Camera, topic: str, schema: Schema, how: Provenance) -> bool:
-    """Return whether a channel of the log is drawn, and its view is missing or shows earlier rows."""
-    opened, full = state.opened, topic + FULL
+def _due_of_log(state: RunState, camera: Camera, topic: str, how: Provenance) -> ChannelToDraw | None:
+    """Return a channel of the log if a view of it is due. Its rows are read only if one may be."""
+    channel = state.opened.channels[topic]
+    schema = SCHEMAS.get(channel.schema_name)
+    if schema is None or not _is_drawn(state, camera, topic, schema):
+        return None
+    is_outdated = _is_outdated(state.opened, topic, how)
+    lacks_image = camera.pictures and schema in views.DRAWN and topic + views.SUFFIX not in state.opened.channels
+    if not (is_outdated or lacks_image):
+        return None
+    names, made_by = class_names(channel.metadata), how.transform if how.transform in STAGES else ""
+    frames = state.opened.frame_columns(topic, schema)
+    drawing = ChannelToDraw(schema, frames, how.digest, made_by, names, how.frame_id)
+    if is_outdated:
+        return drawing if camera.pictures or drawing.is_on_ground() else None
+    return drawing if _is_in_pictures(state, topic, drawing, how) else None
+
+
+def _is_drawn(state: RunState, camera: Camera, topic: str, schema: Schema) -> bool:
+    """Return whether a channel of the log gets views."""
     is_drawn = schema in views.DRAWN or (schema is GROUND_PLANE and topic == f"{camera.prefix}/ground_plane")
-    if not is_drawn or topic.endswith(NOT_SHOWN) or full in {*opened.channels, *state.results} - state.gone:
-        return False
+    full = topic + FULL in {*state.opened.channels, *state.results} - state.gone
+    return is_drawn and not topic.endswith(NOT_SHOWN) and not full
+
+
+def _is_outdated(opened: log.Log, topic: str, how: Provenance) -> bool:
+    """Return whether a channel has no view, or those of earlier rows."""
     names = [topic + suffix for suffix in views.SUFFIXES]
     names += [view for view in opened.channels if view.startswith(f"{topic}{views.SUFFIX}/")]
     drawn = [Provenance.from_metadata(opened.channels[name].metadata) for name in names if name in opened.channels]
     return not any(view is not None and view.input_digest == how.digest for view in drawn)
+
+
+def _is_in_pictures(state: RunState, topic: str, drawing: ChannelToDraw, how: Provenance) -> bool:
+    """Return whether a channel is drawn in the pictures of its camera, which may have come after its other view."""
+    bodies = _bodies(_Current(state, {}), topic, how.input) if drawing.schema is PREDICTIONS else ()
+    is_solid = drawing._replace(bodies=bodies).is_solid()
+    return not is_solid and len(picture_clock(state.opened, state.prefix, {}).t_ns) > 0
 
 
 def _nothing(opened: log.Log, topic: str) -> ChannelToDraw:
@@ -364,22 +390,29 @@ def highest_values(prefix: str, frames_of: Callable[[str, Schema], Sequence[Fram
 def with_views(opened: log.Log) -> Iterator[tuple[log.Log, dict[str, bytes]]]:
     """Yield a log with the views that are due, which are in a temporary file, and the layouts for all of it, by name.
 
-    It yields the log itself, and no layouts, if no view is due. The log on the disk stays as it is.
+    It yields the log itself, and no layouts, if no view is due, or if others recorded what stands in its place. The log
+    on the disk stays as it is. Raises McaptrackError if the folder of temporary files has no room.
     """
     due = [camera for camera in cameras(opened) if channels_to_draw(RunState(opened, camera.prefix, {}), camera)]
-    if not due:
+    made = [make_views(RunState(opened, at.prefix, {}), read_planes(opened, at.prefix) or ()) for at in due]
+    drawn = [views_of_camera for views_of_camera in made if views_of_camera and views_of_camera.topics]
+    if not drawn:
         yield opened, {}
         return
-    made_layouts: dict[str, bytes] = {}
-    with TemporaryDirectory(prefix="mcaptrack-views-") as folder:
-        path = Path(folder, f"{opened.path.name.removesuffix('.mcap')}.views.mcap")
-        with log.create(path) as writer:
-            streams = []
-            for camera in due:
-                if drawn := make_views(RunState(opened, camera.prefix, {}), read_planes(opened, camera.prefix) or ()):
-                    made_layouts |= drawn.layouts
-                    streams += add_views(writer, (*drawn.first, *drawn.last), PROTOBUF)
-            write_by_time(writer, streams)
-        with log.read(opened.path) as complete:
-            complete.attach_results(log.read(path), is_new=False)
-            yield complete, made_layouts
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(TemporaryDirectory(prefix="mcaptrack-views-"))
+            path = sibling(Path(folder, opened.path.name), ".views.mcap", of=opened.path.name.removesuffix(".mcap"))
+            with log.create(path) as writer:
+                streams = [add_views(writer, (*each.first, *each.last), PROTOBUF) for each in drawn]
+                write_by_time(writer, chain.from_iterable(streams))
+        except (OSError, McaptrackError) as error:
+            if isinstance(error, McaptrackError) and not isinstance(error.__cause__, OSError):
+                raise
+            raise McaptrackError(
+                f"views that {opened.path} lacks can't be drawn in a temporary file ({error}); the variable TMPDIR "
+                f"names another folder, and {call('run', opened.path)} keeps them in the log"
+            ) from error
+        complete = stack.enter_context(log.read(opened.path))
+        complete.attach_results(log.read(path), is_new=False)
+        yield complete, {name: layout for each in drawn for name, layout in each.layouts.items()}

@@ -87,7 +87,7 @@ class Stage:
     beside : tuple[str, ...]
         Outputs that are made wherever the main one is, also again in logs that lack them.
     package : tuple[str, str]
-        Name and version of the installed package that it is of; ("", "") for those of mcaptrack.
+        Name and version of the installed package that has the stage; ("", "") for those of mcaptrack.
     """
 
     name: str

@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import urlencode
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack import log
 from mcaptrack.errors import DamagedError, McaptrackError
@@ -19,7 +20,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind
 from mcaptrack.schema.classes import class_names, is_person
-from mcaptrack.schema.framing import join_frames
+from mcaptrack.schema.framing import frame_times, join_frames, row_ends
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import is_video_codec
@@ -105,6 +106,7 @@ KINDS: Final = (EventKind.SWITCH, EventKind.JOINED, EventKind.PARTED)
 LEAD_S: Final = 1.0
 #: The tracks that viewers show first, below the name of a camera; the first that has events or people is opened.
 _BEST: Final = ("retracks", "tracks")
+_NO_TRACKS: Final = (np.empty(0, np.int64), np.empty(0, np.int64))
 
 
 class LinkedEvent(NamedTuple):
@@ -185,16 +187,26 @@ def opening_moment(opened: log.Log, moments: Sequence[LinkedEvent]) -> tuple[int
         if first is not None:
             return before(first.t_ns, opened.start_ns), f"a second before event {first.event} ({first.text})"
     for name in _BEST:
-        for topic, channel in sorted(opened.channels.items()):
-            if topic.endswith(f"/{name}/counts") and channel.holds(COUNTS):
-                joined = join_frames(COUNTS, opened.frame_columns(topic, COUNTS))
-                tracked = joined.rows["tracked"].astype(np.int64)
-                if tracked.any():
-                    at = int(np.argmax(2 * tracked >= tracked.max()))
-                    return int(joined.row_ns[at]), f"where there are {tracked[at]} of at most {tracked.max()} tracks"
+        for topic in sorted(opened.channels):
+            t_ns, tracked = _tracks_over_time(opened, topic) if topic.endswith(f"/{name}") else _NO_TRACKS
+            if tracked.any():
+                at = int(np.argmax(2 * tracked >= tracked.max()))
+                return int(t_ns[at]), f"where there are {tracked[at]} of at most {tracked.max()} tracks"
     if moments:
         return before(moments[0].t_ns, opened.start_ns), f"a second before event 1 ({moments[0].text})"
     return opened.start_ns, "its start: nothing is tracked in it yet"
+
+
+def _tracks_over_time(opened: log.Log, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return times in ns and the number of tracks at each: as they were counted, or else of the tracks themselves."""
+    counts, channel = opened.channels.get(f"{topic}/counts"), opened.channels[topic]
+    if counts is not None and counts.holds(COUNTS):
+        joined = join_frames(COUNTS, opened.frame_columns(counts.topic, COUNTS))
+        return joined.row_ns, joined.rows["tracked"].astype(np.int64)
+    if not channel.holds(TRACKS):
+        return _NO_TRACKS
+    frames = opened.frame_columns(topic, TRACKS)
+    return frame_times(frames), np.diff(row_ends(frames))
 
 
 def seconds_of(opened: log.Log, t_ns: int) -> float:

@@ -93,7 +93,7 @@ def render(
 
     def drawn() -> Iterator[tuple[int, Image]]:
         span = int(chosen[0]), int(chosen[-1]) + 1
-        views = views_at(opened, view_topics, span)
+        views, done = views_at(opened, view_topics, span), 0
         for done, frame in enumerate(pictures.readable(numbers.tolist()), 1):
             whole = np.asarray(frame.rows, np.uint8)
             if hidden is not None:
@@ -105,6 +105,8 @@ def render(
                     image = draw(image, annotations, scale)
             yield frame.t_ns, image
             progress("render", done, len(chosen))
+        if not done:
+            raise McaptrackError(f"{opened.path}: no picture of {picture_topic} in this time can be decoded")
 
     return write_clip(output, drawn(), rate_of(chosen))
 
