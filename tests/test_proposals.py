@@ -7,9 +7,11 @@ import html
 import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -62,6 +64,12 @@ class Scene:
         """Make the log again."""
         done("ingest", *words, "-o", f"./{NAME}", "--force")
         return self
+
+    def without_temporary_folder(self) -> str:
+        """Look at a log that lacks views, where none can be drawn."""
+        self.ingested("truth.txt", "--as", "truth", "--fps", "10")
+        with patch.object(tempfile, "tempdir", "./gone"):
+            return self.says("view", "LOG")
 
     def cubes(self) -> Scene:
         """Add a file of 3D labels."""
@@ -196,6 +204,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "viewing/report/figures.py:identity_events:view": Scene.page,
     "api/viewing.py:_say_trouble:ingest": lambda s: s.says("view", "LOG"),
     "api/viewing.py:view:run": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says("view", "LOG"),
+    "pipeline/views.py:with_views:run": Scene.without_temporary_folder,
     "api/viewing.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
         "evaluate", "LOG", "--truth", "truth.txt"

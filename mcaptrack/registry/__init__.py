@@ -240,7 +240,7 @@ def ignored(kind: Kind) -> dict[str, str]:
 
 
 def _owner(kind: Kind, name: str) -> str:
-    """What has this name, so that no entry point of the kind can: a built-in entry, or the command of a stage."""
+    """The entry with this name, which no entry point of the kind can have: a built-in one, or a command; "" if none."""
     if name in BUILT_IN[kind]:
         return f"a built-in {titled(kind, name)}"
     return f"a {titled('command', name)}" if kind == "stage" and name in names("command") else ""
