@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Final, NamedTuple
@@ -18,6 +19,11 @@ from mcaptrack.transforms import STAGES
 SCENE: Final = "/world"
 #: The channels that a run can begin with, if a camera has no pictures and no boxes of others.
 _BEGINNINGS: Final = tuple(STAGES[name].input_topic for name in ("track", "sample", "predict"))
+#: What image_transport of ROS adds to the topic of pictures for a second form of them.
+_TRANSPORTS: Final = ("compressed", "theora", "ffmpeg", "avif", "zstd")
+#: Topics of depth cameras, and the pixel formats of distances.
+_DEPTH: Final = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)
+_RANGES: Final = ("16uc1", "32fc1", "mono16")
 
 
 class ChosenCameras(NamedTuple):
@@ -40,7 +46,7 @@ def choose_cameras(opened: log.Log, names: Sequence[str] = ()) -> ChosenCameras 
     if not names and not wanted:
         return None
     wanted_scenes = tuple(camera.prefix for camera in named if camera.prefix in scenes)
-    chosen, lacks = split_by_lack(wanted, partial(_lack, opened))
+    chosen, lacks = split_by_lack(wanted, partial(_lack, opened) if names else partial(_unfit, opened))
     if not chosen and not wanted_scenes:
         why = "; ".join(f"{name} {reason}" for name, reason in lacks.items())
         raise McaptrackError(f"{opened.path} has no camera to begin with: {why}")
@@ -92,6 +98,22 @@ def _lack(opened: log.Log, camera: Camera) -> str:
             return f"has no picture in {camera.pictures} that can be decoded"
     except McaptrackError as error:
         return f"has pictures that can't be read: {error}"
+    return ""
+
+
+def _unfit(opened: log.Log, camera: Camera) -> str:
+    """The reason why a camera that no option names isn't run; "" if there is none."""
+    if lack := _lack(opened, camera):
+        return lack
+    topic = camera.pictures
+    if topic is None or has_own_channels(opened, camera):
+        return ""
+    base, _, transport = topic.rpartition("/")
+    raw = opened.channels.get(base)
+    if transport in _TRANSPORTS and raw is not None and raw.messages and foreign.holds_pictures(raw):
+        return f"has the pictures of {base} a second time ({transport}); `camera=` runs it"
+    if _DEPTH.search(topic) and next(foreign.pictures(opened, topic))[1].format in _RANGES:
+        return f"has depths in {topic}, in which people are not detected; `camera=` runs it"
     return ""
 
 

@@ -1,0 +1,56 @@
+"""Pictures that are recorded twice, and depths: one camera is run once."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+from mcap.writer import Writer
+
+import mcaptrack
+from tests.worlds import small_scene
+
+RAW, COMPRESSED, DEPTH = "/cam/color/image_raw", "/cam/color/image_raw/compressed", "/cam/depth/image_rect"
+
+
+def written(path: Path, *topics: str) -> Path:
+    """A log of the same pictures on these topics: as jpeg on one, as distances on the last."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic in topics:
+            name = "foxglove.CompressedImage" if topic == COMPRESSED else "foxglove.RawImage"
+            schema = writer.register_schema(name, "jsonschema", b"{}")
+            channel = writer.register_channel(topic, "json", schema)
+            for number, shot in enumerate(small_scene(3.0).shots()):
+                image = cv2.cvtColor(shot.image, cv2.COLOR_BGR2GRAY)
+                height, width = image.shape
+                data, encoding, step = image.tobytes(), "mono8", width
+                if topic == DEPTH:
+                    data, encoding, step = (image.astype("<u2") * 20).tobytes(), "16UC1", 2 * width
+                if topic == COMPRESSED:
+                    data = cv2.imencode(".jpg", shot.image)[1].tobytes()
+                t_ns = 10**9 + number * 10**8
+                stamp = {"timestamp": {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}, "format": "jpeg"}
+                about = {"width": width, "height": height, "encoding": encoding, "step": step}
+                content = json.dumps(stamp | about | {"data": base64.b64encode(data).decode()}).encode()
+                writer.add_message(channel, t_ns, content, t_ns)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("topics", [(RAW, COMPRESSED), (RAW, COMPRESSED, DEPTH), (RAW, DEPTH)])
+def test_a_camera_that_is_recorded_twice_is_run_once(tmp_path, topics):
+    result = mcaptrack.run(written(tmp_path / "a.mcap", *topics), tables=False)
+    assert {topic for topic in result.channels if topic.endswith("/detections")} == {"/cam/color/detections"}
+    assert len(result.left_out) == len(topics) - 1
+    assert ("cam/depth" in result.left_out) is (DEPTH in topics)
+    named = mcaptrack.run(tmp_path / "a.mcap", camera=next(iter(result.left_out)), tables=False)
+    assert named.stages[0] == "detect"
+
+
+def test_the_only_pictures_are_run_whatever_their_names(tmp_path):
+    assert "/cam/color/image_raw/detections" in mcaptrack.run(written(tmp_path / "a.mcap", COMPRESSED)).channels
