@@ -67,7 +67,7 @@ class Scene:
 
     def without_temporary_folder(self) -> str:
         """Look at a log that lacks views, where none can be drawn."""
-        self.ingested("truth.txt", "--as", "truth", "--fps", "10")
+        self.ingested("clip.mp4", "--truth", "truth.txt", "--ground-plane", "plane.txt")
         with patch.object(tempfile, "tempdir", "./gone"):
             return self.says("view", "LOG")
 
@@ -203,7 +203,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/viewing.py:_report:report": lambda s: s.with_an_old_report().says("view", "LOG"),
     "viewing/report/figures.py:identity_events:view": Scene.page,
     "api/viewing.py:_say_trouble:ingest": lambda s: s.says("view", "LOG"),
-    "api/viewing.py:view:run": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says("view", "LOG"),
+    "api/viewing.py:view:run": lambda s: s.ingested("clip.mp4", "--truth", "truth.txt").says("view", "LOG"),
     "pipeline/views.py:with_views:run": Scene.without_temporary_folder,
     "api/viewing.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(
