@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from mcaptrack import log
+from mcaptrack.log.messages import Payloads
 from mcaptrack.pipeline.views import make_views
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import CLOCK, Provenance
+from mcaptrack.tables import Pointers, TablePieces, messages
 from tests.commands import zones_file
 from tests.worlds import boxes_at, ns, tracks_at
 
@@ -153,3 +156,17 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
 }
 if find_spec("torch"):  # without it `train` reads nothing
     READING["train"] = lambda log, out: [log, "-o", out / "trained", "--epochs", "1", "--device", "cpu"]
+
+
+def flat_table(rows: Sequence[Mapping[str, object]], blobs: bool) -> tuple[TablePieces, list[str]]:
+    """The table of messages with these fields."""
+    numbers = np.arange(len(rows))
+    places = Pointers("a.mcap", numbers, numbers, numbers, numbers, numbers)
+    starts = 8 * numbers
+    data = Payloads(numbers, numbers.astype("<i8").view(np.uint8), starts, starts + 8)
+
+    def flatten(payload: bytes) -> dict[tuple[str, ...], object]:
+        return {(name,): value for name, value in rows[int.from_bytes(payload, "little")].items()}
+
+    fields = messages.inferred_fields("a.mcap: /a", lambda: iter([data]), flatten, lambda _: True, blobs)
+    return messages.messages_table("/a", "A", places, fields), [name for (name,) in fields.left_out]

@@ -224,7 +224,7 @@ def test_a_foreign_channel_becomes_a_table_with_sql_names(tmp_path):
     done = exported(some_log(tmp_path / "a.mcap"), tmp_path, topics=["/imu"], progress=lambda *some: told.append(some))
     assert told == [("export", count, len(told)) for count in range(1, len(told) + 1)]  # one table after the other
     assert done.rows["topics/imu"] == 4
-    query = "select frame, t_ns, header_stamp_ns, header_frame_id, gyro_x, cov[2], n from '@/topics/imu/*/*.parquet' order by n"
+    query = "select frame, t_ns, epoch_ns(header_stamp), header_frame_id, gyro_x, cov[2], n from '@/topics/imu/*/*.parquet' order by n"
     assert ask(query, tmp_path) == [(n, ns(n) + 7, ns(1) + 5, "imu", 0.5, 2.0, n) for n in range(4)]
     assert ask("select distinct topic from '@/topics/imu/*/*.parquet'", tmp_path) == [("/imu",)]
     field = pq.read_schema(tmp_path / "topics/imu/recording=a/part-0.parquet").field("gyro_x")

@@ -284,6 +284,8 @@ class _List(_Counted):
     def __init__(self, of: _Type, fixed: int | None, most: int, order: str, is_aligned: bool) -> None:
         super().__init__(order, is_aligned)
         self.of, self.fixed, self.most = of, fixed, most
+        self.is_bytes = isinstance(of, _Number) and of.is_byte
+        self.is_blob = self.is_bytes and fixed is None
         self.stride = of.size + -of.size % of.align if of.size >= 0 else 0 if fixed == 0 else -1
         if fixed is not None:
             self.align, self.least = of.align, fixed * of.least
@@ -316,7 +318,7 @@ class _List(_Counted):
         sizes = self._aligned(cursor, counts)
         data = cursor.joined(sizes, ends * self.stride)
         cursor.move(sizes)
-        if isinstance(self.of, _Number) and self.of.is_byte:
+        if self.is_bytes:
             buffers = [None, limits.buffers()[1], pa.py_buffer(data)]
             return pa.Array.from_buffers(pa.binary(), len(counts), buffers)
         start = np.arange(ends[-1]) * self.stride
@@ -454,6 +456,13 @@ class RosColumns:
     encoding : {"cdr", "ros1"}
     wanted : callable, optional
         Whether a field, by its path, is wanted; others are skipped.
+    blobs : bool, default True
+        Whether fields of any number of bytes, as pictures are, are wanted, too.
+
+    Attributes
+    ----------
+    left_out : dict of Path
+        The fields of bytes that were not wanted.
 
     Raises
     ------
@@ -467,9 +476,10 @@ class RosColumns:
         name: str,
         encoding: str = "cdr",
         wanted: Callable[[Path], bool] = lambda _: True,
+        blobs: bool = True,
     ) -> None:
-        self.is_cdr = encoding == "cdr"
-        self._definitions, self._wanted, self._types = definitions, wanted, 0
+        self.is_cdr, self.left_out = encoding == "cdr", dict[Path, None]()
+        self._definitions, self._wanted, self._blobs, self._types = definitions, wanted, blobs, 0
         self._by_order = {order: self._struct(name, order, ()) for order in ("<>" if self.is_cdr else "<")}
 
     def _struct(self, name: str, order: str, path: Path) -> _Struct:
@@ -482,7 +492,11 @@ class RosColumns:
         for field, of in self._definitions[name][1]:
             if self.is_cdr or field != _PLACEHOLDER:
                 inside = (*path, field)
-                fields.append((field, self._type(of, order, inside), self._wanted(inside) and field != _PLACEHOLDER))
+                kind = self._type(of, order, inside)
+                is_wanted = self._wanted(inside) and field != _PLACEHOLDER
+                if is_wanted and not self._blobs and isinstance(kind, _List) and kind.is_blob:
+                    self.left_out[inside], is_wanted = None, False
+                fields.append((field, kind, is_wanted))
         return _Struct(name, fields)
 
     def _type(self, of: Any, order: str, path: Path) -> _Type:

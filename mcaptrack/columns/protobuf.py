@@ -108,7 +108,7 @@ class _Fields:
     def _singly(self, row: Ints, at: Ints, end: Ints) -> tuple[Ints, ...]:
         """All fields of a few rows."""
         out: list[tuple[int, int, int, int, int]] = []
-        data = memoryview(self.data)
+        data = self.data.data
 
         def varint(at: int) -> tuple[int, int]:
             value = shift = 0
@@ -139,7 +139,8 @@ class _Fields:
         length, size = _varints(self.data, np.minimum(at, end))
         is_sized = wire == _SIZED_BYTES
         at = at + np.where(is_sized, size, 0)
-        sizes = [length.astype(np.int64), size, 8, 4]
+        wide, narrow = np.full_like(at, 8), np.full_like(at, 4)
+        sizes = [length.astype(np.int64), size, wide, narrow]
         size = np.select([is_sized, wire == _VARINT, wire == _WIDE, wire == _NARROW], sizes, -1)
         number = (tag >> np.uint64(3)).astype(np.int64)
         bad = (tag_size > 5) | (size < 0) | (number < 1) | (at > end) | (size > end - at)
@@ -155,39 +156,59 @@ class ProtobufColumns:
     ----------
     message : Descriptor
         Of the type.
-    wanted : callable, optional
-        Whether a field, by its path, is wanted.
+    wanted, blobs, left_out
+        As of ``cdr.RosColumns``.
+
+    Raises
+    ------
+    Unsupported
+        If messages of the type are in messages of the same type.
     """
 
-    def __init__(self, message: Descriptor, wanted: Callable[[Path], bool] = lambda _: True) -> None:
-        self._message, self._wanted = message, wanted
+    def __init__(
+        self, message: Descriptor, wanted: Callable[[Path], bool] = lambda _: True, blobs: bool = True
+    ) -> None:
+        self._message, self._wanted, self._blobs, self.left_out = message, wanted, blobs, dict[Path, None]()
+        self._fields = dict[Path, list[FieldDescriptor]]()
+        self._choose(message, (), ())
+
+    def _choose(self, of: Descriptor, path: Path, around: tuple[str, ...]) -> None:
+        """The fields that are wanted of a message, and of those in it."""
+        if of.full_name in around or len(path) > MAX_DEPTH:
+            raise Unsupported(f"{of.full_name} is in itself, or messages are more than {MAX_DEPTH} deep")
+        self._fields[path] = []
+        for field in of.fields:
+            inside = (*path, field.name)
+            if not self._wanted(inside):
+                continue
+            if field.type == field.TYPE_GROUP:
+                raise Unsupported("groups are not read")
+            if field.type == field.TYPE_BYTES and not self._blobs:
+                self.left_out[inside] = None
+                continue
+            self._fields[path].append(field)
+            if field.message_type is not None and not _is_time(field):
+                self._choose(field.message_type, inside, (*around, of.full_name))
 
     def read(self, data: Bytes, start: Ints, end: Ints) -> dict[Path, pa.Array]:
         """As ``cdr.RosColumns.read``; fields that are not set are null, or 0 where the schema says nothing else."""
         padded = np.concatenate([data, np.zeros(_PADDING, np.uint8)])
         rows = _Fields(padded, start.astype(np.int64), end.astype(np.int64), np.arange(len(start)))
-        return dict(self._columns(self._message, rows, (), None))
+        return dict(self._columns((), rows, None))
 
-    def _columns(self, of: Descriptor, rows: _Fields, path: Path, take: Any) -> Iterator[tuple[Path, pa.Array]]:
+    def _columns(self, path: Path, rows: _Fields, take: Any) -> Iterator[tuple[Path, pa.Array]]:
         """The columns of a message; ``take`` are the places of its rows among those of the message around it."""
-        if len(path) > MAX_DEPTH:
-            raise Unsupported(f"messages are more than {MAX_DEPTH} deep")
-        for field in of.fields:
+        for field in self._fields[path]:
             inside = (*path, field.name)
-            if not self._wanted(inside):
-                continue
             if not _is_embedded(field):
-                column = self._column(field, rows, len(path))
+                column = self._column(field, rows, inside)
                 yield (*path, _titled(field)), column if take is None else column.take(take)
                 continue
             inner, places = self._embedded(field, rows)
-            outer = places if take is None else places.take(take)
-            yield from self._columns(field.message_type, inner, inside, outer)
+            yield from self._columns(inside, inner, places if take is None else places.take(take))
 
     def _embedded(self, field: FieldDescriptor, rows: _Fields) -> tuple[_Fields, pa.Array]:
         """The rows of a message in another one, and for each outer row its place among them, or null."""
-        if field.type == field.TYPE_GROUP:
-            raise Unsupported("groups are not read")
         which = np.flatnonzero((rows.number == field.number) & (rows.wire == _SIZED_BYTES))
         if len(which) and (np.diff(rows.row[which]) == 0).any():
             raise Unsupported("parts of a message are to be merged")
@@ -199,19 +220,17 @@ class ProtobufColumns:
         inner = _Fields(rows.data, at, at + rows.size[which], rows.message[rows.row[which]])
         return inner, pa.array(place, mask=missing)
 
-    def _column(self, field: FieldDescriptor, rows: _Fields, depth: int) -> pa.Array:
+    def _column(self, field: FieldDescriptor, rows: _Fields, path: Path) -> pa.Array:
         """The column of a field with values, or with a list of anything."""
-        if field.type == field.TYPE_GROUP:
-            raise Unsupported("groups are not read")
         which = np.flatnonzero(rows.number == field.number)
         if field.is_repeated:
-            row, values = self._values(field, rows, which, depth)
+            row, values = self._values(field, rows, which, path)
             ends = ends_of(np.bincount(row, minlength=rows.count))
             return pa.ListArray.from_arrays(pa.array(ends.astype(np.int32)), values)
         place = np.full(rows.count, -1)
         place[rows.row[which]] = which  # the last one counts
         is_set = place >= 0
-        _, values = self._values(field, rows, place[is_set], depth)
+        _, values = self._values(field, rows, place[is_set], path)
         if is_set.all():
             return values
         places = np.cumsum(is_set) - 1
@@ -221,7 +240,7 @@ class ProtobufColumns:
             return values.take(pa.array(np.where(is_set, places, len(values) - 1)))
         return values.take(pa.array(places, mask=~is_set))
 
-    def _values(self, field: FieldDescriptor, rows: _Fields, which: Ints, depth: int) -> tuple[Ints, pa.Array]:
+    def _values(self, field: FieldDescriptor, rows: _Fields, which: Ints, path: Path) -> tuple[Ints, pa.Array]:
         """The rows of values, and the values, of some of the fields."""
         row, wire, at, size = rows.row[which], rows.wire[which], rows.at[which], rows.size[which]
         if field.type in _SIZED or field.message_type:
@@ -229,7 +248,7 @@ class ProtobufColumns:
                 raise Unsupported("a field is of another type")
             if field.message_type:
                 inner = _Fields(rows.data, at, at + size, rows.message[row])
-                return row, self._structs(field.message_type, inner, depth + 1)
+                return row, self._structs(field.message_type, inner, path)
             return row, self._texts(field, rows, row, at, size)
         form = _FIXED.get(field.type, "")
         odd = wire != ({8: _WIDE, 4: _NARROW}[np.dtype(form).itemsize] if form else _VARINT)
@@ -279,23 +298,23 @@ class ProtobufColumns:
         texts = [names[number].name if number in names else str(number) for number in occurring.tolist()]
         return pa.array(texts, pa.string()).take(pa.array(place))
 
-    def _structs(self, of: Descriptor, rows: _Fields, depth: int) -> pa.Array:
+    def _structs(self, of: Descriptor, rows: _Fields, path: Path) -> pa.Array:
         """Messages in a list, or times."""
-        if depth > MAX_DEPTH:
-            raise Unsupported(f"messages are more than {MAX_DEPTH} deep")
         if of.full_name in (_TIME, _DURATION):
-            seconds, parts = (self._column(field, rows, depth).to_numpy().astype(np.int64) for field in of.fields)
+            seconds, parts = (self._column(field, rows, path).to_numpy().astype(np.int64) for field in of.fields)
             t_ns = seconds * _NS_PER_S + parts
             return as_times(t_ns) if of.full_name == _TIME else pa.array(t_ns)
-        columns = dict(self._nested(of, rows, depth))
+        columns = dict(self._nested(rows, path))
         if not columns:
             return pa.Array.from_buffers(pa.struct([]), rows.count, [None])
         return pa.StructArray.from_arrays(list(columns.values()), list(columns))
 
-    def _nested(self, of: Descriptor, rows: _Fields, depth: int) -> Iterator[tuple[str, pa.Array]]:
-        for field in of.fields:
+    def _nested(self, rows: _Fields, path: Path) -> Iterator[tuple[str, pa.Array]]:
+        for field in self._fields[path]:
+            inside = (*path, field.name)
             if _is_embedded(field):
                 inner, places = self._embedded(field, rows)
-                yield field.name, self._structs(field.message_type, inner, depth + 1).take(places)
+                assert field.message_type is not None
+                yield field.name, self._structs(field.message_type, inner, inside).take(places)
             else:
-                yield _titled(field), self._column(field, rows, depth)
+                yield _titled(field), self._column(field, rows, inside)

@@ -48,6 +48,8 @@ OPEN_BYTES: Final = 128 * 2**20
 _KEPT_BYTES: Final = 8 * 2**20
 #: Messages outside of chunks are read one by one if their average distance in the file is larger.
 _MAX_GAP_BYTES: Final = 16 * 2**10
+#: Payloads come in batches of this many bytes at least: fewer make each step for few messages, more exceed the caches.
+_BATCH_BYTES: Final = 4 * 2**20
 #: Chunks in a store that are smaller together are read with their indexes, others after them. Indexes that are nearer
 #: to each other come in one request.
 _READ_AT_ONCE_BYTES: Final = 16 * 2**20
@@ -70,6 +72,15 @@ class ChannelRows(NamedTuple):
     t_ns: Ints
     sequence: Ints
     counts: Ints
+
+
+class Payloads(NamedTuple):
+    """Messages in time order, (M,): their times in ns, and their bytes: ``data`` from ``start`` to before ``end``."""
+
+    t_ns: Ints
+    data: NDArray[np.uint8]
+    start: Ints
+    end: Ints
 
 
 class MessageLocations(NamedTuple):
@@ -369,6 +380,19 @@ def joined_by_chunk(batches: Sequence[MessageBatch], *, reverse: bool) -> tuple[
     ], of
 
 
+def _joined_payloads(parts: Sequence[Payloads]) -> Payloads:
+    """Payloads behind each other, in one buffer."""
+    if len(parts) == 1:
+        return parts[0]
+    before = np.cumsum([0, *(len(part.data) for part in parts)]).tolist()
+    start, end = (
+        np.concatenate([places + size for places, size in zip(columns, before, strict=False)])
+        for columns in ([part.start for part in parts], [part.end for part in parts])
+    )
+    t_ns = np.concatenate([part.t_ns for part in parts])
+    return Payloads(t_ns, np.concatenate([part.data for part in parts]), start, end)
+
+
 def overlaps(chunk: ChunkIndex, span: Span) -> bool:
     """Whether a chunk may have messages in a span of times."""
     first, last = span
@@ -494,6 +518,24 @@ class Messages:
             if taken[number] == len(batch.t_ns):
                 del opened[number]
                 size -= batch.size
+
+    def payloads(self, channels: Sequence[int], span: Span = (None, None)) -> Iterator[Payloads]:
+        """The bytes of messages in time order, in batches of whole chunks."""
+        waiting: list[Payloads] = []
+        for group in self._located(channels, span).in_order():
+            joined = _joined_payloads([self._payloads(batch) for batch in group])
+            order = np.argsort(joined.t_ns, kind="stable")
+            waiting.append(Payloads(joined.t_ns[order], joined.data, joined.start[order], joined.end[order]))
+            if sum(len(part.data) for part in waiting) >= _BATCH_BYTES:
+                yield _joined_payloads(waiting)
+                waiting = []
+        if waiting:
+            yield _joined_payloads(waiting)
+
+    def _payloads(self, batch: MessageBatch) -> Payloads:
+        content, offset = self._open(batch)
+        heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
+        return Payloads(to_int64(batch.t_ns), np.frombuffer(content, np.uint8), heads.start, heads.end)
 
     def columns(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> ChannelRows | None:
         """Rows without a loop over messages; None if a message has another layout than the reader's."""

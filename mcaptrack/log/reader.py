@@ -29,7 +29,7 @@ from mcaptrack.log.byte_source import ByteSource, OpenFile, ReadFile, Signature,
 from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.journal import changed, find_journal, recover_hint
-from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, Span, TimeOutOfRange
+from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, Payloads, Span, TimeOutOfRange
 from mcaptrack.log.records import Damaged
 from mcaptrack.log.remote import RemoteFile
 from mcaptrack.objects import Version
@@ -468,6 +468,19 @@ class Log:
         channels = self._ids(topic)
         with self.snapshot.reporting_damage():
             yield from self._messages.by_time(channels, (start_ns, end_ns))
+            self.snapshot.confirm_unchanged(channels)
+
+    def payloads(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Payloads]:
+        """The bytes of the messages that ``messages`` gives, in batches, without an object for each.
+
+        Raises McaptrackError where the file is damaged, and for times that don't fit into int64.
+        """
+        if (part := self.part(topic)) is not self:
+            yield from part.payloads(topic, start_ns, end_ns)
+            return
+        channels = self._ids(topic)
+        with self.snapshot.reporting_bad_times(topic):
+            yield from self._messages.payloads(channels, (start_ns, end_ns))
             self.snapshot.confirm_unchanged(channels)
 
     def records(

@@ -262,6 +262,8 @@ def _kind(kind: Any) -> str:
     """The name of a type, independent of the name that Parquet and Arrow give to members of lists."""
     import pyarrow as pa
 
+    if pa.types.is_struct(kind):
+        return f"struct<{', '.join(f'{field.name}: {_kind(field.type)}' for field in kind)}>"
     return f"list<{_kind(kind.value_type)}>" if pa.types.is_list(kind) else str(kind)
 
 
@@ -271,7 +273,7 @@ class _ColumnDigest:
     def __init__(self) -> None:
         self._values, self._missing, self._lengths = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
         self._rows = 0
-        self._within: _ColumnDigest | None = None
+        self._within: list[_ColumnDigest] = []
 
     def add(self, array: Any) -> None:
         """Add values, an Arrow array."""
@@ -288,18 +290,23 @@ class _ColumnDigest:
         elif pa.types.is_string(kind) or pa.types.is_binary(kind) or pa.types.is_large_string(kind):
             filled = array.fill_null("" if not pa.types.is_binary(kind) else b"")
             self._lengths.update(pc.binary_length(filled).to_numpy().astype("<i8").tobytes())
-            for value in filled.cast(pa.large_binary()).to_pylist():
-                self._values.update(value)
+            self._values.update(_bytes(filled.cast(pa.large_binary())))
         elif pa.types.is_list(kind):
             self._lengths.update(pc.list_value_length(array).fill_null(0).to_numpy().astype("<i8").tobytes())
-            self._within = self._within or _ColumnDigest()
-            self._within.add(array.flatten())
+            self._add_within([array.flatten()])
+        elif pa.types.is_struct(kind):
+            self._add_within(array.flatten())
         elif pa.types.is_null(kind):
             pass
         else:
             filled = array.fill_null(False if pa.types.is_boolean(kind) else 0) if array.null_count else array
             numbers = filled.cast(pa.int64()) if pa.types.is_timestamp(kind) else filled
             self._values.update(np.ascontiguousarray(numbers.to_numpy(zero_copy_only=False)).view(np.uint8).data)
+
+    def _add_within(self, arrays: Sequence[Any]) -> None:
+        self._within = self._within or [_ColumnDigest() for _ in arrays]
+        for column, array in zip(self._within, arrays, strict=True):
+            column.add(array)
 
     def _add_dictionary(self, array: Any) -> None:
         names = array.dictionary.to_pylist()
@@ -311,4 +318,13 @@ class _ColumnDigest:
     def digest(self) -> str:
         """The digest of all added values."""
         parts = [self._values.hexdigest(), self._missing.hexdigest(), self._lengths.hexdigest()]
-        return " ".join([*parts, self._within.digest() if self._within else ""])
+        return " ".join([*parts, *([column.digest() for column in self._within] or [""])])
+
+
+def _bytes(array: Any) -> Any:
+    """The bytes of all values of an array of large_binary, one behind the other."""
+    _, ends, data = array.buffers()
+    if data is None:
+        return b""
+    first, last = np.frombuffer(ends, np.int64)[[array.offset, array.offset + len(array)]].tolist()
+    return memoryview(data)[first:last]

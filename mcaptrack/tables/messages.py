@@ -1,174 +1,324 @@
-"""Flat messages of foreign channels -> Arrow: a column for each field, with names that need no quotes in SQL.
+"""Messages of channels of other software -> Arrow: a column for each field, with names that need no quotes in SQL.
 
 ``angular_velocity.x`` becomes ``angular_velocity_x``, because a dot would need quotes in every query; the path of the
-field is in the column's metadata. Columns get the narrowest type that holds all values: flags, int64, float64, text, or
-lists of these; mixed values become JSON text. The type is known when all messages were read, so their values wait in a
-temporary file, and the table is made in pieces.
+field is in the column's metadata. Columns have the types of the definition; messages in lists are structs. A message
+that can't be read has no values, and costs the others nothing.
+
+Messages without a definition (JSON) have the types of their values, which are known when all were read, so they wait in
+a temporary file: numbers, texts, lists and structs; values that no type holds become JSON text.
 """
 
 from __future__ import annotations
 
 import json
-import pickle
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.notices import warn
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.tables.build import Pointers, TablePieces, frames_table
 
-Path = tuple[str, ...]
+if TYPE_CHECKING:
+    from mcaptrack.columns import ProtobufColumns, RosColumns
+    from mcaptrack.log.messages import Payloads
 
-_EXACT: Final = 2**53
-_MAX_INT, _MAX_UINT = 2**63, 2**64
-#: A part of the messages ends after so many of them, or so many bytes in their values.
+Path = tuple[str, ...]
+Columns = Mapping[Path, Any]
+Flatten = Callable[[bytes], Mapping[Path, Any]]
+
+#: A part of flat messages ends after so many of them.
 _PART_MESSAGES: Final = 4096
-_PART_BYTES: Final = 4 * 2**20
 #: Bytes of rows after which a piece of the table ends, so that a table of pictures is made in pieces, too.
 _PIECE_BYTES: Final = 32 * 2**20
+#: If more messages of a channel can't be read, and more than half, it is of another type.
+_MOST_UNREAD: Final = 100
 
 
-def messages_table(
-    topic: str, schema_name: str, places: Pointers, rows: Iterable[Mapping[Path, Any]], blobs: bool = False
-) -> tuple[TablePieces, list[str]]:
-    """One channel as a table: time and place of each message, then its fields; and the paths of fields left out.
+class Fields(NamedTuple):
+    """The fields of a channel's messages: their types by path, those left out, and their columns, batch by batch."""
 
-    Fields of bytes are left out unless ``blobs``.
-    """
+    types: Mapping[Path, Any]
+    left_out: Sequence[Path]
+    columns: Callable[[], Iterator[tuple[int, Columns]]]
+
+
+class _Unread:
+    """The messages of a channel that can't be read: their times, and why."""
+
+    def __init__(self, where: str) -> None:
+        self._where, self._total, self._why = where, 0, dict[int, str]()
+
+    def count(self, messages: int) -> None:
+        """Count messages that are read next."""
+        self._total += messages
+
+    def add(self, t_ns: int, why: str) -> None:
+        """Add a message. Raises McaptrackError if most are of another type."""
+        self._why[t_ns] = why
+        unread = len(self._why)
+        if unread == self._total or (unread > _MOST_UNREAD and 2 * unread > self._total):
+            raise McaptrackError(f"{self._where}{self}")
+
+    def warn(self) -> None:
+        """Warn of them, if there are any."""
+        if self._why:
+            warn(f"{self._where}{self}; they have no values", "lost")
+
+    def __str__(self) -> str:
+        first = min(self._why)
+        many = f"; {len(self._why)} of {self._total} messages are like this" if len(self._why) > 1 else ""
+        return f" at {first} ns: {self._why[first]}{many}"
+
+
+def messages_table(topic: str, schema_name: str, places: Pointers, fields: Fields) -> TablePieces:
+    """A channel as a table: time and place of each message, then its fields."""
     import pyarrow as pa
 
-    kept = _KeptMessages(blobs)
-    for row in rows:
-        kept.add(row)
-    kept.close()
     head = frames_table({topic: places}).drop_columns(["rows"])
     names = dict.fromkeys(head.column_names, ())
-    left_out = [".".join(path) for path, facts in kept.facts.items() if facts.has_bytes and not blobs]
-    fields, makers = list(head.schema), dict[Path, _Maker]()
-    for path, facts in kept.facts.items():
-        if facts.has_bytes and not blobs:
-            continue
-        name = _free_name("_".join(path), names)
-        makers[path] = facts.maker()
+    columns = list(head.schema)
+    for path, kind in fields.types.items():
         unit = "ns" if path[-1].endswith("_ns") else ""
         metadata = {"unit": unit, "description": f"field {'.'.join(path)} of {schema_name or 'the message'}"}
-        fields.append(pa.field(name, makers[path].type, metadata=metadata | {"path": ".".join(path)}))
-    schema = pa.schema(fields)
+        name = _free_name("_".join(path), names)
+        columns.append(pa.field(name, kind, metadata=metadata | {"path": ".".join(path)}))
+    schema = pa.schema(columns)
 
     def pieces() -> Iterator[Any]:
         low = 0
-        for count, values in kept.parts():
-            empty = [None] * count
-            arrays = [
-                pa.array(
-                    [None if value is None else maker.make(value) for value in values.get(path, empty)], maker.type
-                )
-                for path, maker in makers.items()
-            ]
+        for count, values in fields.columns():
+            arrays = [values.get(path, pa.nulls(count, kind)) for path, kind in fields.types.items()]
             yield pa.table([*head.slice(low, count).columns, *arrays], schema=schema)
             low += count
 
-    return TablePieces(schema, head.num_rows, pieces, _PIECE_BYTES), left_out
+    return TablePieces(schema, head.num_rows, pieces, _PIECE_BYTES)
 
 
-class _KeptMessages:
-    """The values of flat messages, most of which wait in a temporary file, and facts about each field."""
+# Messages with a definition
 
-    def __init__(self, blobs: bool) -> None:
-        self.facts: dict[Path, _Facts] = {}
-        self._blobs = blobs
-        self._columns: dict[Path, list[Any]] = {}
-        self._count = self._bytes = 0
-        self._parts: list[Stored] = []
+
+def typed_fields(
+    where: str, reader: RosColumns | ProtobufColumns, payloads: Callable[[], Iterator[Payloads]], flatten: Flatten
+) -> Fields:
+    """The fields of messages that are read as columns, or, where ``reader`` can't, each by ``flatten``."""
+    nothing = np.empty(0, np.int64)
+    types = {path: column.type for path, column in reader.read(np.empty(0, np.uint8), nothing, nothing).items()}
+    for path in list(types):
+        with suppress(ValueError):
+            _settled(types[path])
+            continue
+        del types[path]  # its messages have no fields
+
+    def columns() -> Iterator[tuple[int, Columns]]:
+        unread = _Unread(where)
+        for batch in payloads():
+            unread.count(len(batch.t_ns))
+            yield len(batch.t_ns), _read(reader, batch, types, flatten, unread)
+        unread.warn()
+
+    return Fields(types, list(reader.left_out), columns)
+
+
+def _read(
+    reader: RosColumns | ProtobufColumns,
+    batch: Payloads,
+    types: Mapping[Path, Any],
+    flatten: Flatten,
+    unread: _Unread,
+) -> Columns:
+    """The columns of a batch, with nulls for messages that can't be read."""
+    import pyarrow as pa
+
+    from mcaptrack.columns import Malformed, Unsupported
+
+    parts: list[tuple[Ints, Columns]] = []
+    todo = [np.arange(len(batch.t_ns))]
+    while todo:
+        rows = todo.pop()
+        try:
+            parts.append((rows, reader.read(batch.data, batch.start[rows], batch.end[rows])))
+        except Malformed as error:
+            at = error.message
+            unread.add(int(batch.t_ns[rows[at]]), str(error))
+            todo += [some for some in (rows[at + 1 :], rows[:at]) if len(some)]
+        except Unsupported:
+            flat = list(_flat(batch, rows, flatten, unread))
+            parts.append((rows, {path: pa.array([row.get(path) for row in flat], types[path]) for path in types}))
+    if len(parts) == 1 and len(parts[0][0]) == len(batch.t_ns):
+        return parts[0][1]
+    read = np.concatenate([rows for rows, _ in parts] or [np.empty(0, np.int64)])
+    place = np.full(len(batch.t_ns), -1)
+    place[read] = np.arange(len(read))
+    take = pa.array(place, mask=place < 0)
+    joined = {path: pa.chunked_array([part[path] for _, part in parts], kind) for path, kind in types.items()}
+    return {path: column.combine_chunks().take(take) for path, column in joined.items()}
+
+
+def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: _Unread) -> Iterator[Mapping[Path, Any]]:
+    """Some messages of a batch, decoded each for itself; nothing of those that can't be."""
+    for t_ns, start, end in zip(
+        *(values[rows].tolist() for values in (batch.t_ns, batch.start, batch.end)), strict=True
+    ):
+        try:
+            yield flatten(batch.data[start:end].tobytes())
+        except McaptrackError as error:
+            unread.add(t_ns, str(error))
+            yield {}
+
+
+# Messages without one
+
+
+def inferred_fields(
+    where: str,
+    payloads: Callable[[], Iterator[Payloads]],
+    flatten: Flatten,
+    wanted: Callable[[Path], bool],
+    blobs: bool,
+) -> Fields:
+    """The fields of messages by their values."""
+    stored, unread = _Stored(wanted, blobs), _Unread(where)
+    for batch in payloads():
+        unread.count(len(batch.t_ns))
+        for row in _flat(batch, np.arange(len(batch.t_ns)), flatten, unread):
+            stored.add(row)
+    stored.close()
+    unread.warn()
+    types = stored.types()
+    return Fields(types, list(stored.left_out), lambda: stored.columns(types))
+
+
+class _Stored:
+    """Flat messages as columns, part by part, which wait in a temporary file."""
+
+    def __init__(self, wanted: Callable[[Path], bool], blobs: bool) -> None:
+        self.left_out: dict[Path, None] = {}
+        self._wanted, self._blobs = wanted, blobs
+        self._rows: list[Mapping[Path, Any]] = []
+        self._types: dict[Path, dict[Any, None]] = {}
+        self._mixed: set[Path] = set()
+        self._parts: list[tuple[int, list[Path], Stored]] = []
         self._file = SpillFile()
 
     def add(self, row: Mapping[Path, Any]) -> None:
         """Add a message."""
-        for path, value in row.items():
-            if path not in self._columns:
-                self._columns[path] = []
-                self.facts.setdefault(path, _Facts())
-            values = self._columns[path]
-            values += [None] * (self._count - len(values))
-            if isinstance(value, bytes) and not self._blobs:
-                self.facts[path].has_bytes = True  # it is left out: its bytes needn't be kept
-                continue
-            values.append(value)
-            self._bytes += (
-                8 * len(value) if isinstance(value, list) else len(value) if isinstance(value, str | bytes) else 8
-            )
-        self._count += 1
-        if self._count >= _PART_MESSAGES or self._bytes >= _PART_BYTES:
+        self._rows.append(row)
+        if len(self._rows) >= _PART_MESSAGES:
             self.close()
 
     def close(self) -> None:
         """End a part."""
-        if not self._count:
-            return
-        for path, values in self._columns.items():
-            values.extend([None] * (self._count - len(values)))
-            self.facts[path].add(values)
-        self._parts.append(self._file.put(pickle.dumps((self._count, self._columns))))
-        self._columns, self._count, self._bytes = {}, 0, 0
-
-    def parts(self) -> Iterator[tuple[int, dict[Path, list[Any]]]]:
-        """Numbers of messages, and their values by field; a field that none of them has is missing."""
-        for part in self._parts:
-            yield pickle.loads(self._file.get(part))  # noqa: S301  # from this process
-
-
-@dataclass
-class _Maker:
-    """The type of a column, and the function that converts its values."""
-
-    type: Any
-    make: Callable[[Any], Any]
-
-
-@dataclass
-class _Facts:
-    """Facts about the values of a field, by which its column gets a type; of lists, about their members."""
-
-    has_bytes: bool = False
-    has_lists: bool = False
-    has_others: bool = False
-    types: set[type] = field(default_factory=set)
-    low: int = 0
-    high: int = 0
-
-    def add(self, values: Sequence[Any]) -> None:
-        """Add values, or None for messages without the field."""
-        present = [value for value in values if value is not None]
-        lists = [value for value in present if isinstance(value, list)]
-        self.has_bytes |= any(isinstance(value, bytes) for value in present)
-        self.has_lists |= bool(lists)
-        self.has_others |= len(lists) < len(present)
-        members = [member for value in lists for member in value] if lists else present
-        self.types |= set(map(type, members))
-        whole = [member for member in members if isinstance(member, int)]
-        self.low, self.high = min([self.low, *whole]), max([self.high, *whole])
-
-    def maker(self) -> _Maker:
-        """The type of the column."""
         import pyarrow as pa
 
-        kind = None if self.has_lists and self.has_others else self._kind()
-        if kind is None:
-            return _Maker(pa.string(), _json)
-        one = _maker(kind)
-        return _Maker(pa.list_(one.type), lambda value: list(map(one.make, value))) if self.has_lists else one
+        columns: dict[Path, Any] = {}
+        for path in dict.fromkeys(path for row in self._rows for path in row if self._wanted(path)):
+            values = [row.get(path) for row in self._rows]
+            if not self._blobs and any(isinstance(value, bytes) for value in values):
+                self.left_out[path] = None
+                continue
+            columns[path] = _array(values)
+            self._types.setdefault(path, {})[columns[path].type] = None
+        if self._rows:
+            table = pa.table(list(columns.values()), [str(number) for number in range(len(columns))])
+            sink = pa.BufferOutputStream()
+            with pa.ipc.new_stream(sink, table.schema) as stream:
+                stream.write_table(table)
+            self._parts.append((len(self._rows), list(columns), self._file.put(memoryview(sink.getvalue()))))
+        self._rows = []
 
-    def _kind(self) -> str | None:
-        """The narrowest type that holds all values; None if only JSON does."""
-        if len(self.types) == 1 and self.types <= {bool, float, str, bytes}:
-            return next(iter(self.types)).__name__
-        if not self.types:
-            return "float"
-        if self.types == {int}:
-            if self.low >= -_MAX_INT and self.high < _MAX_INT:
-                return "int"
-            return "uint" if self.low >= 0 and self.high < _MAX_UINT else None
-        return "float" if self.types == {int, float} and max(-self.low, self.high) <= _EXACT else None
+    def types(self) -> dict[Path, Any]:
+        """The type of each column that holds the values of all parts; text, for JSON, if there is none."""
+        import pyarrow as pa
+
+        out = {path: _common(list(kinds)) for path, kinds in self._types.items() if path not in self.left_out}
+        several = {path for path in out if len(self._types[path]) > 1}
+        for _, columns in self._read(several):  # a number may be too large for the common type
+            for path, column in columns.items():
+                try:
+                    column.cast(out[path] or column.type)
+                except pa.ArrowInvalid:
+                    out[path] = None
+        self._mixed = {path for path, kind in out.items() if kind is None}
+        return {path: pa.string() if kind is None else kind for path, kind in out.items()}
+
+    def columns(self, types: Mapping[Path, Any]) -> Iterator[tuple[int, Columns]]:
+        """The columns of each part."""
+        for count, columns in self._read(set(types)):
+            yield (
+                count,
+                {
+                    path: _as_json(column) if path in self._mixed else column.cast(types[path])
+                    for path, column in columns.items()
+                },
+            )
+
+    def _read(self, wanted: Set[Path]) -> Iterator[tuple[int, dict[Path, Any]]]:
+        import pyarrow as pa
+
+        for count, names, place in self._parts:
+            table = pa.ipc.open_stream(self._file.get(place)).read_all()
+            columns = zip(names, table.columns, strict=True)
+            yield count, {path: column.combine_chunks() for path, column in columns if path in wanted}
+
+
+def _array(values: Sequence[Any]) -> Any:
+    """Values as Arrow; as an array of JSON text (large_string) if they have no common type."""
+    import pyarrow as pa
+
+    for kind in (None, pa.uint64()):
+        with suppress(pa.ArrowException, OverflowError, UnicodeEncodeError, TypeError, ValueError):
+            return pa.array(values, kind)
+    if all(value is None or isinstance(value, str) for value in values):  # lone surrogates, which JSON allows
+        return pa.array([None if value is None else _clean(value) for value in values], pa.string())
+    return pa.array([None if value is None else _json(value) for value in values], pa.large_string())
+
+
+def _as_json(column: Any) -> Any:
+    """The values of a column as JSON text."""
+    import pyarrow as pa
+
+    if pa.types.is_large_string(column.type):
+        return column.cast(pa.string())
+    return pa.array([None if value is None else _json(value) for value in column.to_pylist()], pa.string())
+
+
+def _common(kinds: Sequence[Any]) -> Any:
+    """A type for all values of these types; None if there is none."""
+    import pyarrow as pa
+
+    whole = [kind for kind in kinds if not pa.types.is_null(kind)]
+    if any(pa.types.is_unsigned_integer(kind) for kind in whole) and all(map(pa.types.is_integer, whole)):
+        return pa.uint64()
+    try:
+        schemas = [pa.schema([("", kind)]) for kind in kinds]
+        kind = _settled(pa.unify_schemas(schemas, promote_options="permissive").field(0).type)
+    except (pa.ArrowException, ValueError):
+        return None
+    return None if pa.types.is_large_string(kind) else kind
+
+
+def _settled(kind: Any) -> Any:
+    """A type as files and queries take it: times in UTC, and numbers where no value says what. Raises ValueError for
+    messages without fields, which files can't hold.
+    """
+    import pyarrow as pa
+
+    if pa.types.is_null(kind):
+        return pa.float64()
+    if pa.types.is_timestamp(kind):
+        return pa.timestamp("ns", tz="UTC")
+    if pa.types.is_list(kind):
+        return pa.list_(_settled(kind.value_type))
+    if pa.types.is_struct(kind):
+        if not kind.num_fields:
+            raise ValueError("messages without fields")
+        return pa.struct([(field.name, _settled(field.type)) for field in kind])
+    return kind
 
 
 def _free_name(wanted: str, names: dict[str, Any]) -> str:
@@ -188,19 +338,7 @@ def _clean(text: str) -> str:
 
 
 def _json(value: Any) -> str:
-    return _clean(json.dumps(value.hex() if isinstance(value, bytes) else value, ensure_ascii=False))
+    def plain(inner: Any) -> str:
+        return inner.hex() if isinstance(inner, bytes) else str(inner)
 
-
-def _maker(kind: str) -> _Maker:
-    """The column of single values of a kind."""
-    import pyarrow as pa
-
-    makers = {
-        "bool": _Maker(pa.bool_(), bool),
-        "float": _Maker(pa.float64(), float),
-        "int": _Maker(pa.int64(), int),
-        "uint": _Maker(pa.uint64(), int),
-        "bytes": _Maker(pa.binary(), bytes),
-        "str": _Maker(pa.string(), _clean),
-    }
-    return makers[kind]
+    return _clean(json.dumps(value, ensure_ascii=False, separators=(",", ":"), default=plain))

@@ -97,6 +97,11 @@ def unpacker(kind: MessageType) -> Unpack:
 
 def protobuf_unpacker(kind: MessageType) -> Unpack:
     """A decoder for protobuf, by the definition in the log."""
+    return protobuf_class(kind).FromString  # type: ignore[no-any-return]
+
+
+def protobuf_class(kind: MessageType) -> Any:
+    """The class of a message of protobuf, by the definition in the log."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
     from google.protobuf.descriptor_pool import DescriptorPool
     from google.protobuf.message_factory import GetMessageClass
@@ -112,13 +117,12 @@ def protobuf_unpacker(kind: MessageType) -> Unpack:
         pool = DescriptorPool()
         for name in TopologicalSorter(imports).static_order():  # the order of the files in a log is free
             pool.Add(files[name])
-        message_class: Any = GetMessageClass(pool.FindMessageTypeByName(kind.name))
+        return GetMessageClass(pool.FindMessageTypeByName(kind.name))
     except Exception as error:  # a third-party parser that raises various exceptions
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise McaptrackError(
             f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
         ) from None
-    return message_class.FromString  # type: ignore[no-any-return]
 
 
 def _ros_unpacker(kind: MessageType) -> Unpack:

@@ -1,33 +1,38 @@
-"""Flatten messages of any schema to rows: every field with a value, or a list of values, by its path.
+"""Messages of any schema as columns, or, where they can't be read so, flat one by one: fields by their paths.
 
-Times and durations (seconds and nanoseconds) become an integer in nanoseconds; lists of messages become JSON; bytes are
-kept as bytes, so that pictures and point clouds can be excluded from tables.
+Times become timestamps, durations a whole number of nanoseconds (``..._ns``), messages in lists dicts; bytes stay
+bytes, so that pictures and point clouds can be left out of tables.
 """
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, protobuf_unpacker, unpacker
+from mcaptrack.sources.foreign.decoding import (
+    MessageType,
+    decoder_with_errors,
+    protobuf_class,
+    protobuf_unpacker,
+    ros_types,
+    unpacker,
+)
+
+if TYPE_CHECKING:
+    from mcaptrack.columns import ProtobufColumns, RosColumns
 
 Path = tuple[str, ...]
-Value = bool | int | float | str | bytes | list[Any] | None
 
 _MAX_DEPTH: Final = 32
+_LIMIT_NS: Final = 2**63
 #: The field names of times in ROS 1, ROS 2, JSON of bridges, and protobuf.
-_TIMES: Final = (("secs", "nsecs"), ("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos"))
-
-
-class _Messages(tuple[Any, ...]):
-    """A list of messages, which becomes JSON even if it is empty, so that a column keeps its type."""
+_TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
 
 
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
@@ -55,7 +60,19 @@ def recorded_decoder(kind: MessageType) -> Callable[[bytes], Any]:
     return decoder_with_errors(kind, lambda message: message, _unpacker(kind))
 
 
-def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Value]]:
+def column_reader(kind: MessageType, wanted: Callable[[Path], bool], blobs: bool) -> RosColumns | ProtobufColumns:
+    """A reader of all messages of a batch at once. Raises ``columns.Unsupported`` where messages need ``flattener``."""
+    from mcaptrack.columns import ProtobufColumns, RosColumns, Unsupported
+
+    if kind.encoding == MessageEncoding.Protobuf:
+        return ProtobufColumns(protobuf_class(kind).DESCRIPTOR, wanted, blobs)
+    if kind.encoding not in (MessageEncoding.ROS1, MessageEncoding.CDR):
+        raise Unsupported(f"messages in {kind.encoding} have no types")
+    store, name = ros_types(kind)
+    return RosColumns(store.fielddefs, name, kind.encoding, wanted, blobs)
+
+
+def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Any]]:
     """A function that flattens a payload to a row: path of each field -> value.
 
     Raises McaptrackError if messages of this type are not supported; the returned function raises McaptrackError for
@@ -72,17 +89,14 @@ def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
     return unpacker(kind)
 
 
-def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Value]]:
+def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:
+    fields = _fields(value)
+    if fields is None or (path and _nanoseconds(fields) is not None):
+        title, plain = _plain(path[-1] if path else "value", value, len(path))
+        yield (*path[:-1], title), plain
+        return
     if len(path) > _MAX_DEPTH:
         raise ValueError(f"it is more than {_MAX_DEPTH} messages deep")
-    fields = _fields(value)
-    if fields is None:
-        yield path or ("value",), _value(value)
-        return
-    t_ns = _nanoseconds(fields)
-    if t_ns is not None and path:
-        yield (*path[:-1], path[-1] + "_ns"), t_ns
-        return
     for name, member in fields.items():
         yield from _walk(member, (*path, name))
 
@@ -95,25 +109,17 @@ def _fields(value: Any) -> Mapping[str, Any] | None:
         return {field.name: _member(value, field) for field in value.DESCRIPTOR.fields}
     fields = getattr(value, "__dataclass_fields__", None)
     if fields is not None:  # the fields include constants, which are marked as ClassVar
-        kinds = {name: str(field.type) for name, field in fields.items()}
-        return {name: _ros(getattr(value, name), kind) for name, kind in kinds.items() if "ClassVar" not in kind}
+        return {name: getattr(value, name) for name, field in fields.items() if "ClassVar" not in str(field.type)}
     return None
 
 
-def _ros(value: Any, kind: str) -> Any:
-    """A field of a ROS message."""
-    return _Messages(value) if isinstance(value, list) and "__" in kind else value
-
-
 def _member(message: Any, field: Any) -> Any:
-    """A field of a protobuf message: None if it is not set, enumerations by name."""
+    """A field of a protobuf message: None if it is not set, enumerations by name, maps as lists of entries."""
     if field.has_presence and not message.HasField(field.name):
         return None
     value = getattr(message, field.name)
-    if field.message_type is not None and isinstance(value, Sequence):
-        return _Messages(value)
     if field.enum_type is None:
-        return value
+        return [{"key": key, "value": value[key]} for key in value] if hasattr(value, "items") else value
     names = field.enum_type.values_by_number
 
     def named(number: int) -> str:
@@ -123,50 +129,34 @@ def _member(message: Any, field: Any) -> Any:
 
 
 def _nanoseconds(fields: Mapping[str, Any]) -> int | None:
-    for seconds, nanoseconds in _TIMES:
-        if set(fields) == {seconds, nanoseconds}:
-            parts = [fields[seconds], fields[nanoseconds]]
-            if all(isinstance(part, int | np.integer) and not isinstance(part, bool) for part in parts):
-                return int(parts[0]) * NS_PER_S + int(parts[1])
-    return None
+    """A time or duration in nanoseconds; None if fields are none."""
+    if set(fields) not in _TIMES:
+        return None
+    values = [*fields.values()]  # seconds come first
+    if next(iter(fields)).startswith("n"):
+        values.reverse()
+    if not all(isinstance(value, int | np.integer) and not isinstance(value, bool) for value in values):
+        return None
+    t_ns = int(values[0]) * NS_PER_S + int(values[1])
+    return t_ns if -_LIMIT_NS < t_ns < _LIMIT_NS else None
 
 
-def _value(value: Any) -> Value:
-    if value is None or isinstance(value, bool | str | bytes | int | float):
-        return value
-    if isinstance(value, np.generic):
-        return value.item()  # type: ignore[no-any-return]
-    if isinstance(value, np.ndarray):
-        return value.tobytes() if value.dtype.itemsize == 1 and value.dtype.kind in "ui" else value.tolist()
-    if hasattr(value, "items"):  # a map of protobuf
-        return _json({str(key): member for key, member in value.items()})
-    members = list(value)
-    if not isinstance(value, _Messages) and all(
-        isinstance(member, bool | int | float | str | np.generic) for member in members
-    ):
-        return [member.item() if isinstance(member, np.generic) else member for member in members]
-    return _json(members)
-
-
-def _json(value: Any) -> str:
-    return json.dumps(_plain(value, 0), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-
-
-def _plain(value: Any, depth: int) -> Any:
-    """A message as JSON data; non-finite numbers as text, bytes as their number."""
+def _plain(name: str, value: Any, depth: int) -> tuple[str, Any]:
+    """A field as Arrow takes it: its name, and a number, a text, bytes, a time, or lists and dicts of these."""
     if depth > _MAX_DEPTH:
         raise ValueError(f"it is more than {_MAX_DEPTH} messages deep")
     fields = _fields(value)
     if fields is not None:
-        return {name: _plain(member, depth + 1) for name, member in fields.items()}
-    if isinstance(value, float | np.floating) and not math.isfinite(value):
-        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+        t_ns = _nanoseconds(fields)
+        if t_ns is None:
+            return name, dict(_plain(inner, member, depth + 1) for inner, member in fields.items())
+        kind = str(getattr(getattr(value, "DESCRIPTOR", None), "name", type(value).__name__))
+        return (f"{name}_ns", t_ns) if kind.endswith("Duration") else (name, np.datetime64(t_ns, "ns"))
     if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, bytes):
-        return f"{len(value)} bytes"
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if hasattr(value, "items"):
-        return {str(key): _plain(member, depth + 1) for key, member in value.items()}
-    return [_plain(member, depth + 1) for member in value]
+        return name, value.item()
+    if isinstance(value, np.ndarray):
+        is_bytes = value.dtype.itemsize == 1 and value.dtype.kind in "ui"
+        return name, value.tobytes() if is_bytes else value.tolist()
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return name, [_plain("", member, depth + 1)[1] for member in value]
+    return name, value

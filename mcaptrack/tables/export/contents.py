@@ -19,6 +19,7 @@ from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.location import Location, shortened
+from mcaptrack.log.messages import Payloads
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
@@ -27,8 +28,9 @@ from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
-from mcaptrack.sources.foreign.flatten import flattener, message_type_of
+from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
+from mcaptrack.tables.messages import Fields
 
 #: Tables about the places of messages, or about the whole log.
 _OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
@@ -264,21 +266,30 @@ class LogTables:
         schema = self.opened.channel(topic).schema
         if schema is not None:
             return self._rows(schema, [topic]), []
-        places = self._pointers(topic, of_rows=False)
         kind = message_type_of(self.opened, topic)
+        fields = self._fields(topic, kind, blobs)
+        places = self._pointers(topic, of_rows=False)
+        return tables.messages_table(topic, kind.name, places, fields), [".".join(path) for path in fields.left_out]
+
+    def _fields(self, topic: str, kind: foreign.MessageType, blobs: bool) -> Fields:
+        """The fields of the messages of a channel of other software."""
+        from mcaptrack.columns import Unsupported
+
+        def payloads() -> Iterator[Payloads]:
+            return self.opened.payloads(topic)
+
+        def wanted(_: tuple[str, ...]) -> bool:
+            return True
+
+        where = f"{self.opened.path}: {topic}"
         try:
             flatten = flattener(kind)
         except McaptrackError as error:
-            raise McaptrackError(f"{self.opened.path}: {topic}: {error}") from None
-
-        def rows() -> Iterator[Mapping[tuple[str, ...], Any]]:
-            for message in self.opened.messages(topic):
-                try:
-                    yield flatten(message.payload)
-                except McaptrackError as error:
-                    raise McaptrackError(f"{self.opened.path}: {topic} at {message.t_ns} ns: {error}") from None
-
-        return tables.messages_table(topic, kind.name, places, rows(), blobs)
+            raise McaptrackError(f"{where}: {error}") from None
+        try:
+            return tables.typed_fields(where, column_reader(kind, wanted, blobs), payloads, flatten)
+        except Unsupported:
+            return tables.inferred_fields(where, payloads, flatten, wanted, blobs)
 
     # Parts of tables
 
