@@ -36,7 +36,7 @@ from mcaptrack.tables import TABLES, Pointers, text
 from mcaptrack.tables import files as tables_files
 from mcaptrack.tables.fields import CODES
 from tests.commands import call
-from tests.logs import write_channels
+from tests.logs import flat_table, write_channels
 from tests.strategies import columns
 from tests.tiers import one_in
 from tests.worlds import ns, table_to_frames, tracks_at
@@ -554,7 +554,7 @@ def test_fields_of_bytes_are_left_out_unless_they_are_wanted():
         assert table.column("T_2").to_pylist() == [1, None, None]
         assert table.column("c_ns").to_pylist() == [None, 5, 7]
         words = table.schema.field("c_ns").metadata
-        assert words == {b"unit": b"ns", b"description": b"field c_ns of the message", b"path": b"c_ns"}
+        assert words == {b"unit": b"ns", b"description": b"field c_ns of A", b"path": b"c_ns"}
 
 
 # Names beside numbers

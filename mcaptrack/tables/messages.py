@@ -270,9 +270,16 @@ def _array(values: Sequence[Any]) -> Any:
     """Values as Arrow; as an array of JSON text (large_string) if they have no common type."""
     import pyarrow as pa
 
-    for kind in (None, pa.uint64()):
-        with suppress(pa.ArrowException, OverflowError, UnicodeEncodeError, TypeError, ValueError):
-            return pa.array(values, kind)
+    errors = (pa.ArrowException, OverflowError, UnicodeEncodeError, TypeError, ValueError)
+    with suppress(*errors):
+        return pa.array(values)
+    for kind, members in (
+        (pa.uint64(), values),
+        (pa.list_(pa.uint64()), [member for value in values if isinstance(value, list) for member in value]),
+    ):
+        if {type(member) for member in members} <= {int, type(None)}:  # others would be rounded
+            with suppress(*errors):
+                return pa.array(values, kind)
     if all(value is None or isinstance(value, str) for value in values):  # lone surrogates, which JSON allows
         return pa.array([None if value is None else _clean(value) for value in values], pa.string())
     return pa.array([None if value is None else _json(value) for value in values], pa.large_string())
