@@ -146,13 +146,14 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
         other = writer.add_channel("/y", ("robot.State", "protobuf", schema), "protobuf", {})
         writer.add_message(other, 0, 0, make(picture=b"\x01").SerializeToString())
     from mcaptrack.tables.export import export
+    from mcaptrack.tables.export.contents import MessagesPart
 
     with log.read(tmp_path / "a.mcap") as opened:
         done = export(opened, tmp_path / "t", topics=["/x"])
         assert done.notes == ["/x: picture left out, bytes; `blobs=True` keeps them"]
-        export(opened, tmp_path / "t", topics=["/x"], blobs=True)
+        export(opened, tmp_path / "t", topics=["/x"], part=MessagesPart(blobs=True))
         assert export(opened, tmp_path / "t").written == []  # and they stay
-        assert export(opened, tmp_path / "t", topics=["/y"], blobs=True).rows["topics/y"] == 1
+        assert export(opened, tmp_path / "t", topics=["/y"], part=MessagesPart(blobs=True)).rows["topics/y"] == 1
         (words,) = export(opened, tmp_path / "t", topics=["/y"]).notes
         assert words == "/y: picture left out, bytes; `blobs=True` keeps them"  # of /y alone
     import pyarrow.parquet as pq

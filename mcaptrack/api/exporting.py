@@ -9,18 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
 
-from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
+from mcaptrack.api.common import log_location, names_of, optional_path, split_names, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, named, no_progress, output
 from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish, publish_folder, refuse_overwrite
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice, warn
 
 if TYPE_CHECKING:
     from mcaptrack.api.reading import LogReader
+    from mcaptrack.log import Log
     from mcaptrack.registry import Entry
+    from mcaptrack.tables.export.contents import MessagesPart
     from mcaptrack.tables.rosbag2 import Storage
 
 #: ROS 2 bags by the format of ``export``.
@@ -64,7 +67,49 @@ class ExportResult:
         return not self.written
 
 
-@declared(most_used=("form", "topic", "output", "force"))
+class _Part(NamedTuple):
+    """The channels of other software that get tables, and what these hold."""
+
+    topics: tuple[str, ...]
+    all_topics: bool
+    columns: tuple[str, ...]
+    blobs: bool
+    start_s: float | None
+    end_s: float | None
+
+    def chosen(self) -> dict[str, bool]:
+        """Whether each option chooses anything, by its name."""
+        start, end = self.start_s is not None, self.end_s is not None
+        return {"columns": bool(self.columns), "blobs": self.blobs, "start_s": start, "end_s": end}
+
+    def warn_unused(self, why: str, has_topic: bool = False) -> None:
+        """Warn of options that choose something without effect."""
+        warn_unused(why, **self.chosen(), all_topics=self.all_topics, topic=has_topic and bool(self.topics))
+
+    def check(self) -> None:
+        """Raise McaptrackError for options that need others, or contradict each other."""
+        needing = [name for name, is_chosen in self.chosen().items() if is_chosen]
+        if needing and not self.topics and not self.all_topics:
+            raise McaptrackError(
+                f"`{needing[0]}=` needs a channel to write; name it with `topic=`, or give `all_topics=True`"
+            )
+        if self.columns and self.all_topics:
+            raise McaptrackError("`columns=` are those of a channel; name it with `topic=` in place of `all_topics=`")
+        if self.start_s is not None and self.end_s is not None and self.start_s >= self.end_s:
+            raise McaptrackError(f"`end_s={self.end_s:g}` isn't after `start_s={self.start_s:g}`")
+
+    def of(self, opened: Log) -> MessagesPart:
+        """The messages and fields that tables of a log's channels hold."""
+        from mcaptrack.tables.export.contents import MessagesPart
+
+        span = [
+            None if second is None else opened.start_ns + round(second * NS_PER_S)
+            for second in (self.start_s, self.end_s)
+        ]
+        return MessagesPart(self.blobs, self.columns, *span)
+
+
+@declared(most_used=("form", "topic", "all_topics", "output", "force"))
 def export(
     log: EachLog,
     output: Annotated[PathLike | None, output("LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log")] = None,
@@ -73,7 +118,13 @@ def export(
         TableFormat | BagFormat | ExchangeFormat | str, named("exporter", _BUILT_IN, FILES, "format")
     ] = "parquet",
     topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
+    all_topics: Annotated[bool, Option(FILES, flag="all")] = False,
+    columns: Annotated[
+        str | Sequence[str] | None, Option(FILES, metavar="A,B", commas=True, shown="all fields")
+    ] = None,
     blobs: Annotated[bool, Option(FILES)] = False,
+    start_s: Annotated[float | None, Option(FILES, 0, 1e9)] = None,
+    end_s: Annotated[float | None, Option(FILES, 0, 1e9)] = None,
     force: Force = False,
     progress: Reports = no_progress,
 ) -> ExportResult:
@@ -103,8 +154,14 @@ def export(
         "rosbag2" is a bag in MCAP, "rosbag2-sqlite3" one in a database.
     topic : str or sequence of str, optional
         Also write a table of all messages of this channel; the channel with the boxes for a file.
+    all_topics : bool, default False
+        Also write a table of each channel of other software; a warning names those that can't be one.
+    columns : str or sequence of str, optional
+        With ``topic``: write these fields only, as in header.stamp,angular_velocity.z; of a message all its fields.
     blobs : bool, default False
         With ``topic``: include binary fields, such as pictures and point clouds.
+    start_s, end_s : float, optional
+        With ``topic``: write messages from the first time on, and before the second, in seconds since the log begins.
     force : bool, default False
         Write all tables again, also over those of another log of this name; replace a bag or a file.
 
@@ -128,6 +185,8 @@ def export(
 
         mcaptrack export robot.mcap --topic /imu --format csv
 
+        mcaptrack export robot.mcap --all -o tables/
+
     >>> import mcaptrack
     >>> mcaptrack.export("log.mcap", "tables").rows["tracks"] > 0
     True
@@ -138,22 +197,21 @@ def export(
     from mcaptrack.tables.export import export as write_tables
 
     path = log_location(log)
+    part = _Part(names_of(topic), all_topics, split_names("columns", columns), blobs, start_s, end_s)
     if form in get_args(ExchangeFormat):
-        return _export_file(
-            path, optional_path(output), cast("ExchangeFormat", form), names_of(topic), blobs, force, progress
-        )
+        return _export_file(path, optional_path(output), cast("ExchangeFormat", form), part, force, progress)
     if form in _BAGS:
-        return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
+        return _export_bag(path, optional_path(output), _BAGS[form], part, force, progress)
     if form not in get_args(TableFormat):
-        return _export_by_package(path, optional_path(output), form, topic, blobs, force)
+        return _export_by_package(path, optional_path(output), form, part, force)
     folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
     if folder.exists() and not folder.is_dir():
         raise McaptrackError(f"{folder} is a file; tables go to a folder")
-    if blobs and not topic:
-        raise McaptrackError("`blobs=True` needs a channel to write; name it with `topic=`")
+    part.check()
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
-            done = write_tables(opened, folder, progress, form=kind, topics=names_of(topic), blobs=blobs, force=force)
+            topics = None if all_topics else part.topics
+            done = write_tables(opened, folder, progress, form=kind, topics=topics, part=part.of(opened), force=force)
         for note in done.notes:
             warn(note, "left-out")
     owed = (main_file(path, folder, kind),)
@@ -164,8 +222,7 @@ def _export_bag(
     path: Location,
     output: Path | None,
     storage: Storage,
-    topic: str | Sequence[str] | None,
-    blobs: bool,
+    part: _Part,
     force: bool,
     progress: Progress,
 ) -> ExportResult:
@@ -174,7 +231,7 @@ def _export_bag(
     from mcaptrack.tables.rosbag2 import default_folder, write_bag
 
     with warnings_about(path) as warnings:
-        warn_unused("a bag has no tables", topic=bool(topic), blobs=blobs)
+        part.warn_unused("a bag has no tables", has_topic=True)
         folder = output or default_folder(path)
         with logs.read(path) as opened:
             done = write_bag(opened, folder, progress, storage=storage, force=force)
@@ -189,8 +246,7 @@ def _export_file(
     path: Location,
     output: Path | None,
     form: ExchangeFormat,
-    topics: Sequence[str],
-    blobs: bool,
+    part: _Part,
     force: bool,
     progress: Progress,
 ) -> ExportResult:
@@ -198,13 +254,14 @@ def _export_file(
     from mcaptrack import log as logs
     from mcaptrack.tables.exchange import default_file, write_boxes
 
+    topics = part.topics
     if len(topics) > 1:
         raise McaptrackError(f"a file of {form} has the boxes of one channel, not of {', '.join(topics)}; give one")
     target = output or default_file(path, form)
     with warnings_about(path) as warnings:
-        warn_unused("a file of boxes has no tables", blobs=blobs)
+        part.warn_unused("a file of boxes has no tables")
         with logs.read(path) as opened:
-            if any(is_same_file(part.path, target) for part in opened.parts):
+            if any(is_same_file(file.path, target) for file in opened.parts):
                 raise McaptrackError(f"{target} is a log; give the file another name with `output=`")
             done = write_boxes(opened, target, form, topics[0] if topics else None, progress, force=force)
         for note in done.notes:
@@ -246,9 +303,7 @@ def exporter_for(entry: Entry, exporter: Any) -> ExporterOfPackage:
     return ExporterOfPackage(entry, exporter, end, bool(getattr(exporter, "is_folder", False)))
 
 
-def _export_by_package(
-    path: Location, output: Path | None, form: str, topic: str | Sequence[str] | None, blobs: bool, force: bool
-) -> ExportResult:
+def _export_by_package(path: Location, output: Path | None, form: str, part: _Part, force: bool) -> ExportResult:
     """Write a log by the exporter of another package."""
     from mcaptrack import log as logs
     from mcaptrack.api.reading import LogReader
@@ -256,19 +311,19 @@ def _export_by_package(
     with warnings_about(path) as warnings:
         by = exporter_of_package(form)
         assert by is not None
-        warn_unused(f"the {by.entry} has no tables of channels", topic=bool(topic), blobs=blobs)
+        part.warn_unused(f"the {by.entry} has no tables of channels", has_topic=True)
         target = output or local_name(path, by.end)
         if by.is_folder:
             _refuse_folder(by, target, force)
         else:
             refuse_overwrite(target, force)
         with logs.read(path) as opened:
-            places = [place_of(part.path) for part in opened.parts]
+            places = [place_of(file.path) for file in opened.parts]
         for place in places:
             if isinstance(place, Path) and place_of(target) in (place, *place.parents):
                 raise McaptrackError(f"{target} is a log, or holds it; give another name with `output=`")
-        with LogReader(path) as recording, (publish_folder if by.is_folder else publish)(target) as part:
-            rows = write_by_package(by, recording, part)
+        with LogReader(path) as recording, (publish_folder if by.is_folder else publish)(target) as new:
+            rows = write_by_package(by, recording, new)
     return ExportResult(path, target, rows, tuple(rows), tuple(dict.fromkeys(warnings)), files=(target,))
 
 

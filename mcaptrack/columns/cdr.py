@@ -556,6 +556,6 @@ class RosColumns:
 
 
 def _step(at: Ints) -> int:
-    """How far positions are apart, if always as far; otherwise 0."""
+    """The distance between positions if it is always the same, otherwise 0."""
     steps = np.diff(at)
     return int(steps[0]) if len(steps) and steps[0] > 0 and _are_equal(steps) else 0

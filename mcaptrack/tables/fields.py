@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 #: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "1.7"
+TABLE_VERSION: Final = "2.0"
 
 #: The unit of counts and ids.
 _NONE: Final = "1"

@@ -39,7 +39,7 @@ _PIECE_BYTES: Final = 32 * 2**20
 _MOST_UNREAD: Final = 100
 
 
-class Fields(NamedTuple):
+class MessageFields(NamedTuple):
     """The fields of a channel's messages: their types by path, those left out, and their columns, batch by batch."""
 
     types: Mapping[Path, Any]
@@ -75,7 +75,7 @@ class _Unread:
         return f" at {first} ns: {self._why[first]}{many}"
 
 
-def messages_table(topic: str, schema_name: str, places: Pointers, fields: Fields) -> TablePieces:
+def messages_table(topic: str, schema_name: str, places: Pointers, fields: MessageFields) -> TablePieces:
     """A channel as a table: time and place of each message, then its fields."""
     import pyarrow as pa
 
@@ -104,7 +104,7 @@ def messages_table(topic: str, schema_name: str, places: Pointers, fields: Field
 
 def typed_fields(
     where: str, reader: RosColumns | ProtobufColumns, payloads: Callable[[], Iterator[Payloads]], flatten: Flatten
-) -> Fields:
+) -> MessageFields:
     """The fields of messages that are read as columns, or, where ``reader`` can't, each by ``flatten``."""
     nothing = np.empty(0, np.int64)
     types = {path: column.type for path, column in reader.read(np.empty(0, np.uint8), nothing, nothing).items()}
@@ -121,7 +121,7 @@ def typed_fields(
             yield len(batch.t_ns), _read(reader, batch, types, flatten, unread)
         unread.warn()
 
-    return Fields(types, list(reader.left_out), columns)
+    return MessageFields(types, list(reader.left_out), columns)
 
 
 def _read(
@@ -180,7 +180,7 @@ def inferred_fields(
     flatten: Flatten,
     wanted: Callable[[Path], bool],
     blobs: bool,
-) -> Fields:
+) -> MessageFields:
     """The fields of messages by their values."""
     stored, unread = _Stored(wanted, blobs), _Unread(where)
     for batch in payloads():
@@ -190,7 +190,7 @@ def inferred_fields(
     stored.close()
     unread.warn()
     types = stored.types()
-    return Fields(types, list(stored.left_out), lambda: stored.columns(types))
+    return MessageFields(types, list(stored.left_out), lambda: stored.columns(types))
 
 
 class _Stored:

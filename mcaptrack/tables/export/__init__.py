@@ -30,7 +30,9 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export.contents import (
+    WHOLE,
     LogTables,
+    MessagesPart,
     file_name,
     location_of,
     recording_key,
@@ -222,8 +224,8 @@ def export(
     progress: Callable[[str, int, int], None] = lambda *_: None,
     *,
     form: TableFormat = "parquet",
-    topics: Sequence[str] = (),
-    blobs: bool = False,
+    topics: Sequence[str] | None = (),
+    part: MessagesPart = WHOLE,
     force: bool = False,
     boxes: BoxesRead | None = None,
 ) -> Exported:
@@ -236,11 +238,12 @@ def export(
     progress : callable
         Called with a text, the number of finished tables and their total.
     form : {"parquet", "arrow", "csv", "jsonl"}
-    topics : sequence of str
+    topics : sequence of str, optional
         Foreign channels that get tables of their own, as those with rows of a user's own schema always do.
-        Existing ones are updated, and removed if their channel is gone.
-    blobs : bool
-        Whether these tables have fields of bytes.
+        Existing ones are updated, and removed if their channel is gone. None: all channels, and a note of those that
+        can't be read.
+    part : MessagesPart
+        Which messages and fields these tables hold; of existing ones, what they held before.
     force : bool
         Write all tables again, and replace those of another log with the same name.
     boxes : BoxesRead, optional
@@ -256,6 +259,8 @@ def export(
         If a channel does not exist or can't be read, and if the folder holds tables of another log with the same name.
     """
     contents = LogTables(opened, boxes)
+    if are_all := topics is None:
+        topics = contents.other_topics()
     for topic in topics:
         opened.channel(topic)
     job = _Job(contents, folder, form, force, Exported())
@@ -265,11 +270,17 @@ def export(
         if not force:  # once more, because another process may have written them meanwhile
             refuse_tables_of_another(opened, opened.path, folder)
         job.tidy()
-        _write_all(job, topics, blobs, progress)
+        _write_all(job, topics, part, are_all, progress)
     return job.done
 
 
-def _write_all(job: _Job, topics: Sequence[str], blobs: bool, progress: Callable[[str, int, int], None]) -> None:
+def _write_all(
+    job: _Job,
+    topics: Sequence[str],
+    part: MessagesPart,
+    are_all: bool,
+    progress: Callable[[str, int, int], None],
+) -> None:
     opened = job.contents.opened
     *names, last = TABLES
     topics_before = job.known_topics()
@@ -280,7 +291,12 @@ def _write_all(job: _Job, topics: Sequence[str], blobs: bool, progress: Callable
         job.table(name)
         progress("export", count, total)
     for count, topic in enumerate(wanted, start=len(TABLES)):
-        job.messages(topic, blobs if topic in topics else topics_before.get(topic, False))
+        try:
+            job.messages(topic, part if topic in topics else topics_before.get(topic, WHOLE))
+        except McaptrackError as error:
+            if not are_all:
+                raise
+            job.done.notes.append(f"{error}; it has no table")
         progress("export", count, total)
     job.remove([topic for topic in topics_before if topic not in wanted])
     job.table(last)
@@ -309,14 +325,14 @@ class _Job:
             self._write(name, path, pieces, metadata | ({"note": note} if note else {}), TABLES[name].order)
             self.done.notes += [f"{name}: {note}"] if note else []
 
-    def messages(self, topic: str, blobs: bool) -> None:
+    def messages(self, topic: str, part: MessagesPart) -> None:
         """Update the table of a channel."""
         name = f"{TOPICS}/{topic_folder(topic)}"
         path = self.path(*name.split("/"))
-        metadata = {"topic": topic, "blobs": str(blobs).lower(), "source": self.contents.messages_source(topic, blobs)}
+        metadata = {"topic": topic, "part": json.dumps(part), "source": self.contents.messages_source(topic, part)}
         metadata_before = tables.file_metadata(path, self.form) or {}
         if not self._stands(name, path, metadata["source"]):
-            pieces, left_out = self.contents.message_pieces(topic, blobs)
+            pieces, left_out = self.contents.message_pieces(topic, part)
             metadata |= {"left_out": ", ".join(left_out)} if left_out else {}
             self._write(name, path, pieces, metadata, ("topic", "t_ns"))
         left = metadata.get("left_out") or metadata_before.get("left_out")
@@ -339,13 +355,14 @@ class _Job:
             self.done.written.append(name)
         self.done.rows[name] = rows
 
-    def known_topics(self) -> dict[str, bool]:
-        """The channels of this log with tables of their own in the folder, and whether these have bytes."""
+    def known_topics(self) -> dict[str, MessagesPart]:
+        """The channels of this log with tables of their own in the folder, and what these hold."""
         out = {}
         for path in self._topic_files():
             metadata = tables.file_metadata(path, self.form) or {}
             if metadata.get("recording") == file_name(self.contents.opened.path) and "topic" in metadata:
-                out[metadata["topic"]] = metadata.get("blobs") == "true"
+                blobs, columns, *span = json.loads(metadata.get("part", "[false, [], null, null]"))
+                out[metadata["topic"]] = MessagesPart(blobs, tuple(columns), *span)
         return out
 
     def _topic_files(self) -> Iterator[Path]:

@@ -7,19 +7,19 @@ import json
 import os
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import __version__, evaluation, log, tables
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.location import Location, shortened
-from mcaptrack.log.messages import Payloads
+from mcaptrack.log.messages import MessageLocations, Payloads
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
@@ -30,7 +30,6 @@ from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
-from mcaptrack.tables.messages import Fields
 
 #: Tables about the places of messages, or about the whole log.
 _OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
@@ -43,6 +42,7 @@ _OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
 _MAX_BYTES: Final = 200
 
 
+_FIELDS_LISTED: Final = 30
 #: Words that readers of partitions do not take for text.
 _NO_TEXT: Final = ("nan", "inf", "infinity", "true", "false", "null", "none")
 
@@ -151,6 +151,42 @@ def _headline(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
     return next((by_rule[rule] for rule in rules if rule in by_rule), None)
 
 
+class MessagesPart(NamedTuple):
+    """The messages and fields of a channel of other software that its table holds.
+
+    ``blobs``: also fields of any number of bytes. ``columns`` are paths of fields, as in ``angular_velocity.z``, or of
+    messages in which all fields are wanted; all if there are none. Messages are from ``start_ns`` to before ``end_ns``.
+    """
+
+    blobs: bool = False
+    columns: tuple[str, ...] = ()
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def wants(self, path: tuple[str, ...]) -> bool:
+        """Whether a field is wanted, or a field within it."""
+        return not self.columns or any(_agree(path, column) for column in self.columns)
+
+    def unknown(self, paths: Collection[tuple[str, ...]]) -> str:
+        """The first column that is no field, and of which no field is a part; "" if there is none."""
+        unknown = (
+            column
+            for column in self.columns
+            if not any(_agree(path, column) and len(path) > column.count(".") for path in paths)
+        )
+        return next(unknown, "")
+
+
+#: All messages, and all fields but bytes.
+WHOLE: Final = MessagesPart()
+
+
+def _agree(path: Sequence[str], column: str) -> bool:
+    """Whether a field is the one that is named, within it, or around it; durations may be named as their columns."""
+    names = column.split(".")
+    return all(name in (field, f"{field}_ns") for field, name in zip(path, names, strict=False))
+
+
 class LogTables:
     """The tables of a log. Rows are read once and kept as columns, because several tables are made of them."""
 
@@ -201,6 +237,12 @@ class LogTables:
         schemas = {channel.topic: channel.schema for channel in self.opened.channels.values()}
         return sorted(topic for topic, schema in schemas.items() if schema and schema.name not in SCHEMAS)
 
+    def other_topics(self) -> list[str]:
+        """The channels with messages of other software: no rows, and no views of rows."""
+        channels = [channel for channel in self.opened.channels.values() if channel.schema is None]
+        hows = {channel.topic: Provenance.from_metadata(channel.metadata) for channel in channels}
+        return sorted(topic for topic, how in hows.items() if how is None or how.transform != "view")
+
     def topics(self, name: str) -> list[str]:
         """The channels from which a table is made, in order."""
         if name in ("channels", "warnings", "recordings"):
@@ -246,50 +288,50 @@ class LogTables:
 
     # Foreign channels
 
-    def messages_source(self, topic: str, blobs: bool) -> str:
+    def messages_source(self, topic: str, part: MessagesPart) -> str:
         """A digest of the input of ``messages`` of a topic."""
         places = self._pointers(topic, of_rows=False)
         # The table has the places of messages, so it changes when they move.
         where = hashlib.sha256(places.chunk_offset.tobytes() + places.message_offset.tobytes()).hexdigest()
-        return _digest([topic, __version__, self.recording, places.file, self.opened.fingerprint(topic), where, blobs])
+        return _digest([topic, __version__, self.recording, places.file, self.opened.fingerprint(topic), where, *part])
 
-    def messages(self, topic: str, blobs: bool = False) -> tuple[Any, list[str]]:
+    def messages(self, topic: str, part: MessagesPart = WHOLE) -> tuple[Any, list[str]]:
         """The messages of any channel as a flat table, and the fields that were left out; as ``message_pieces``."""
-        pieces, left_out = self.message_pieces(topic, blobs)
+        pieces, left_out = self.message_pieces(topic, part)
         return pieces.table(), left_out
 
-    def message_pieces(self, topic: str, blobs: bool = False) -> tuple[TablePieces, list[str]]:
+    def message_pieces(self, topic: str, part: MessagesPart = WHOLE) -> tuple[TablePieces, list[str]]:
         """The rows of a channel, or the messages of any other as a flat table; in pieces, and the fields left out.
 
-        Raises McaptrackError, with topic and time, for messages that can't be read.
+        Raises McaptrackError, with topic and time, if its messages can't be read; a warning names a few that can't be.
         """
         schema = self.opened.channel(topic).schema
         if schema is not None:
             return self._rows(schema, [topic]), []
-        kind = message_type_of(self.opened, topic)
-        fields = self._fields(topic, kind, blobs)
-        places = self._pointers(topic, of_rows=False)
-        return tables.messages_table(topic, kind.name, places, fields), [".".join(path) for path in fields.left_out]
-
-    def _fields(self, topic: str, kind: foreign.MessageType, blobs: bool) -> Fields:
-        """The fields of the messages of a channel of other software."""
         from mcaptrack.columns import Unsupported
 
+        kind, where = message_type_of(self.opened, topic), f"{self.opened.path}: {topic}"
+
         def payloads() -> Iterator[Payloads]:
-            return self.opened.payloads(topic)
+            return self.opened.payloads(topic, part.start_ns, part.end_ns)
 
-        def wanted(_: tuple[str, ...]) -> bool:
-            return True
-
-        where = f"{self.opened.path}: {topic}"
         try:
             flatten = flattener(kind)
         except McaptrackError as error:
             raise McaptrackError(f"{where}: {error}") from None
-        try:
-            return tables.typed_fields(where, column_reader(kind, wanted, blobs), payloads, flatten)
-        except Unsupported:
-            return tables.inferred_fields(where, payloads, flatten, wanted, blobs)
+
+        def fields_of(wanted: MessagesPart) -> tables.MessageFields:
+            try:
+                return tables.typed_fields(where, column_reader(kind, wanted.wants, wanted.blobs), payloads, flatten)
+            except Unsupported:
+                return tables.inferred_fields(where, payloads, flatten, wanted.wants, wanted.blobs)
+
+        fields = fields_of(part)
+        if column := part.unknown([*fields.types, *fields.left_out]):
+            all_fields = list_names([".".join(path) for path in fields_of(WHOLE).types], _FIELDS_LISTED)
+            raise McaptrackError(f"{where} has no field {column}; it has {all_fields}")
+        places = self._pointers(topic, of_rows=False, span=(part.start_ns, part.end_ns))
+        return tables.messages_table(topic, kind.name, places, fields), [".".join(path) for path in fields.left_out]
 
     # Parts of tables
 
@@ -356,11 +398,17 @@ class LogTables:
     def _note(self, name: str, note: str) -> None:
         self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), note])
 
-    def _pointers(self, topic: str, of_rows: bool = True) -> Pointers:
-        places = self.opened.places(topic)
+    def _pointers(
+        self, topic: str, of_rows: bool = True, span: tuple[int | None, int | None] = (None, None)
+    ) -> Pointers:
+        places, low = self.opened.places(topic), 0
+        if span != (None, None):
+            first, last = (0 if span[0] is None else span[0]), (LAST_NS if span[1] is None else span[1])
+            low, high = np.searchsorted(places.t_ns, (first, last)).tolist()
+            places = MessageLocations(*(values[low:high] for values in places))
         file = file_name(self.opened.part(topic).path)
         count = len(places.t_ns)
-        frame, rows = np.arange(count), np.full(count, -1)
+        frame, rows = np.arange(low, low + count), np.full(count, -1)
         # Rows of 3D boxes are at their stamps: several messages may be one frame.
         has_rows = not foreign.holds_pictures(self.opened.channel(topic)) and not holds_boxes_3d(self.opened, topic)
         if of_rows and has_rows:
