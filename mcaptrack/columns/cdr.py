@@ -10,7 +10,7 @@ size. Otherwise (messages with strings or lists in them) the first elements of a
 the second ones, and so on; where few messages have that many, element by element.
 
 Alignment (XCDR1) is relative to the end of the 4-byte head of a message, so the bodies of CDR messages are first copied
-to multiples of 8. ROS 1 has neither heads nor alignment, and is read in place.
+to multiples of 8, or, if they are long, read in groups. ROS 1 has neither heads nor alignment, and is read in place.
 
 Nothing is read, nor room made for it, before it is certain to be within its message: other messages raise Malformed.
 
@@ -37,6 +37,12 @@ MAX_DEPTH: Final = 32
 _MAX_TYPES: Final = 4096
 _MAX_BYTES: Final = 2**31 - 1
 _NS_PER_S: Final = 10**9
+#: Numbers of CDR are aligned to at most so many bytes behind the head of a message.
+_GRID: Final = 8
+#: Longer messages, on average, are not copied to aligned places, but read in groups of equal alignment.
+_COPIED: Final = 2048
+#: Writers may fill up the end of a message.
+_PADDING: Final = 3
 #: The fields of times and durations, in ROS 2 and ROS 1.
 _TIMES: Final = ({"sec", "nanosec"}, {"sec", "nsec"}, {"secs", "nsecs"})
 #: What IDL needs where a message of ROS has no fields.
@@ -526,28 +532,36 @@ class RosColumns:
         order = data[start + 1].astype(np.int64) | data[start].astype(np.int64) << 8
         if (order > 1).any():  # parameter lists, and the encodings of XCDR2
             raise Malformed(f"its encapsulation {order.max():04x} is not read", int(np.argmax(order)))
-        if _are_equal(order):
-            return self._read(data, start + 4, end, "<" if not len(order) or order[0] else ">")
-        rows, parts = [np.flatnonzero(order == number) for number in (0, 1)], []
-        for which, kind in zip(rows, "><", strict=True):
+        body = start + 4
+        is_in_place = int((end - start).sum()) > _COPIED * len(start)
+        group = order * _GRID + (body % _GRID if is_in_place else 0)
+        if _are_equal(group):
+            return self._read(data, body, end, "<" if not len(order) or order[0] else ">", is_in_place)
+        rows, parts = [np.flatnonzero(group == number) for number in np.unique(group)], []
+        for which in rows:
             try:
-                parts.append(self._read(data, start[which] + 4, end[which], kind))
+                kind = "<" if order[which[0]] else ">"
+                parts.append(self._read(data, body[which], end[which], kind, is_in_place))
             except Malformed as error:
                 raise Malformed(str(error), int(which[error.message])) from None
         back = pa.array(np.argsort(np.concatenate(rows)))
-        return {path: pa.concat_arrays([column, parts[1][path]]).take(back) for path, column in parts[0].items()}
+        return {path: pa.concat_arrays([part[path] for part in parts]).take(back) for path in parts[0]}
 
-    def _read(self, data: Bytes, start: Ints, end: Ints, order: str) -> dict[Path, pa.Array]:
+    def _read(self, data: Bytes, start: Ints, end: Ints, order: str, is_in_place: bool = False) -> dict[Path, pa.Array]:
+        """The columns of messages of one byte order; of CDR that is read in place, also of one alignment."""
         cursor = Cursor(data, start, end, 1, _step(start))
-        sizes, left_over = end - start, 0
+        sizes = end - start
         try:
-            if self.is_cdr:
-                slots = ends_of((sizes | 7) + 1)
-                body, base, left_over = cursor.joined(sizes, slots), slots[:-1], 3
-                cursor = Cursor(body, base, base + sizes, 8, _step(base))
+            if self.is_cdr and is_in_place and len(start):
+                shift = int(start[0]) % _GRID
+                cursor = Cursor(data[shift:], start - shift, end - shift, _GRID, _step(start))
+            elif self.is_cdr:
+                slots = ends_of((sizes | (_GRID - 1)) + 1)
+                base = slots[:-1]
+                cursor = Cursor(cursor.joined(sizes, slots), base, base + sizes, _GRID, _step(base))
             out = dict(self._by_order[order].columns(cursor))
             left = cursor.end - cursor.at
-            bad = np.flatnonzero((left < 0) | (left > left_over))
+            bad = np.flatnonzero((left < 0) | (left > (_PADDING if self.is_cdr else 0)))
             if len(bad):
                 raise _Outside(f"{left[bad[0]]} bytes of it are left over", int(cursor.end[bad[0]]))
         except _Outside as error:

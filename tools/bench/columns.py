@@ -1,0 +1,201 @@
+"""Messages of robots as tables, beside other readers of the same files, in one call, by CPU time.
+
+python tools/bench/columns.py [--messages 20000] [--folder DIR]
+
+For each type: CPU from the file to an Arrow table here; and how many times as long take mcap-ros2-support and the
+protobuf runtime to give objects, rosbags to deserialize the payloads alone, and roboto-mcap-codec (Rust, if it is
+installed) to give Arrow. The last line is ``export --all`` of all of them against reading the chunks and writing the
+same tables by pyarrow alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
+from mcap_protobuf.schema import build_file_descriptor_set
+from mcap_ros2.decoder import DecoderFactory as Ros2Factory
+from rosbags.typesys import Stores, get_typestore
+
+import mcaptrack
+from mcaptrack import log
+
+STORE = get_typestore(Stores.LATEST)
+RANDOM = np.random.default_rng(1)
+#: Lists of messages have so many elements at most.
+_MOST = 30
+#: Types, messages for each of ``--messages``, and elements of their lists.
+TYPES = {
+    "sensor_msgs/msg/Imu": (5.0, 1),
+    "sensor_msgs/msg/JointState": (2.0, 12),
+    "nav_msgs/msg/Odometry": (2.0, 1),
+    "tf2_msgs/msg/TFMessage": (0.25, 20),
+    "visualization_msgs/msg/MarkerArray": (0.1, 30),
+    "diagnostic_msgs/msg/DiagnosticArray": (0.25, 8),
+    "sensor_msgs/msg/PointCloud2": (0.01, 500_000),
+}
+PROTOBUF = {"FrameTransforms": (0.25, 20), "LocationFix": (2.0, 1)}
+
+
+def value(form: Any, size: int) -> Any:
+    """A random value of a type of a store."""
+    node, what = int(form[0]), form[1]
+    if node == 1:
+        return (
+            "name"
+            if what[0] == "string"
+            else bool(size % 2)
+            if what[0] == "bool"
+            else float(RANDOM.random())
+            if "float" in what[0]
+            else 1
+        )
+    if node == 2:
+        return STORE.types[what](**{name: value(of, size) for name, of in STORE.fielddefs[what][1]})
+    member, count = what
+    length = count if node == 3 else size
+    if int(member[0]) == 1 and member[1][0] != "string":
+        return (
+            RANDOM.random(length) if "float" in member[1][0] else np.ones(length, member[1][0].replace("byte", "uint8"))
+        )
+    return [value(member, min(size, 4)) for _ in range(min(length, _MOST))]
+
+
+def ros_messages(name: str, count: int, size: int) -> Iterator[bytes]:
+    kinds = [bytes(STORE.serialize_cdr(value((2, name), size + step % 3), name)) for step in range(50)]
+    return (kinds[number % len(kinds)] for number in range(count))
+
+
+def protobuf_messages(kind: Any, count: int, size: int) -> Iterator[bytes]:
+    def message() -> bytes:
+        out = kind()
+        for inner in [out.transforms.add() for _ in range(size)] if hasattr(out, "transforms") else [out]:
+            inner.timestamp.seconds = 1_700_000_000
+            for field in inner.DESCRIPTOR.fields:
+                if field.type == field.TYPE_STRING:
+                    setattr(inner, field.name, "frame")
+                elif field.name in ("translation", "rotation"):
+                    getattr(inner, field.name).x = float(RANDOM.random())
+                elif field.type == field.TYPE_DOUBLE and not field.is_repeated:
+                    setattr(inner, field.name, float(RANDOM.random()))
+        return bytes(out.SerializeToString())
+
+    kinds = [message() for _ in range(50)]
+    return (kinds[number % len(kinds)] for number in range(count))
+
+
+def write(path: Path, name: str, encoding: tuple[str, str], definition: bytes, payloads: Iterator[bytes]) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2")
+        channel = writer.register_channel("/t", encoding[0], writer.register_schema(name, encoding[1], definition))
+        for number, payload in enumerate(payloads):
+            writer.add_message(channel, 10**18 + number * 10**6, payload, 10**18 + number * 10**6, number)
+        writer.finish()
+
+
+def cpu(work: Callable[[], object], times: int = 3) -> float:
+    """The least CPU time of some runs, in seconds."""
+    best = float("inf")
+    for _ in range(times):
+        started = time.process_time()
+        work()
+        best = min(best, time.process_time() - started)
+    return best
+
+
+def ours(path: Path) -> Any:
+    with mcaptrack.open(path) as opened:
+        return opened.table("/t")
+
+
+def objects(path: Path) -> int:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[Ros2Factory(), ProtobufFactory()])
+        return sum(1 for _ in reader.iter_decoded_messages())
+
+
+def rosbags(path: Path, name: str) -> None:
+    with log.read(path) as opened:
+        for message in opened.messages("/t"):
+            STORE.deserialize_cdr(message.payload, name)
+
+
+def roboto(path: Path) -> int:
+    codec = importlib.import_module("mcap_codec")
+    with path.open("rb") as stream:
+
+        def read(offset: int, size: int) -> bytes:
+            stream.seek(offset)
+            return stream.read(size)
+
+        topic, times = codec.TopicName("/t"), codec.TimestampSource("message_log_time")
+        with codec.open_mcap_file(read, path.stat().st_size, channel=topic, timestamp=times) as cursor:
+            return sum(batch.num_rows for batch in cursor)
+
+
+def compare(path: Path, name: str) -> None:
+    table = ours(path)
+    here = cpu(lambda: ours(path))
+    peers: dict[str, Callable[[], object]] = {"objects": lambda: objects(path)}
+    if not name.startswith("foxglove"):
+        peers["rosbags"] = lambda: rosbags(path, name)
+    if importlib.util.find_spec("mcap_codec") and not name.startswith("foxglove"):
+        peers["roboto"] = lambda: roboto(path)
+    ratios = "  ".join(f"{peer} {cpu(work, 1) / here:6.1f}" for peer, work in peers.items())
+    print(f"{name:38} {table.num_rows:7} rows {here:6.3f} s   {ratios}")
+
+
+def compare_export(paths: list[Path], folder: Path) -> None:
+    tables = {path: ours(path) for path in paths}
+
+    def alone() -> None:
+        for path, table in tables.items():
+            with log.read(path) as opened:
+                for _ in opened.payloads("/t"):
+                    pass
+            pq.write_table(table, folder / "alone.parquet", compression="zstd")
+
+    def export() -> None:
+        for path in paths:
+            mcaptrack.export(path, folder / "tables", all_topics=True, force=True)
+
+    print(f"export --all: {cpu(export, 2) / cpu(alone, 2):.2f} times as long as chunks and Parquet alone")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--messages", type=int, default=20_000)
+    parser.add_argument("--folder", type=Path)
+    chosen = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=chosen.folder) as name:
+        folder, paths = Path(name), []
+        for kind, (share, size) in TYPES.items():
+            paths.append(folder / f"{kind.replace('/', '_')}.mcap")
+            definition = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
+            messages = ros_messages(kind, int(chosen.messages * share), size)
+            write(paths[-1], kind, ("cdr", "ros2msg"), definition, messages)
+            compare(paths[-1], kind)
+        for kind, (share, size) in PROTOBUF.items():
+            message = getattr(importlib.import_module(f"foxglove_schemas_protobuf.{kind}_pb2"), kind)
+            paths.append(folder / f"{kind}.mcap")
+            definition = build_file_descriptor_set(message).SerializeToString()
+            payloads = protobuf_messages(message, int(chosen.messages * share), size)
+            write(paths[-1], f"foxglove.{kind}", ("protobuf", "protobuf"), definition, payloads)
+            compare(paths[-1], f"foxglove.{kind}")
+        compare_export(paths, folder)
+
+
+if __name__ == "__main__":
+    main()
