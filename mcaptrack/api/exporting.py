@@ -160,8 +160,10 @@ def export(
         With ``topic``: write these fields only, as in header.stamp,angular_velocity.z; of a message all its fields.
     blobs : bool, default False
         With ``topic``: include binary fields, such as pictures and point clouds.
-    start_s, end_s : float, optional
-        With ``topic``: write messages from the first time on, and before the second, in seconds since the log begins.
+    start_s : float, optional
+        With ``topic``: write messages from this time of the log on, in seconds.
+    end_s : float, optional
+        With ``topic``: write messages before this time of the log, in seconds.
     force : bool, default False
         Write all tables again, also over those of another log of this name; replace a bag or a file.
 

@@ -210,6 +210,10 @@ CASES: dict[str, dict[str, Case]] = {
         format="--format csv",
         topic="--topic /others",
         blobs=("export a.mcap --topic /others", "--blobs"),
+        all=("export a.mcap", "--all"),
+        columns=("export a.mcap --topic /others", "--columns header"),
+        start_s=("export a.mcap --topic /others", "--start-s 1"),
+        end_s=("export a.mcap --topic /others", "--end-s 0.5"),
         force=("export a.mcap -o taken", "--force"),
     ),
     "query": common(
