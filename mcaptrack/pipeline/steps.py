@@ -19,12 +19,13 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
-from mcaptrack.notices import warn
+from mcaptrack.notices import Code, Notice, warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
 from mcaptrack.pipeline.motion import SideInput, boxes_input, motion_input, path_with
 from mcaptrack.pipeline.pictures import with_descriptors
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_for, without_unseen
+from mcaptrack.pipeline.scores import DOUBTFUL, score_map, score_range, without_doubtful
 from mcaptrack.pipeline.staleness import digest_of, takes_corrections
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import TRACKS, VIDEO, Frame, Schema
@@ -101,7 +102,8 @@ class Work:
     ``planes`` are the ground planes of the camera, and ``plane_choice`` how one is made where none is given.
     ``seen`` are the frames of its input with boxes in the pictures that they were seen in, also where the camera moves
     by ``path``. ``references`` are the digests of channels beside the main input, by topic. ``outputs`` are schema and
-    frames by topic; ``continued`` says how their ids go on from the log before.
+    frames by topic; ``continued`` says how their ids go on from the log before. ``scores`` say what scores of its input
+    were taken for, by class, and ``said`` are warnings of that, which its channels keep.
     """
 
     state: RunState
@@ -116,6 +118,8 @@ class Work:
     references: dict[str, str] = field(default_factory=dict)
     outputs: dict[str, tuple[Schema, Sequence[Frame]]] = field(default_factory=dict)
     continued: Mapping[str, str] = field(default_factory=dict)
+    scores: Mapping[str, str] = field(default_factory=dict)
+    said: list[Notice] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.transform, self.seen, self.own_planes = self.job.transform, self.source.frames, self.planes
@@ -152,6 +156,11 @@ class Work:
         """Do the steps after the transform."""
         for step in self.stage.after:
             AFTER[step](self)
+
+    def say(self, message: str, code: Code) -> None:
+        """Warn of something that its channels keep, so that later runs repeat it."""
+        self.said.append(Notice(message, code))
+        warn(message, code)
 
     def _taken(self, name: str, side: SideInput | None) -> dict[str, Any]:
         if side is None:
@@ -232,6 +241,31 @@ def _after_log_before(work: Work) -> None:
         work.source = work.source.with_frames(led(lead, frames, work.transform.reads))
 
 
+def _with_likelihoods(work: Work) -> None:
+    """Take scores that are outside of 0 to 1 for likelihoods that detections are real, and leave out unlikely ones."""
+    frames, transform = work.source.frames, work.transform
+    span = score_range(frames)
+    if span is None:
+        return
+    least, said = (
+        getattr(transform, "min_score", None),
+        f"{work.job.source}: scores are from {span[0]:g} to {span[1]:g}",
+    )
+    if least is not None and not 0 <= least <= 1:
+        work.say(f"{said}; `min_score={least:g}` is one of these, so they stay as they are", "scores")
+        return
+    names = {int(number): name for number, name in work.source.classes.items()}
+    found = score_map(frames, *span, tuple(names.items()), getattr(transform, "class_limits", ""))
+    work.scores = {names.get(number) or str(number): str(curve) for number, curve in found.curves.items()}
+    frames, text = found.mapped(frames), f"{said}: {found.how}"
+    if found.is_fitted and least is None:
+        count, frames = int(row_ends(frames)[-1]), without_doubtful(frames)
+        text += f"; {count - int(row_ends(frames)[-1]):,} of {count:,} detections are less likely than {DOUBTFUL:g} and"
+        text += " left out" + (" (`min_score=` sets another limit)" if hasattr(transform, "min_score") else "")
+    work.source, work.seen = work.source.with_frames(frames), frames
+    work.say(text, "scores")
+
+
 BEFORE: Final[Mapping[StepBefore, Callable[[Work], None]]] = MappingProxyType(
     {
         "memory": lambda work: warn_memory(work.source.frames),
@@ -240,6 +274,7 @@ BEFORE: Final[Mapping[StepBefore, Callable[[Work], None]]] = MappingProxyType(
         "corrections": _with_corrections,
         "scene": _in_scene,
         "log-before": _after_log_before,
+        "scores": _with_likelihoods,
     }
 )
 

@@ -32,7 +32,7 @@ from mcaptrack.schema import (
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
 
 #: Steps before and after a transform (``mcaptrack.pipeline.steps``).
-StepBefore = Literal["memory", "planes", "scale", "corrections", "scene", "log-before"]
+StepBefore = Literal["memory", "planes", "scale", "corrections", "scene", "log-before", "scores"]
 StepAfter = Literal["one-class", "log-before", "video-rate", "pictures", "seen"]
 #: Suffix of the topic of tracks at the video's rate (the step "video-rate").
 FULL: Final = "/full"
@@ -331,7 +331,7 @@ _STAGES: Final = (
         input_topic="detections",
         output_topic="tracks",
         rows="tracks",
-        before=("scale", "memory", "log-before"),
+        before=("scale", "memory", "log-before", "scores"),
         after=("one-class", "log-before", "seen"),
     ),
     Stage(
