@@ -54,6 +54,9 @@ _OF_THREE: Final = 6**0.5
 _REAL: Final = np.array([0.02, 0.05, 0.13, 0.80])
 _FALSE: Final = np.array([0.40, 0.20, 0.20, 0.20])
 _EXPECTED: Final = 60.0
+#: False detections go on in this share of these runs at most, in metres and in pictures. Of what seems to be false and
+#: goes on more often, a part is real, such as people who are half hidden.
+_STEADY_FALSE: Final = (0.5, 0.7)
 #: Detections that a mixture is fitted to, of each class, and rounds of that at most.
 _FITTED: Final = 20_000
 _ROUNDS: Final = 200
@@ -69,6 +72,11 @@ class Curve(NamedTuple):
 
     score: Floats
     likelihood: Floats
+
+    def least(self, likelihood: float) -> float:
+        """The least score that is so likely; infinity if none is."""
+        is_reached = self.likelihood >= likelihood
+        return float(np.interp(likelihood, self.likelihood, self.score)) if is_reached.any() else np.inf
 
     def __str__(self) -> str:
         """The knots as the provenance has them: SCORE:LIKELIHOOD with spaces between them."""
@@ -130,11 +138,11 @@ def score_map(
         guess = Curve(ends, 1 / (1 + np.exp(-ends)) if low < 0 else ends / high)
         kind = "logits" if low < 0 else "shares of the highest"
         return ScoreMap(dict.fromkeys(numbers, guess), f"taken as {kind}: there are too few to learn more", False)
-    steady = table.steady()
+    steady, false = table.steady(), _STEADY_FALSE[0 if table.in_metres else 1]
     every = np.ones(len(table.score), bool)
     counts = {number: table.class_id == number for number in numbers}
     chosen = {number: of_class if of_class.sum() >= _FEW else every for number, of_class in counts.items()}
-    curves = {number: _curve(table.score[which], steady[which]) for number, which in chosen.items()}
+    curves = {number: _curve(table.score[which], steady[which], false) for number, which in chosen.items()}
     return ScoreMap(curves, "mapped to likelihoods by how steadily boxes of each class and score go on", True)
 
 
@@ -150,6 +158,7 @@ class _Detections(NamedTuple):
     place: Floats
     reach: Floats
     unsteady: Floats
+    in_metres: bool
 
     @classmethod
     def of(cls, frames: Sequence[Frame], class_names: ClassNames, class_limits: str) -> _Detections:
@@ -164,7 +173,8 @@ class _Detections(NamedTuple):
         frame, score, class_id, x_m, y_m, x, y, w, h = np.concatenate(parts, axis=1)
         t_ns, numbers = np.concatenate(times), class_id.astype(np.int64)
         step_s = _steps_s(t_ns)[frame.astype(np.int64)]
-        if np.isfinite(x_m).mean() >= 0.5:
+        in_metres = bool(np.isfinite(x_m + y_m).mean() >= 0.5)
+        if in_metres:
             of = limits_by_class(np.unique(numbers).tolist(), class_names, class_limits)
             speed, noise, drift = (
                 np.array([getattr(of[number], name) for number in numbers.tolist()])
@@ -175,7 +185,7 @@ class _Detections(NamedTuple):
         else:
             size = np.sqrt(np.maximum(w * h, 1e-9))
             place, reach, unsteady = np.stack([x + w / 2, y + h / 2], axis=1), _REACH * size, _UNSTEADY * size
-        return cls(t_ns, frame.astype(np.int64), numbers, score, place, reach, unsteady)
+        return cls(t_ns, frame.astype(np.int64), numbers, score, place, reach, unsteady, in_metres)
 
     def steady(self) -> Ints:
         """How often each detection goes on steadily, 0 to 3 (N,): with those of the frames before and after, of the two
@@ -204,7 +214,7 @@ class _Detections(NamedTuple):
         # Fewer are possible at the ends of a log.
         to_end = np.minimum(self.frame, len(self.t_ns) - 1 - self.frame)
         possible = np.where(to_end >= 2, 3, to_end + 1)
-        return np.rint(3 * out.sum(axis=0) / possible).astype(np.int64)
+        return np.asarray(np.rint(3 * out.sum(axis=0) / possible), np.int64)
 
 
 def _steps_s(t_ns: Ints) -> Floats:
@@ -223,8 +233,8 @@ def _nearest(first: Ints, second: Ints, way: Floats) -> tuple[Ints, Ints, Floats
     return first[order], second[order], way[order]
 
 
-def _curve(score: Floats, steady: Ints) -> Curve:
-    """What the scores (N,) of detections mean that go on steadily so often (N,)."""
+def _curve(score: Floats, steady: Ints, steady_false: float) -> Curve:
+    """What the scores (N,) of detections mean that go on steadily so often (N,); false ones do in a share at most."""
     from scipy.optimize import isotonic_regression
 
     order = np.argsort(score, kind="stable")[:: -(-len(score) // _FITTED)]
@@ -233,6 +243,9 @@ def _curve(score: Floats, steady: Ints) -> Curve:
     lowest = int(by_score[: max(1, len(score) // 2)].argmin())
     rising = np.maximum.accumulate(np.concatenate([np.full(lowest, by_score[lowest]), by_score[lowest:]]))
     likelihood = (rising + isotonic_regression(is_real).x) / 2
+    goes_on = [float(np.average(steady / 3, weights=weight + 1e-9)) for weight in (is_real, 1 - is_real)]
+    share = np.clip((goes_on[1] - steady_false) / max(goes_on[0] - steady_false, 0.1), 0, 1)
+    likelihood = share + (1 - share) * likelihood
     knot = np.unique(np.quantile(score, np.linspace(0, 1, _KNOTS), method="nearest"))
     values = np.interp(knot, score, likelihood)
     values = (1 - _RISE) * values + _RISE * np.linspace(0, 1, len(knot))

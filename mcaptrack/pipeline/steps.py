@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
@@ -45,6 +45,8 @@ from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 #: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
 #: has all samples in memory).
 _BASE, _A_PERSON_SECOND = 400_000_000, 3_000
+#: Classes that a warning names.
+_LISTED: Final = 8
 #: Called with the name of a stage, the steps that are done, and their total.
 Progress = Callable[[str, int, int], None]
 
@@ -256,12 +258,15 @@ def _with_likelihoods(work: Work) -> None:
         return
     names = {int(number): name for number, name in work.source.classes.items()}
     found = score_map(frames, *span, tuple(names.items()), getattr(transform, "class_limits", ""))
-    work.scores = {names.get(number) or str(number): str(curve) for number, curve in found.curves.items()}
+    curves = {names.get(number) or f"class {number}": curve for number, curve in found.curves.items()}
+    work.scores = {name: str(curve) for name, curve in curves.items()}
     frames, text = found.mapped(frames), f"{said}: {found.how}"
     if found.is_fitted and least is None:
         count, frames = int(row_ends(frames)[-1]), without_doubtful(frames)
-        text += f"; {count - int(row_ends(frames)[-1]):,} of {count:,} detections are less likely than {DOUBTFUL:g} and"
-        text += " left out" + (" (`min_score=` sets another limit)" if hasattr(transform, "min_score") else "")
+        limits = list_names([f"{name} {curve.least(DOUBTFUL):.3g}" for name, curve in sorted(curves.items())], _LISTED)
+        text += f"; {count - int(row_ends(frames)[-1]):,} of {count:,} detections are less likely than {DOUBTFUL:g}, "
+        text += f"which is a score of {limits}, and are left out"
+        text += " (`min_score=` sets another limit)" if hasattr(transform, "min_score") else ""
     work.source, work.seen = work.source.with_frames(frames), frames
     work.say(text, "scores")
 
