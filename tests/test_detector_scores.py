@@ -155,7 +155,7 @@ def test_percentages_and_scores_that_are_all_the_same_are_named(score, how, expe
     values = score(len(scene.logit))
     frames = scene.frames(values)
     found = score_map(frames, values.min(), values.max(), NAMES)
-    assert how in found.how
+    assert how in found.basis
     assert not found.is_fitted
     assert likelihoods(scene, values) == pytest.approx(expected(len(values)), abs=1e-6, nan_ok=True)
 
@@ -165,7 +165,7 @@ def test_few_detections_keep_their_order_and_none_is_left_out():
     frames = [Frame(n * STEP_NS, n, rows) for n in range(4)]
     found = score_map(frames, -2.0, 3.0, NAMES)
     assert not found.is_fitted
-    assert "too few" in found.how
+    assert "too few" in found.basis
     assert found.mapped(frames)[0].rows["score"] == pytest.approx(1 / (1 + np.exp([2.0, -3.0])), abs=0.01)
 
 

@@ -352,7 +352,7 @@ def _done(work: Work) -> dict[str, Made]:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
     work.source.warn_lost(job.source, work.transform.reads, max(counts))
-    provenance, usual = _provenance_of(work, [*work.said, *warnings]), stage.outputs(job.target)
+    provenance, usual = _provenance_of(work, [*work.notices, *warnings]), stage.outputs(job.target)
     return {
         topic: Made.of(
             schema, frames, replace(provenance, output="" if topic in usual else topic.removeprefix(job.target + "/"))

@@ -68,7 +68,7 @@ _RISE: Final = 0.02
 
 
 class Curve(NamedTuple):
-    """What scores of a class mean: likelihoods (K,) that detections are real, at scores (K,), both rising."""
+    """The meaning of the scores of a class: likelihoods (K,) that detections are real, at scores (K,), both rising."""
 
     score: Floats
     likelihood: Floats
@@ -84,13 +84,13 @@ class Curve(NamedTuple):
 
 
 class ScoreMap(NamedTuple):
-    """What the scores of a channel mean, by class, and how that is known, in words.
+    """The meaning of the scores of a channel: a curve for each class; ``basis`` says where these come from.
 
     ``is_fitted`` is false where likelihoods are too uncertain to leave detections out.
     """
 
     curves: Mapping[int, Curve]
-    how: str
+    basis: str
     is_fitted: bool
 
     def mapped(self, frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -124,7 +124,7 @@ def without_doubtful(frames: Sequence[Frame]) -> Sequence[Frame]:
 def score_map(
     frames: Sequence[Frame], low: float, high: float, class_names: ClassNames, class_limits: str = ""
 ) -> ScoreMap:
-    """Find out what the scores of a channel, which are from ``low`` to ``high``, mean."""
+    """Find the meaning of the scores of a channel, which are from ``low`` to ``high``."""
     table = _Detections.of(frames, class_names, class_limits)
     numbers = np.unique(table.class_id).tolist()
     if low == high:
@@ -188,8 +188,8 @@ class _Detections(NamedTuple):
         return cls(t_ns, frame.astype(np.int64), numbers, score, place, reach, unsteady, in_metres)
 
     def steady(self) -> Ints:
-        """How often each detection goes on steadily, 0 to 3 (N,): with those of the frames before and after, of the two
-        frames before, and of the two after.
+        """Count how often each detection goes on steadily, 0 to 3 (N,): with those of the frames before and after, of
+        the two frames before, and of the two after.
         """
         step_s = _steps_s(self.t_ns)
         gap = np.diff(self.t_ns, append=self.t_ns[-1:]) / NS_PER_S > _LONG_STEP * step_s
@@ -234,7 +234,10 @@ def _nearest(first: Ints, second: Ints, way: Floats) -> tuple[Ints, Ints, Floats
 
 
 def _curve(score: Floats, steady: Ints, steady_false: float) -> Curve:
-    """What the scores (N,) of detections mean that go on steadily so often (N,); false ones do in a share at most."""
+    """Find the meaning of the scores (N,) of detections, by how often these go on steadily (N,).
+
+    False ones do so in the share ``steady_false`` at most.
+    """
     from scipy.optimize import isotonic_regression
 
     order = np.argsort(score, kind="stable")[:: -(-len(score) // _FITTED)]

@@ -105,7 +105,7 @@ class Work:
     ``seen`` are the frames of its input with boxes in the pictures that they were seen in, also where the camera moves
     by ``path``. ``references`` are the digests of channels beside the main input, by topic. ``outputs`` are schema and
     frames by topic; ``continued`` says how their ids go on from the log before. ``scores`` say what scores of its input
-    were taken for, by class, and ``said`` are warnings of that, which its channels keep.
+    were taken for, by class, and ``notices`` are warnings of that, which its channels keep.
     """
 
     state: RunState
@@ -121,7 +121,7 @@ class Work:
     outputs: dict[str, tuple[Schema, Sequence[Frame]]] = field(default_factory=dict)
     continued: Mapping[str, str] = field(default_factory=dict)
     scores: Mapping[str, str] = field(default_factory=dict)
-    said: list[Notice] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.transform, self.seen, self.own_planes = self.job.transform, self.source.frames, self.planes
@@ -161,7 +161,7 @@ class Work:
 
     def say(self, message: str, code: Code) -> None:
         """Warn of something that its channels keep, so that later runs repeat it."""
-        self.said.append(Notice(message, code))
+        self.notices.append(Notice(message, code))
         warn(message, code)
 
     def _taken(self, name: str, side: SideInput | None) -> dict[str, Any]:
@@ -249,24 +249,22 @@ def _with_likelihoods(work: Work) -> None:
     span = score_range(frames)
     if span is None:
         return
-    least, said = (
-        getattr(transform, "min_score", None),
-        f"{work.job.source}: scores are from {span[0]:g} to {span[1]:g}",
-    )
+    least = getattr(transform, "min_score", None)
+    text = f"{work.job.source}: scores are from {span[0]:g} to {span[1]:g}"
     if least is not None and not 0 <= least <= 1:
-        work.say(f"{said}; `min_score={least:g}` is one of these, so they stay as they are", "scores")
+        work.say(f"{text}; `min_score={least:g}` is one of these, so they stay as they are", "scores")
         return
     names = {int(number): name for number, name in work.source.classes.items()}
-    found = score_map(frames, *span, tuple(names.items()), getattr(transform, "class_limits", ""))
-    curves = {names.get(number) or f"class {number}": curve for number, curve in found.curves.items()}
+    score_meaning = score_map(frames, *span, tuple(names.items()), getattr(transform, "class_limits", ""))
+    curves = {names.get(number) or f"class {number}": curve for number, curve in score_meaning.curves.items()}
     work.scores = {name: str(curve) for name, curve in curves.items()}
-    frames, text = found.mapped(frames), f"{said}: {found.how}"
-    if found.is_fitted and least is None:
+    frames, text = score_meaning.mapped(frames), f"{text}: {score_meaning.basis}"
+    if score_meaning.is_fitted and least is None:
         count, frames = int(row_ends(frames)[-1]), without_doubtful(frames)
         limits = list_names([f"{name} {curve.least(DOUBTFUL):.3g}" for name, curve in sorted(curves.items())], _LISTED)
-        text += f"; {count - int(row_ends(frames)[-1]):,} of {count:,} detections are less likely than {DOUBTFUL:g}, "
-        text += f"which is a score of {limits}, and are left out"
-        text += " (`min_score=` sets another limit)" if hasattr(transform, "min_score") else ""
+        text += f"; {count - int(row_ends(frames)[-1]):,} of {count:,} detections are less likely than {DOUBTFUL:g} "
+        text += f"(scores below {limits}) and are left out"
+        text += "; `min_score=` sets another limit" if hasattr(transform, "min_score") else ""
     work.source, work.seen = work.source.with_frames(frames), frames
     work.say(text, "scores")
 
