@@ -86,7 +86,7 @@ def likelihoods(scene: Scene, score: np.ndarray) -> np.ndarray:
     frames = scene.frames(score)
     span = score_range(frames)
     assert span is not None
-    mapped = score_map(frames, *span, NAMES).mapped(frames)
+    mapped = score_map(frames, span, NAMES).mapped(frames)
     out = np.empty(len(score))
     for n, frame in enumerate(mapped):
         out[scene.frame == n] = frame.rows["score"]
@@ -146,15 +146,16 @@ def test_scores_from_0_to_1_are_probabilities_and_left_alone():
     ("score", "how", "expected"),
     [
         (lambda n: np.linspace(0, 100, n), "percentages", lambda n: np.linspace(0, 1, n)),
+        (lambda n: np.append(np.full(n - 2, 0.4), [-3, 7]), "0 or 1", lambda n: np.append(np.full(n - 2, 0.4), [0, 1])),
         (lambda n: np.full(n, -1.0), "say nothing", lambda n: np.full(n, np.nan)),
         (lambda n: np.full(n, 255.0), "say nothing", lambda n: np.full(n, np.nan)),
     ],
 )
-def test_percentages_and_scores_that_are_all_the_same_are_named(score, how, expected):
+def test_scales_that_are_known_are_named(score, how, expected):
     scene = drawn(1)
     values = score(len(scene.logit))
     frames = scene.frames(values)
-    found = score_map(frames, values.min(), values.max(), NAMES)
+    found = score_map(frames, score_range(frames), NAMES)
     assert how in found.basis
     assert not found.is_fitted
     assert likelihoods(scene, values) == pytest.approx(expected(len(values)), abs=1e-6, nan_ok=True)
@@ -163,7 +164,7 @@ def test_percentages_and_scores_that_are_all_the_same_are_named(score, how, expe
 def test_few_detections_keep_their_order_and_none_is_left_out():
     rows = DETECTIONS.rows(x_m=[0.0, 9.0], y_m=[0.0, 0.0], score=[-2.0, 3.0], class_id=[3, 3])
     frames = [Frame(n * STEP_NS, n, rows) for n in range(4)]
-    found = score_map(frames, -2.0, 3.0, NAMES)
+    found = score_map(frames, score_range(frames), NAMES)
     assert not found.is_fitted
     assert "too few" in found.basis
     assert found.mapped(frames)[0].rows["score"] == pytest.approx(1 / (1 + np.exp([2.0, -3.0])), abs=0.01)
@@ -177,32 +178,30 @@ def test_boxes_that_are_all_real_are_all_kept():
         x = 100.0 * np.arange(8) + 3 * n + rng.normal(0, 0.5, 8)
         score = np.where(np.arange(8) < 4, 9.2, rng.normal(1.0, 0.8, 8))
         frames.append(Frame(n * STEP_NS, n, DETECTIONS.rows(x_px=x, score=score, **same)))
-    found = score_map(frames, *score_range(frames), ((1, "person"),))
+    found = score_map(frames, score_range(frames), ((1, "person"),))
     assert min(frame.rows["score"].min() for frame in found.mapped(frames)) > DOUBTFUL
 
 
-@pytest.mark.parametrize("shape", [(0, 5), (1, 400), (1, 3000), (40, 1)])
-def test_odd_numbers_of_detections_and_frames(shape):
-    frames_count, count = shape
-    rng = np.random.default_rng(0)
-    frames = [
-        Frame(
-            0,
-            n,
-            DETECTIONS.rows(
-                x_m=rng.uniform(0, 9, count),
-                y_m=np.zeros(count),
-                score=rng.normal(0, 4, count),
-                class_id=np.full(count, 3),
-            ),
-        )
-        for n in range(frames_count)
-    ]
+@pytest.mark.parametrize("shape", [(0, 5), (1, 400), (1, 3000), (40, 1), (40, 60)])
+@pytest.mark.parametrize(
+    "values", [[-4.0, 0.5, 3.0], [-np.inf, -1e30, 0.5, 3.0, 1e38, np.nan], [1e-30, 1e30], [2.0, 3.0]]
+)
+def test_odd_scores_and_numbers_of_detections_become_likelihoods(shape, values):
+    rng, (frames_count, count) = np.random.default_rng(0), shape
+
+    def rows():
+        columns = {"x_m": rng.uniform(0, 9, count), "y_m": np.zeros(count), "score": rng.choice(values, count)}
+        return DETECTIONS.rows(class_id=rng.integers(0, 9, count), **columns)
+
+    frames = [Frame(0, n, rows()) for n in range(frames_count)]
     span = score_range(frames)
-    assert (span is None) == (not frames_count)
-    if span:
-        for frame in score_map(frames, *span, NAMES).mapped(frames):
-            assert ((frame.rows["score"] >= 0) & (frame.rows["score"] <= 1)).all()
+    if span is None:
+        assert not any(np.isfinite(frame.rows["score"]).any() for frame in frames)
+        return
+    for frame, given in zip(score_map(frames, span, NAMES).mapped(frames), frames, strict=True):
+        score, has_score = frame.rows["score"], np.isfinite(given.rows["score"])
+        assert (np.isnan(score) == ~has_score).all()
+        assert ((score[has_score] >= 0) & (score[has_score] <= 1)).all()
 
 
 @pytest.fixture

@@ -33,6 +33,8 @@ from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class
 DOUBTFUL: Final = 0.6
 #: Scores may be outside of 0 to 1 by rounding.
 _ROUNDING: Final = 1e-3
+#: With fewer scores outside of 0 to 1, as a share of all, the others are probabilities.
+_ODD: Final = 0.01
 #: The highest of percentages is above this, and not above 100.
 _PERCENT: Final = 90.0
 #: With fewer detections or frames nothing can be told from the log; classes with fewer are judged with all others.
@@ -107,13 +109,22 @@ class ScoreMap(NamedTuple):
         return mapped_rows(DETECTIONS, frames, change)
 
 
-def score_range(frames: Sequence[Frame]) -> tuple[float, float] | None:
-    """The least and the highest score of detections; None if these are from 0 to 1, or there are none."""
-    low, high = np.inf, -np.inf
+class ScoreRange(NamedTuple):
+    """The least and the highest score of a channel, and the share of scores that are outside of 0 to 1."""
+
+    low: float
+    high: float
+    outside: float
+
+
+def score_range(frames: Sequence[Frame]) -> ScoreRange | None:
+    """The range of the scores of detections; None if these are from 0 to 1, or there are none."""
+    low, high, count, outside = np.inf, -np.inf, 0, 0
     for _, _, joined in joined_parts(DETECTIONS, frames):
         score = joined.rows["score"][np.isfinite(joined.rows["score"])]
         low, high = float(score.min(initial=low)), float(score.max(initial=high))
-    return None if low > high or (low >= -_ROUNDING and high <= 1 + _ROUNDING) else (low, high)
+        count, outside = count + len(score), outside + int(((score < -_ROUNDING) | (score > 1 + _ROUNDING)).sum())
+    return ScoreRange(low, high, outside / count) if outside else None
 
 
 def without_doubtful(frames: Sequence[Frame]) -> Sequence[Frame]:
@@ -121,21 +132,23 @@ def without_doubtful(frames: Sequence[Frame]) -> Sequence[Frame]:
     return filtered_rows(DETECTIONS, frames, lambda joined: ~(joined.rows["score"] < DOUBTFUL))
 
 
-def score_map(
-    frames: Sequence[Frame], low: float, high: float, class_names: ClassNames, class_limits: str = ""
-) -> ScoreMap:
-    """Find the meaning of the scores of a channel, which are from ``low`` to ``high``."""
+def score_map(frames: Sequence[Frame], span: ScoreRange, class_names: ClassNames, class_limits: str = "") -> ScoreMap:
+    """Find the meaning of the scores of a channel, which are in the range ``span``."""
+    low, high, outside = span
     table = _Detections.of(frames, class_names, class_limits)
     numbers = np.unique(table.class_id).tolist()
     if low == high:
         unknown = Curve(np.array([low]), np.array([np.nan]))
         return ScoreMap(dict.fromkeys(numbers, unknown), "all are the same, so that they say nothing", False)
+    if outside < _ODD:
+        as_they_are = Curve(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+        return ScoreMap(dict.fromkeys(numbers, as_they_are), f"{outside:.2%} outside of 0 to 1 count as 0 or 1", False)
     if low >= 0 and _PERCENT < high <= 100 + _ROUNDING:
         share = Curve(np.array([0.0, 100.0]), np.array([0.0, 1.0]))
         return ScoreMap(dict.fromkeys(numbers, share), "taken as percentages", False)
     if len(table.score) < _FEW or len(frames) < _FEW_FRAMES:
         ends = np.linspace(low, high, _KNOTS)
-        guess = Curve(ends, 1 / (1 + np.exp(-ends)) if low < 0 else ends / high)
+        guess = Curve(ends, _logistic(ends) if low < 0 else ends / high)
         kind = "logits" if low < 0 else "shares of the highest"
         return ScoreMap(dict.fromkeys(numbers, guess), f"taken as {kind}: there are too few to learn more", False)
     steady, false = table.steady(), _STEADY_FALSE[0 if table.in_metres else 1]

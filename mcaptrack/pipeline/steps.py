@@ -250,12 +250,12 @@ def _with_likelihoods(work: Work) -> None:
     if span is None:
         return
     least = getattr(transform, "min_score", None)
-    text = f"{work.job.source}: scores are from {span[0]:g} to {span[1]:g}"
+    text = f"{work.job.source}: scores are from {span.low:g} to {span.high:g}"
     if least is not None and not 0 <= least <= 1:
         work.say(f"{text}; `min_score={least:g}` is one of these, so they stay as they are", "scores")
         return
     names = {int(number): name for number, name in work.source.classes.items()}
-    score_meaning = score_map(frames, *span, tuple(names.items()), getattr(transform, "class_limits", ""))
+    score_meaning = score_map(frames, span, tuple(names.items()), getattr(transform, "class_limits", ""))
     curves = {names.get(number) or f"class {number}": curve for number, curve in score_meaning.curves.items()}
     work.scores = {name: str(curve) for name, curve in curves.items()}
     frames, text = score_meaning.mapped(frames), f"{text}: {score_meaning.basis}"
