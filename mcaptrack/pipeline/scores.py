@@ -100,10 +100,10 @@ class ScoreMap(NamedTuple):
 
         def change(joined: JoinedFrames) -> Rows:
             rows = joined.rows.copy()
+            rows["score"][~np.isfinite(rows["score"])] = np.nan
             for number, curve in self.curves.items():
                 of_class = rows["class_id"] == number
-                score = rows["score"][of_class]
-                rows["score"][of_class] = np.where(np.isfinite(score), np.interp(score, *curve), np.nan)
+                rows["score"][of_class] = np.interp(rows["score"][of_class], *curve)
             return rows
 
         return mapped_rows(DETECTIONS, frames, change)
