@@ -47,6 +47,7 @@ Code = Literal[
     "other-settings",
     "other-version",
     "out-of-date",
+    "scores",
     "transforms",
     "view-lost",
     "weak-predictor",

@@ -142,8 +142,10 @@ def test_what_can_not_be_is_refused_with_its_place(answer, said):
 def test_scores_that_trackers_cannot_use_are_said_once(scores, said):
     with collected() as warnings:
         answers(one(rows=changed(score=scores)))
-    expected = f"tracker mine (pack 1) gave scores {said}; trackers that use them need scores from 0 to 1"
-    assert [(warning.code, warning.message) for warning in warnings] == ([("other", expected)] if said else [])
+    expected = (
+        f"tracker mine (pack 1) gave scores {said}; likelihoods are from 0 to 1, and tracking maps others to them"
+    )
+    assert [(warning.code, warning.message) for warning in warnings] == ([("scores", expected)] if said else [])
 
 
 def test_frames_that_are_left_out_are_counted():

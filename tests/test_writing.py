@@ -375,6 +375,6 @@ class TestWriting:
     def test_scores_beyond_one_are_said(self, tmp_path):
         with (
             mcaptrack.open(tmp_path / "a.mcap", create=True) as opened,
-            pytest.warns(mcaptrack.McaptrackWarning, match="scores are from 2 to 95; trackers"),
+            pytest.warns(mcaptrack.McaptrackWarning, match="scores are from 2 to 95; likelihoods"),
         ):
             opened.write("/own/detections", table(score=[2.0, 95.0]))

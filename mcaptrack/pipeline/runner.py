@@ -24,7 +24,7 @@ from mcaptrack.pipeline.pictures import pictures_of
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, plane_in_words, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.staleness import digest_of, read_planes, warn_clock_jumps
-from mcaptrack.pipeline.steps import Input, Progress, Work
+from mcaptrack.pipeline.steps import BEFORE, Input, Progress, Work
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import EVENT_KINDS, EVENTS, TRACKS, VIDEO, Frame
@@ -352,7 +352,7 @@ def _done(work: Work) -> dict[str, Made]:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
     work.source.warn_lost(job.source, work.transform.reads, max(counts))
-    provenance, usual = _provenance_of(work, warnings), stage.outputs(job.target)
+    provenance, usual = _provenance_of(work, [*work.notices, *warnings]), stage.outputs(job.target)
     return {
         topic: Made.of(
             schema, frames, replace(provenance, output="" if topic in usual else topic.removeprefix(job.target + "/"))
@@ -396,6 +396,7 @@ def _provenance_of(work: Work, warnings: Sequence[Notice]) -> Provenance:
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
         continued=work.continued,
+        scores=work.scores,
     )
 
 
@@ -475,5 +476,7 @@ def input_of(
     source_of_job = Input(frames, frames, lambda: "", lambda: len(frames), classes)
     work = Work(RunState(opened, prefix, {}), job, source_of_job, read_planes(opened, prefix))
     work.take_context()
+    if "scores" in work.stage.before:
+        BEFORE["scores"](work)
     filled = work.transform
-    return frames, {f.name: getattr(filled, f.name) for f in fields(filled) if f.metadata.get("context")}
+    return work.source.frames, {f.name: getattr(filled, f.name) for f in fields(filled) if f.metadata.get("context")}

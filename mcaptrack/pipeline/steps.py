@@ -15,16 +15,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
-from mcaptrack.notices import warn
+from mcaptrack.notices import Code, Notice, warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
 from mcaptrack.pipeline.motion import SideInput, boxes_input, motion_input, path_with
 from mcaptrack.pipeline.pictures import with_descriptors
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_for, without_unseen
+from mcaptrack.pipeline.scores import DOUBTFUL, score_map, score_range, without_doubtful
 from mcaptrack.pipeline.staleness import digest_of, takes_corrections
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import TRACKS, VIDEO, Frame, Schema
@@ -44,6 +45,8 @@ from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 #: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
 #: has all samples in memory).
 _BASE, _A_PERSON_SECOND = 400_000_000, 3_000
+#: Classes that a warning names.
+_LISTED: Final = 8
 #: Called with the name of a stage, the steps that are done, and their total.
 Progress = Callable[[str, int, int], None]
 
@@ -101,7 +104,8 @@ class Work:
     ``planes`` are the ground planes of the camera, and ``plane_choice`` how one is made where none is given.
     ``seen`` are the frames of its input with boxes in the pictures that they were seen in, also where the camera moves
     by ``path``. ``references`` are the digests of channels beside the main input, by topic. ``outputs`` are schema and
-    frames by topic; ``continued`` says how their ids go on from the log before.
+    frames by topic; ``continued`` says how their ids go on from the log before. ``scores`` say what scores of its input
+    were taken for, by class, and ``notices`` are warnings of that, which its channels keep.
     """
 
     state: RunState
@@ -116,6 +120,8 @@ class Work:
     references: dict[str, str] = field(default_factory=dict)
     outputs: dict[str, tuple[Schema, Sequence[Frame]]] = field(default_factory=dict)
     continued: Mapping[str, str] = field(default_factory=dict)
+    scores: Mapping[str, str] = field(default_factory=dict)
+    notices: list[Notice] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.transform, self.seen, self.own_planes = self.job.transform, self.source.frames, self.planes
@@ -152,6 +158,11 @@ class Work:
         """Do the steps after the transform."""
         for step in self.stage.after:
             AFTER[step](self)
+
+    def say(self, message: str, code: Code) -> None:
+        """Warn of something that its channels keep, so that later runs repeat it."""
+        self.notices.append(Notice(message, code))
+        warn(message, code)
 
     def _taken(self, name: str, side: SideInput | None) -> dict[str, Any]:
         if side is None:
@@ -232,6 +243,32 @@ def _after_log_before(work: Work) -> None:
         work.source = work.source.with_frames(led(lead, frames, work.transform.reads))
 
 
+def _with_likelihoods(work: Work) -> None:
+    """Take scores that are outside of 0 to 1 for likelihoods that detections are real, and leave out unlikely ones."""
+    frames, transform = work.source.frames, work.transform
+    span = score_range(frames)
+    if span is None:
+        return
+    least = getattr(transform, "min_score", None)
+    text = f"{work.job.source}: scores are from {span.low:g} to {span.high:g}"
+    if least is not None and not 0 <= least <= 1:
+        work.say(f"{text}; `min_score={least:g}` is one of these, so they stay as they are", "scores")
+        return
+    names = {int(number): name for number, name in work.source.classes.items()}
+    score_meaning = score_map(frames, span, tuple(names.items()), getattr(transform, "class_limits", ""))
+    curves = {names.get(number) or f"class {number}": curve for number, curve in score_meaning.curves.items()}
+    work.scores = {name: str(curve) for name, curve in curves.items()}
+    frames, text = score_meaning.mapped(frames), f"{text}: {score_meaning.basis}"
+    if score_meaning.is_fitted and least is None:
+        count, frames = int(row_ends(frames)[-1]), without_doubtful(frames)
+        limits = list_names([f"{name} {curve.least(DOUBTFUL):.3g}" for name, curve in sorted(curves.items())], _LISTED)
+        text += f"; {count - int(row_ends(frames)[-1]):,} of {count:,} detections are less likely than {DOUBTFUL:g} "
+        text += f"(scores below {limits}) and are left out"
+        text += "; `min_score=` sets another limit" if hasattr(transform, "min_score") else ""
+    work.source, work.seen = work.source.with_frames(frames), frames
+    work.say(text, "scores")
+
+
 BEFORE: Final[Mapping[StepBefore, Callable[[Work], None]]] = MappingProxyType(
     {
         "memory": lambda work: warn_memory(work.source.frames),
@@ -240,6 +277,7 @@ BEFORE: Final[Mapping[StepBefore, Callable[[Work], None]]] = MappingProxyType(
         "corrections": _with_corrections,
         "scene": _in_scene,
         "log-before": _after_log_before,
+        "scores": _with_likelihoods,
     }
 )
 

@@ -241,7 +241,7 @@ SIZES: Final = ("w_px", "h_px", "length_m", "width_m", "height_m")
 DETECTIONS: Final = Schema("mcaptrack.Detections", BOX_PX, PLACE_M)
 TRACKS: Final = Schema("mcaptrack.Tracks")
 #: What a warning of other scores ends with.
-SCORES_NEEDED: Final = "trackers that use them need scores from 0 to 1"
+SCORES_MAPPED: Final = "likelihoods are from 0 to 1, and tracking maps others to them"
 PREDICTIONS: Final = Schema("mcaptrack.Predictions")
 GROUND_PLANE: Final = Schema("mcaptrack.GroundPlane")
 CAMERA_MOTION: Final = Schema("mcaptrack.CameraMotion")

@@ -55,7 +55,9 @@ class Provenance:
     out to be. ``warnings`` are the warnings when it was made, with code and message. ``continued`` says from which
     channel of the log before its ids go on (``after``, a digest), and the largest id so far (``last_id``).
     ``output`` is the end of the topic of an output that only the class of another package has, below its main output.
-    ``columns`` are those of a schema of a user's own (see ``schema.own``).
+    ``columns`` are those of a schema of a user's own (see ``schema.own``). ``scores`` say what scores of its input were
+    taken for where these are no likelihoods: by the name of a class, SCORE:LIKELIHOOD of points with straight lines
+    between them.
     """
 
     transform: str
@@ -76,6 +78,7 @@ class Provenance:
     continued: Mapping[str, str] = field(default_factory=dict)
     output: str = ""
     columns: str = ""
+    scores: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def written_by(self) -> str:
@@ -117,8 +120,9 @@ class Provenance:
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
             "continued": json.dumps(dict(self.continued), sort_keys=True),
+            "scores": json.dumps(dict(self.scores), ensure_ascii=False),
         }
-        for name in ("continued", "warnings", "references", "plugins", "classes", "zones", "model"):
+        for name in ("scores", "continued", "warnings", "references", "plugins", "classes", "zones", "model"):
             if not getattr(self, name):
                 del values[name]
         return {_PREFIX + key: value for key, value in values.items() if value}
@@ -130,13 +134,13 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        names = ("classes", "zones", "model", "continued")
-        classes, zones, model, continued = (read_texts(values.pop(key, "")) for key in names)
+        names = ("classes", "zones", "model", "continued", "scores")
+        classes, zones, model, continued, scores = (read_texts(values.pop(key, "")) for key in names)
         plugins = _plugins(values)
         warnings = [warning for warning in _read(values.pop("warnings", ""), list) if _is_warning(warning)]
         fields: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
         fields |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
-        fields |= {"zones": zones, "continued": continued}
+        fields |= {"zones": zones, "continued": continued, "scores": scores}
         return cls(parameters=parameters, model=model, **fields)
 
 

@@ -35,7 +35,7 @@ from mcaptrack.geometry.transform_tree import (
     turned,
 )
 from mcaptrack.notices import warn
-from mcaptrack.schema import DETECTIONS, SCORES_NEEDED, Frame, Rows
+from mcaptrack.schema import DETECTIONS, Frame, Rows
 from mcaptrack.schema.classes import UNKNOWN
 from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
@@ -786,14 +786,11 @@ def _connected(opened: log.Log, boxes: Recorded3d) -> str:
 
 
 def _warn_odd(opened: log.Log, topic: str, boxes: Recorded3d) -> None:
-    """Warn of boxes that have the log time instead of their stamp, and of scores that are none."""
+    """Warn of boxes that have the log time instead of their stamp."""
     _, count = boxes.times()
     if count:
         text = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
         warn(f"{opened.path}: {topic}: {count:,} of {len(boxes.stamp_ns):,} boxes {text}", "clock")
-    if ((boxes.score < 0) | (boxes.score > 1)).any():
-        low, high = np.nanmin(boxes.score), np.nanmax(boxes.score)
-        warn(f"{opened.path}: {topic}: scores are from {low:g} to {high:g}; {SCORES_NEEDED}")
 
 
 def rows_of_boxes(boxes: Recorded3d, rotation: Floats, shift: Floats, where: str = "") -> Rows:

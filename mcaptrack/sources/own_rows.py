@@ -22,7 +22,7 @@ from mcaptrack.schema import (
     EVENTS,
     PLACE_M,
     PREDICTIONS,
-    SCORES_NEEDED,
+    SCORES_MAPPED,
     TRACKS,
     Frame,
     Rows,
@@ -212,7 +212,7 @@ def check_frames(schema: Schema, frames: Sequence[Frame]) -> None:
     odd = (rows["score"] < 0) | (rows["score"] > 1)
     if odd.any():
         low, high = np.nanmin(rows["score"]), np.nanmax(rows["score"])
-        warn(f"scores are from {low:g} to {high:g}; {SCORES_NEEDED}")
+        warn(f"scores are from {low:g} to {high:g}; {SCORES_MAPPED}", "scores")
 
 
 def time_of(t_ns: Any) -> int:

@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
 from mcaptrack.registry.guard import Guard
-from mcaptrack.schema import SCORES_NEEDED, Frame, Schema
+from mcaptrack.schema import SCORES_MAPPED, Frame, Schema
 from mcaptrack.schema.impossible import first_impossible
 from mcaptrack.transforms.protocol import Transform, traits_of
 
@@ -90,7 +90,7 @@ def guarded(
         yield checked
         last_ns = checked[0].t_ns
     if low < 0 or high > 1:
-        warn(f"{entry} gave scores from {low:g} to {high:g}; {SCORES_NEEDED}")
+        warn(f"{entry} gave scores from {low:g} to {high:g}; {SCORES_MAPPED}", "scores")
     if entry.kind in _ONE_FOR_EACH and (missing := source.unanswered()):
         warn(
             f"{entry} gave no frame for {missing} of {source.count}; a frame without rows says that nothing was there, "

@@ -32,7 +32,7 @@ from mcaptrack.schema import (
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
 
 #: Steps before and after a transform (``mcaptrack.pipeline.steps``).
-StepBefore = Literal["memory", "planes", "scale", "corrections", "scene", "log-before"]
+StepBefore = Literal["memory", "planes", "scale", "corrections", "scene", "log-before", "scores"]
 StepAfter = Literal["one-class", "log-before", "video-rate", "pictures", "seen"]
 #: Suffix of the topic of tracks at the video's rate (the step "video-rate").
 FULL: Final = "/full"
@@ -74,7 +74,8 @@ class Stage:
     before, after : tuple of str
         Steps that are done with its input before its transform, and with its outputs after it, in order: names of
         ``mcaptrack.pipeline.steps``. "scale" converts boxes to metres, so that a scale is estimated if no ground plane
-        is given; "video-rate" also writes tracks at the video's rate, below ``FULL``.
+        is given; "scores" maps those outside of 0 to 1 to likelihoods; "video-rate" also writes tracks at the video's
+        rate, below ``FULL``.
     also_reads : Mapping[str, tuple[str, Schema]]
         Channels that its transform takes beside its input where the log has them: topic below the name of a camera, and
         schema, by the name of the field, which is made with ``context(tuple, is_recorded=False)`` and gets frames.
@@ -331,7 +332,7 @@ _STAGES: Final = (
         input_topic="detections",
         output_topic="tracks",
         rows="tracks",
-        before=("scale", "memory", "log-before"),
+        before=("scale", "memory", "log-before", "scores"),
         after=("one-class", "log-before", "seen"),
     ),
     Stage(
