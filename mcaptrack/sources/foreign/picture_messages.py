@@ -62,7 +62,8 @@ _VARIANTS: Final = (
 )
 #: Names of topics and frames of depth cameras.
 _DEPTH: Final = re.compile(r"depth|disparity", re.IGNORECASE)
-#: Bytes before the picture in messages of compressed_depth_image_transport, and before the data of those of zstd.
+#: How PNG begins; bytes before the picture in messages of compressed_depth_image_transport, and before the data of those of zstd.
+_PNG: Final = b"\x89PNG"
 _DEPTH_HEAD, _ZSTD_HEAD, _BYTES_A_PIXEL = 12, 17, 8
 #: Messages that are searched for the beginning of a video.
 _SEARCHED: Final = 300
@@ -235,8 +236,8 @@ def _found(opened: log.Log, topic: str) -> SharedFacts:
     parts = _sampled(opened, topic, read)
     is_single = bool(parts) and parts[0].shape[2] == 1
     name = (first.format if first.layout else first.pixels or "16uc1").upper()
-    is_named = bool(_DEPTH.search(topic) or _DEPTH.search(_frame_of(opened, topic)))
-    if first.is_depth or (is_named and is_single and not (first.layout and pixel_format(first.format).tile)):
+    may_be_depth = is_single and not (first.layout and pixel_format(first.format).tile)
+    if first.is_depth or (may_be_depth and any(map(_DEPTH.search, (topic, _frame_of(opened, topic))))):
         facts.depth = name
     if parts and (span := _span(parts)) is not None:
         facts.span = span
@@ -335,10 +336,10 @@ def _compressed(message: Any, facts: SharedFacts, is_video: bool) -> Picture:
     if name == "zstd":
         return _unpacked(data, stamp_ns)._replace(span=facts.span)
     if is_depth:
-        data = data[_DEPTH_HEAD:]
+        data = data if data.startswith(_PNG) else data[_DEPTH_HEAD:]
+        if not data.startswith(_PNG):
+            raise ValueError(f"depth in the format {called[:40]!r} is not read")
     found, data = facts.recogniser.take(name, data, is_video)
-    if is_depth and found != "png":
-        raise ValueError(f"depth in the format {called[:40]!r} is not read")
     pixels = called.partition(";")[0].strip() if ";" in called else ""
     pixels = pixels if is_mosaic(pixels) else ""
     return Picture(stamp_ns, found, data, None, pixels, facts.span, is_depth)

@@ -246,17 +246,11 @@ def _bgr_of_yuv(form: PixelFormat, views: Mapping[str, Samples], layout: PixelLa
     width, height, luma = layout.width_px, layout.height_px, views["y"]
     shares = form.across == 2 or len(form.planes[0]) == 4
     pairs = np.empty((height, -(-width // 2) if shares else width, 4), np.uint8)
-    pairs[:, : luma[:, 0::2].shape[1], 0] = luma[:, 0::2] if shares else luma
-    if shares:
-        pairs[:, : width // 2, 2] = luma[:, 1::2]
-        pairs[:, width // 2 :, 2] = luma[:, -1:]
-    else:
-        pairs[..., 2] = luma
-    for place, letter in ((1, "u"), (3, "v")):
-        colour = views[letter]
-        colour = np.repeat(colour, form.down, axis=0)[:height] if form.down > 1 else colour
-        pairs[:, : colour.shape[1], place] = colour
-        pairs[:, colour.shape[1] :, place] = colour[:, -1:]
+    first, second = (luma[:, 0::2], luma[:, min(1, width - 1) :: 2]) if shares else (luma, luma)
+    u, v = (np.repeat(views[letter], form.down, axis=0)[:height] for letter in "uv")
+    for place, values in enumerate((first, u, second, v)):
+        pairs[:, : values.shape[1], place] = values
+        pairs[:, values.shape[1] :, place] = values[:, -1:]  # the last pixel of an odd width
     bgr = cv2.cvtColor(pairs.reshape(height, -1, 2), cv2.COLOR_YUV2BGR_YUYV)
     return np.ascontiguousarray(bgr[:, :width] if shares else bgr[:, ::2])
 
