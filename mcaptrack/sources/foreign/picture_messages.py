@@ -62,7 +62,8 @@ _VARIANTS: Final = (
 )
 #: Names of topics and frames of depth cameras.
 _DEPTH: Final = re.compile(r"depth|disparity", re.IGNORECASE)
-#: How PNG begins; bytes before the picture in messages of compressed_depth_image_transport, and before the data of those of zstd.
+#: How PNG begins; the bytes before it in messages of compressed_depth_image_transport, and before the data in those of
+#: zstd_image_transport; at most so many bytes a pixel come out of these.
 _PNG: Final = b"\x89PNG"
 _DEPTH_HEAD, _ZSTD_HEAD, _BYTES_A_PIXEL = 12, 17, 8
 #: Messages that are searched for the beginning of a video.
@@ -217,7 +218,7 @@ def stamps(opened: log.Log, topic: str) -> Ints:
 
 
 def _found(opened: log.Log, topic: str) -> SharedFacts:
-    from mcaptrack.sources.video import Recogniser, pixel_format
+    from mcaptrack.sources.video import Recogniser
 
     facts = SharedFacts(Recogniser())
     read = reader(opened, topic, lambda kind: picture_decoder(kind, facts))
@@ -234,9 +235,8 @@ def _found(opened: log.Log, topic: str) -> SharedFacts:
     if first is None:
         return facts
     parts = _sampled(opened, topic, read)
-    is_single = bool(parts) and parts[0].shape[2] == 1
+    may_be_depth = bool(parts) and parts[0].shape[2] == 1
     name = (first.format if first.layout else first.pixels or "16uc1").upper()
-    may_be_depth = is_single and not (first.layout and pixel_format(first.format).tile)
     if first.is_depth or (may_be_depth and any(map(_DEPTH.search, (topic, _frame_of(opened, topic))))):
         facts.depth = name
     if parts and (span := _span(parts)) is not None:

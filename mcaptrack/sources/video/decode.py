@@ -180,17 +180,27 @@ def _decoded_still(picture: EncodedPicture, how: int) -> Samples:
 def wide_samples(picture: EncodedPicture) -> Samples | None:
     """The samples of a picture with more than 8 bits, (H, W, N); None for others, and for videos.
 
+    Those of a mosaic are half as wide and high, with the four of each square.
     Raises McaptrackError as ``decode_gray``.
     """
     import cv2
 
+    name = picture.format if picture.layout else picture.pixels
+    tile = pixel_format(name).tile if name else ""
     if picture.layout:
-        form = pixel_format(picture.format, picture.layout)
-        return raw_samples(picture.format, picture.data, picture.layout) if form.is_wide else None
-    if picture.is_video or not is_deep(picture.data):
+        if not pixel_format(name, picture.layout).is_wide:
+            return None
+        samples = raw_samples(name, picture.data, picture.layout)
+    elif picture.is_video or not is_deep(picture.data):
         return None
-    samples = _decoded_still(picture, cv2.IMREAD_UNCHANGED)
-    return None if samples.dtype == np.uint8 else samples.reshape(*samples.shape[:2], -1)
+    else:
+        samples = _decoded_still(picture, cv2.IMREAD_UNCHANGED)
+        samples = samples.reshape(*samples.shape[:2], -1)
+    if tile and samples.shape[2] == 1:
+        height, width = (size // 2 * 2 for size in samples.shape[:2])
+        parts = [samples[y:height:2, x:width:2, 0] for y in (0, 1) for x in (0, 1)]
+        samples = np.stack(parts, axis=-1)
+    return None if samples.dtype == np.uint8 else samples
 
 
 class _VideoDecoder:

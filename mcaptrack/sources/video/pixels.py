@@ -164,8 +164,8 @@ def _table() -> dict[str, PixelFormat]:
         one = PixelFormat(("m",), "u1", tile=tile)
         table |= dict.fromkeys((f"bayer_{tile}8", f"bayer{short}8", f"s{tile}8", fourcc), one)
         for depth in (10, 12, 14, 16):
-            names = (f"bayer_{tile}{depth}", f"bayer{short}{depth}", f"s{tile}{depth}")
-            table |= dict.fromkeys(names, one._replace(sample="u2"))
+            wide_names = (f"bayer_{tile}{depth}", f"bayer{short}{depth}", f"s{tile}{depth}")
+            table |= dict.fromkeys(wide_names, one._replace(sample="u2"))
     return table
 
 
@@ -277,9 +277,11 @@ def scaled(samples: Samples, span: Span | None) -> Bytes:
     """Samples in 0 to 255, by the values that become black and white: by default the range of whole numbers, 0 to 1."""
     kind = samples.dtype
     low, high = span or (0.0, float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0)
-    values = np.asarray(samples, np.float32 if kind.itemsize <= 4 else np.float64)
-    shares = (np.nan_to_num(values, posinf=high, neginf=low, nan=low) if kind.kind == "f" else values) - low
-    np.clip(shares * (255 / max(high - low, 1e-30)), 0, 255, out=shares)
+    values: Samples = samples.astype(np.float32 if kind.itemsize <= 4 else np.float64)
+    shares: Samples = np.nan_to_num(values, posinf=high, neginf=low, nan=low) if kind.kind == "f" else values
+    shares -= low
+    shares *= 255 / max(high - low, 1e-30)
+    np.clip(shares, 0, 255, out=shares)
     return np.asarray(np.rint(shares), np.uint8)
 
 
