@@ -142,8 +142,8 @@ def _form(topic: str) -> tuple[str, int, int]:
 
 @dataclass
 class SharedFacts:
-    """What all pictures of a channel share: their codec, the values that become black and white, whether they are
-    depths and in which format. ``notes`` are to be said.
+    """The facts that all pictures of a channel share: their codec, the values that become black and white, the format of
+    depths, "" for pictures. ``notes`` are to be said.
     """
 
     recogniser: Recogniser
@@ -158,13 +158,13 @@ _STAMPS: Final[WeakKeyDictionary[log.Log, dict[str, Ints]]] = WeakKeyDictionary(
 
 
 def facts_of(opened: log.Log, topic: str) -> SharedFacts:
-    """What all pictures of a channel share; they are kept as long as the log is open.
+    """The facts that all pictures of a channel share; they are kept as long as the log is open.
 
     Raises McaptrackError if messages of this type are not supported.
     """
     kept = _FACTS.setdefault(opened, {})
     if topic not in kept:
-        kept[topic] = _found(opened, topic)
+        kept[topic] = _shared_facts(opened, topic)
     return kept[topic]
 
 
@@ -217,7 +217,7 @@ def stamps(opened: log.Log, topic: str) -> Ints:
     return kept[topic]
 
 
-def _found(opened: log.Log, topic: str) -> SharedFacts:
+def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
     from mcaptrack.sources.video import Recogniser
 
     facts = SharedFacts(Recogniser())
@@ -316,12 +316,12 @@ def picture_decoder(kind: MessageType, facts: SharedFacts | None = None) -> Call
     """
     from mcaptrack.sources.video import Recogniser
 
-    known = facts or SharedFacts(Recogniser())
+    shared = facts or SharedFacts(Recogniser())
     name = plain_name(kind.name)
     if name in _COMPRESSED:
-        return decoder_with_errors(kind, lambda message: _compressed(message, known, name in _VIDEO))
+        return decoder_with_errors(kind, lambda message: _compressed(message, shared, name in _VIDEO))
     if name in _RAW:
-        return decoder_with_errors(kind, lambda message: _raw(message)._replace(span=known.span))
+        return decoder_with_errors(kind, lambda message: _raw(message)._replace(span=shared.span))
     raise McaptrackError(f"it holds {kind.name or 'no schema'}, not pictures; {', '.join(PICTURES_READ)} are read")
 
 
@@ -339,10 +339,10 @@ def _compressed(message: Any, facts: SharedFacts, is_video: bool) -> Picture:
         data = data if data.startswith(_PNG) else data[_DEPTH_HEAD:]
         if not data.startswith(_PNG):
             raise ValueError(f"depth in the format {called[:40]!r} is not read")
-    found, data = facts.recogniser.take(name, data, is_video)
+    format_name, data = facts.recogniser.take(name, data, is_video)
     pixels = called.partition(";")[0].strip() if ";" in called else ""
     pixels = pixels if is_mosaic(pixels) else ""
-    return Picture(stamp_ns, found, data, None, pixels, facts.span, is_depth)
+    return Picture(stamp_ns, format_name, data, None, pixels, facts.span, is_depth)
 
 
 def _format(called: str) -> str:

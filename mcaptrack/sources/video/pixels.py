@@ -161,11 +161,11 @@ def _table() -> dict[str, PixelFormat]:
         ("gbrg", "gb", "gbrg"),
         ("grbg", "gr", "grbg"),
     ):
-        one = PixelFormat(("m",), "u1", tile=tile)
-        table |= dict.fromkeys((f"bayer_{tile}8", f"bayer{short}8", f"s{tile}8", fourcc), one)
+        mosaic = PixelFormat(("m",), "u1", tile=tile)
+        table |= dict.fromkeys((f"bayer_{tile}8", f"bayer{short}8", f"s{tile}8", fourcc), mosaic)
         for depth in (10, 12, 14, 16):
             wide_names = (f"bayer_{tile}{depth}", f"bayer{short}{depth}", f"s{tile}{depth}")
-            table |= dict.fromkeys(wide_names, one._replace(sample="u2"))
+            table |= dict.fromkeys(wide_names, mosaic._replace(sample="u2"))
     return table
 
 
@@ -182,30 +182,29 @@ def pixel_format(name: str, layout: PixelLayout | None = None) -> PixelFormat:
     The three planes of "yuv444" are one if rows have three bytes a pixel.
     """
     plain = name.strip().lower()
-    found = PIXEL_FORMATS.get(plain) or PIXEL_FORMATS.get(_PREFIX.sub("", plain))
-    if found is None:
+    form = PIXEL_FORMATS.get(plain) or PIXEL_FORMATS.get(_PREFIX.sub("", plain))
+    if form is None:
         raise McaptrackError(
             f"pixels of the encoding {name[:40]!r} are not read; {list_names(_USUAL, len(_USUAL))} and "
             f"{len(PIXEL_FORMATS) - len(_USUAL)} others are"
         )
-    is_packed = layout is not None and found.planes == ("y", "u", "v") and layout.step >= 3 * layout.width_px > 0
-    return PIXEL_FORMATS["yuv24"] if is_packed and found.across == 1 else found
+    is_packed = layout is not None and form.planes == ("y", "u", "v") and layout.step >= 3 * layout.width_px > 0
+    return PIXEL_FORMATS["yuv24"] if is_packed and form.across == 1 else form
 
 
 def is_mosaic(name: str) -> bool:
     """Whether this is the name of a format with the colours of a Bayer filter."""
-    found = PIXEL_FORMATS.get(name)
-    return found is not None and bool(found.tile)
+    form = PIXEL_FORMATS.get(name)
+    return form is not None and bool(form.tile)
 
 
 def raw_samples(encoding: str, data: bytes, layout: PixelLayout) -> Samples:
-    """The samples of a picture without padding, (H, W, N), for the measurement of their range."""
+    """The samples of the first plane without padding, (H, W, N), as a view of ``data``. Raises as ``raw_gray``."""
     form = pixel_format(encoding, layout)
-    return _packed(form, form.views(data, layout))
-
-
-def _packed(form: PixelFormat, views: Mapping[str, Samples]) -> Samples:
-    return np.stack([views[letter] for letter in form.planes[0]], axis=-1)
+    letters, views = form.planes[0], form.views(data, layout)
+    first = views[letters[0]]
+    shape, strides = (*first.shape, len(letters)), (*first.strides, first.itemsize)
+    return np.lib.stride_tricks.as_strided(first, shape, strides, writeable=False)
 
 
 def raw_gray(encoding: str, data: bytes, layout: PixelLayout, span: Span | None = None) -> Bytes:
@@ -223,14 +222,10 @@ def raw_bgr(encoding: str, data: bytes, layout: PixelLayout, span: Span | None =
 
 def _raw(encoding: str, data: bytes, layout: PixelLayout, span: Span | None, is_grey: bool) -> Bytes:
     form = pixel_format(encoding, layout)
-    views = form.views(data, layout)
     if not form.is_yuv:
-        letters = form.planes[0]
-        whole = views[letters[0]]
-        if len(letters) > 1:  # one view of all samples
-            shape, size = (*whole.shape, len(letters)), whole.itemsize
-            whole = np.lib.stride_tricks.as_strided(whole, shape, (*whole.strides, size), writeable=False)
-        return shown(whole, letters, form.tile, span, is_grey)
+        samples = raw_samples(encoding, data, layout)
+        return shown(samples if samples.shape[2] > 1 else samples[..., 0], form.planes[0], form.tile, span, is_grey)
+    views = form.views(data, layout)
     if is_grey:
         return np.asarray(LIMITED_TO_FULL[views["y"]], np.uint8)
     return _bgr_of_yuv(form, views, layout)
@@ -276,13 +271,17 @@ def shown(samples: Samples, letters: str, tile: str, span: Span | None, is_grey:
 def scaled(samples: Samples, span: Span | None) -> Bytes:
     """Samples in 0 to 255, by the values that become black and white: by default the range of whole numbers, 0 to 1."""
     kind = samples.dtype
-    low, high = span or (0.0, float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0)
+    low, high = span or _default_span(kind)
     values: Samples = samples.astype(np.float32 if kind.itemsize <= 4 else np.float64)
     shares: Samples = np.nan_to_num(values, posinf=high, neginf=low, nan=low) if kind.kind == "f" else values
     shares -= low
     shares *= 255 / max(high - low, 1e-30)
     np.clip(shares, 0, 255, out=shares)
     return np.asarray(np.rint(shares), np.uint8)
+
+
+def _default_span(kind: np.dtype[Any]) -> Span:
+    return 0.0, float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
 
 
 # Replace a part of a picture.
@@ -328,6 +327,6 @@ def raw_with(
 
 def _unscaled(values: Bytes, kind: np.dtype[Any], span: Span | None) -> Samples:
     """The inverse of ``scaled``."""
-    low, high = span or (0.0, float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0)
+    low, high = span or _default_span(kind)
     out = low + values.astype(np.float64) * ((high - low) / 255)
     return (np.rint(out) if kind.kind in "iu" else out).astype(kind)

@@ -1,4 +1,4 @@
-"""What the pictures of a channel are, by their bytes: messages may call them otherwise, or nothing at all.
+"""Recognise the pictures of a channel by their bytes: messages may call them otherwise, or nothing at all.
 
 A still image says in its first bytes what it is. A video says it where it begins, with its parameter sets; what follows
 is the same. NAL units with lengths before them, as in MP4 files, become NAL units with start codes (Annex B).
@@ -6,7 +6,7 @@ is the same. NAL units with lengths before them, as in MP4 files, become NAL uni
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from mcaptrack.sources.video.codecs import CODECS, START_CODE, nal_starts, obus, vp9_size
@@ -48,6 +48,8 @@ _TRANSPORT_PACKET, _TRANSPORT_SYNC = 188, 0x47
 #: Widths of the lengths before NAL units that are tried: the usual ones.
 _LENGTHS: Final = (4, 2)
 _SETS: Final = {"h264": "SPS, PPS", "h265": "VPS, SPS, PPS"}
+#: Bytes before the arrays of parameter sets of H.265; those of H.264 have more, too. The bits of their number.
+_LEAST_RECORD, _MOST_SETS = 23, 0x1F
 _RECORDS: Final = {"h264": "avcC", "h265": "hvcC"}
 _SHOWN: Final = 8
 
@@ -74,7 +76,7 @@ class Recogniser:
         self.notes: dict[str, None] = {}
         self.cause = ""
         self.is_settled = False
-        self._known: Recognised | None = None
+        self._stream: Recognised | None = None
 
     def take(self, called: str, data: bytes, is_video: bool) -> tuple[str, bytes]:
         """The format of a picture that a message calls ``called``, and its bytes; ``is_video``: messages say so."""
@@ -82,15 +84,15 @@ class Recogniser:
             self.cause, self.is_settled = "", True
             self._compare(called, still)
             return still, data
-        if self._known is None and (known := _video(data)):
-            self._known, self.cause, self.is_settled = known, "", True
-            self._compare(called, known.format)
-            if known.length_bytes:
-                form = f"{WORDS[known.format]} with lengths before its NAL units"
+        if self._stream is None and (stream := _video(data)):
+            self._stream, self.cause, self.is_settled = stream, "", True
+            self._compare(called, stream.format)
+            if stream.length_bytes:
+                form = f"{WORDS[stream.format]} with lengths before its NAL units"
                 self.notes[f"they are {form}, as in MP4 files; it is read as with start codes (Annex B)"] = None
-        known = self._known
-        if known is not None:
-            return known.format, self._annex_b(known, data) if known.length_bytes else data
+        stream = self._stream
+        if stream is not None:
+            return stream.format, self._annex_b(stream, data) if stream.length_bytes else data
         self.cause = self.cause or _cause(called, data)
         is_named = called in CODECS
         return (UNREAD if _file(data) or (is_video and not is_named) else called), data
@@ -100,17 +102,17 @@ class Recogniser:
             said = f"are called {called[:40]!r}" if called else "have no format"
             self.notes[f"they {said} and are {WORDS[is_format]}"] = None
 
-    def _annex_b(self, known: Recognised, data: bytes) -> bytes:
+    def _annex_b(self, stream: Recognised, data: bytes) -> bytes:
         record = _record(data)
         sets, data = (record.sets, data[record.record_bytes :]) if record else ((), data)
-        units = _with_lengths(data, known.length_bytes)
+        units = _with_lengths(data, stream.length_bytes)
         if units is None:
             return data  # it is cut off, or has start codes
         out = b"".join(START_CODE + unit for unit in (*sets, *units))
-        codec = CODECS[known.format]
+        codec = CODECS[stream.format]
         head = codec.read_head(out)
-        if known.sets and head.is_key and not head.has_parameter_sets:
-            out = codec.with_parameter_sets(out, known.sets)
+        if stream.sets and head.is_key and not head.has_parameter_sets:
+            out = codec.with_parameter_sets(out, stream.sets)
         return out
 
 
@@ -122,14 +124,14 @@ def _still(data: bytes) -> str:
 
 
 def _file(data: bytes) -> str:
-    """What data are that hold no picture by themselves; "" for others."""
+    """A name for data that hold no picture by themselves; "" for others."""
     if len(data) > _TRANSPORT_PACKET and data[0] == data[_TRANSPORT_PACKET] == _TRANSPORT_SYNC:
         return "packets of an MPEG transport stream"
     return next((name for at, magic, name in _FILES if data.startswith(magic, at)), "")
 
 
 def _video(data: bytes) -> Recognised | None:
-    """What the beginning of a video is; None for anything that isn't sure to be one."""
+    """Recognise the beginning of a video; None for anything that isn't sure to be one."""
     if record := _record(data):
         return record
     if data.startswith((START_CODE, START_CODE[1:])) and (name := _codec_of(_with_start_codes(data))):
@@ -145,7 +147,7 @@ def _video(data: bytes) -> Recognised | None:
     return Recognised("av1") if is_whole and any(obu.kind == 1 for obu in units_of_av1) else None
 
 
-def _codec_of(units: list[bytes]) -> str:
+def _codec_of(units: Sequence[bytes]) -> str:
     """The codec of NAL units with parameter sets, "" for others: no unit of H.265 looks like an SPS of H.264."""
     if any(unit[0] & 0x9F == 7 and unit[0] & 0x60 for unit in units):
         return "h264"
@@ -171,50 +173,31 @@ def _with_lengths(data: bytes, length_bytes: int) -> list[bytes] | None:
 
 def _record(data: bytes) -> Recognised | None:
     """The configuration record of H.264 or H.265 at the beginning of data (ISO 14496-15, 5.3.3 and 8.3.3)."""
-    if len(data) < 7 or data[0] != 1:
+    if len(data) < _LEAST_RECORD or data[0] != 1:
         return None
     if data[4] & 0xFC == 0xFC and data[5] & 0xE0 == 0xE0:
-        sets = _sets_of_avcc(data)
-        if sets and _codec_of([*sets[0]]) == "h264":
-            return Recognised("h264", (data[4] & 3) + 1, *sets)
-    if len(data) > 23 and data[21] & 4:
-        sets = _sets_of_hvcc(data)
-        if sets and _codec_of([*sets[0]]) == "h265":
-            return Recognised("h265", (data[21] & 3) + 1, *sets)
-    return None
+        sets, end = _sets(data, 5, arrays=2, head_bytes=1)
+        more = data[end : end + 4]  # of the high profiles: formats of colours, and no further sets
+        if len(more) == 4 and more[0] & 0xFC == 0xFC and more[1] & 0xF8 == more[2] & 0xF8 == 0xF8:
+            end += len(more)
+        if _codec_of(sets) == "h264":
+            return Recognised("h264", (data[4] & 3) + 1, sets, end)
+    sets, end = _sets(data, _LEAST_RECORD, arrays=data[_LEAST_RECORD - 1], head_bytes=3)
+    return Recognised("h265", (data[21] & 3) + 1, sets, end) if _codec_of(sets) == "h265" else None
 
 
-def _sets_of_avcc(data: bytes) -> tuple[tuple[bytes, ...], int] | None:
-    sets, at = list[bytes](), 5
-    for mask in (0x1F, 0xFF):  # SPS, then PPS
-        count, at = (data[at] & mask if at < len(data) else 0), at + 1
-        for unit in _counted(data, at, count):
-            sets.append(unit)
-            at += 2 + len(unit)
-    more = data[at : at + 4]  # of the high profiles: formats of colours, and no further sets
-    if len(more) == 4 and more[0] & 0xFC == 0xFC and more[1] & 0xF8 == more[2] & 0xF8 == 0xF8:
-        at += len(more)
-    return (tuple(sets), at) if at <= len(data) else None
-
-
-def _sets_of_hvcc(data: bytes) -> tuple[tuple[bytes, ...], int] | None:
-    sets, at = list[bytes](), 23
-    for _ in range(data[22]):
-        count, at = int.from_bytes(data[at + 1 : at + 3], "big"), at + 3
-        for unit in _counted(data, at, count):
-            sets.append(unit)
-            at += 2 + len(unit)
-    return (tuple(sets), at) if at <= len(data) else None
-
-
-def _counted(data: bytes, at: int, count: int) -> Iterator[bytes]:
-    """So many units with lengths of two bytes, up to the end of the data."""
-    for _ in range(count):
-        size = int.from_bytes(data[at : at + 2], "big")
-        if not 0 < size <= len(data) - at - 2:
-            return
-        yield data[at + 2 : at + 2 + size]
-        at += 2 + size
+def _sets(data: bytes, at: int, arrays: int, head_bytes: int) -> tuple[tuple[bytes, ...], int]:
+    """The parameter sets in arrays with lengths of two bytes, and where they end; none if they don't fit."""
+    sets = list[bytes]()
+    for _ in range(arrays):
+        count, at = data[at + head_bytes - 1 : at + head_bytes], at + head_bytes
+        for _ in range(count[0] & _MOST_SETS if count else 0):
+            end = at + 2 + int.from_bytes(data[at : at + 2], "big")
+            if not at + 2 < end <= len(data):
+                return (), at
+            sets.append(data[at + 2 : end])
+            at = end
+    return tuple(sets), at
 
 
 def _cause(called: str, data: bytes) -> str:
