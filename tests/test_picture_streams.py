@@ -11,12 +11,15 @@ import av
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from mcap.writer import Writer
 
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import EncodedPicture, Recogniser, decode_gray
 from tests.commands import call
 from tests.ros_messages import pixels, ros_writer
 from tests.worlds import _own_priority
@@ -263,3 +266,33 @@ def test_pictures_that_can_not_be_read_are_named_with_their_cause_and_exit_code_
         return
     with mcaptrack.open(path) as opened, pytest.raises(McaptrackError, match=r"no picture of .* can be decoded: "):
         next(opened.frames(TOPIC))
+
+
+BEGINNINGS = [b"", b"\0\0\1\x67", b"\0\0\0\1\x40\x01", b"\0\0\0\x02\x67", b"\1\x64\0\x0a\xff\xe1\0\2\x67\x64\1\0\1\x68"]
+BEGINNINGS += [
+    b"\xff\xd8\xff",
+    b"\x89PNG\r\n\x1a\n",
+    b"BM" + bytes(12) + b"\x28\0\0\0",
+    b"\x12\0\x0a",
+    b"\x82\x49\x83\x42",
+]
+BEGINNINGS += [b"\1" + bytes(20) + b"\7\1\x20\0\1\0\2\x40\x01", b"\0\0\0\x18ftypavif"]
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(BEGINNINGS), st.binary(max_size=40)), min_size=1, max_size=4),
+    st.sampled_from(["h264", "h265", "av1", "vp9", "jpeg", "", "zstd", "x" * 100]),
+    st.booleans(),
+)
+def test_whatever_bytes_are_they_are_recognised_or_their_cause_is_named(payloads, called, is_video):
+    recogniser = Recogniser()
+    for beginning, rest in payloads:
+        name, data = recogniser.take(called, beginning + rest, is_video)
+        assert isinstance(data, bytes)
+        assert name in (called, "unread", "jpeg", "png", "bmp", "avif", *ENCODERS)
+        picture = EncodedPicture(0, 0, name, data)
+        try:
+            list(decode_gray([picture]))
+        except McaptrackError as error:
+            assert "\n" not in str(error)
+    assert all("\n" not in text for text in (recogniser.cause, *recogniser.notes))

@@ -228,15 +228,16 @@ class _Planner:
             return self.sources.get(stage, usual)
         camera = camera_at(self.opened, self.prefix)
         reads = STAGES[stage].reads
+        depth = foreign.depth_of(self.opened, camera.pictures) if camera.pictures else ""
         if reads is VIDEO and camera.pictures:
-            if depth := foreign.depth_of(self.opened, camera.pictures):
+            if depth:
                 text = f"{camera.pictures} has depths ({depth}), in which people are not detected"
                 raise McaptrackError(f"{self.opened.path}: {text}; `topic=` looks for them there all the same")
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
                 self._notes.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
             return camera.pictures
-        if reads is DETECTIONS and camera.boxes and not camera.pictures:
+        if reads is DETECTIONS and camera.boxes and (depth or not camera.pictures):
             self._notes.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
             return camera.boxes
         return usual

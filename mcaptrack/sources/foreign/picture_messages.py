@@ -142,8 +142,9 @@ def _form(topic: str) -> tuple[str, int, int]:
 
 @dataclass
 class SharedFacts:
-    """The facts that all pictures of a channel share: their codec, the values that become black and white, the format of
-    depths, "" for pictures. ``notes`` are to be said.
+    """The facts that all pictures of a channel share: their codec, and the values that become black and white.
+
+    ``depth`` is the format of depths, "" for pictures. ``notes`` are to be said.
     """
 
     recogniser: Recogniser

@@ -32,6 +32,8 @@ _STILLS: Final = (
     (4, b"ftypavis", "avif"),
     (4, b"ftypmif1", "avif"),
 )
+#: The sizes of the second header of a BMP image: its name alone is short.
+_BMP_HEADS: Final = (12, 40, 52, 56, 64, 108, 124)
 #: The first bytes of what is no picture, and where they stand.
 _FILES: Final = (
     *((4, box, "pieces of an MP4 file") for box in (b"ftyp", b"styp", b"moof", b"moov", b"mdat", b"sidx")),
@@ -118,7 +120,7 @@ class Recogniser:
 
 def _still(data: bytes) -> str:
     """The format of a still image; "" for others."""
-    if data[:2] == b"BM" and int.from_bytes(data[2:6], "little") == len(data):
+    if data[:2] == b"BM" and int.from_bytes(data[14:18], "little") in _BMP_HEADS:
         return "bmp"
     return next((name for at, magic, name in _STILLS if data.startswith(magic, at)), "")
 

@@ -166,7 +166,7 @@ def _json(payload: bytes, data: bytes, word: str) -> bytes:
     fields = json.loads(payload)
     fields["data"] = base64.b64encode(data).decode() if isinstance(fields["data"], str) else list(data)
     if word:
-        fields["format"] = word
+        fields["format" if "format" in fields else "encoding"] = word
     return json.dumps(fields, separators=(",", ":")).encode()
 
 
