@@ -264,7 +264,7 @@ def test_pictures_that_can_not_be_read_are_named_with_their_cause_and_exit_code_
         assert cause.replace("`ingest`", "`mcaptrack ingest`") in found["message"] or cause in found["message"]
     if cause.startswith("a video has"):
         return
-    with mcaptrack.open(path) as opened, pytest.raises(McaptrackError, match=r"no picture of .* can be decoded: "):
+    with mcaptrack.open(path) as opened, pytest.raises(McaptrackError, match=f"{TOPIC}: no picture can be decoded: "):
         next(opened.frames(TOPIC))
 
 

@@ -111,7 +111,7 @@ class Pictures:
             raise McaptrackError(f"{self._opened.path}: {self._topic} has {len(self.t_ns)} pictures, not {wanted[-1]}")
         cause = foreign.facts_of(self._opened, self._topic).recogniser.cause
         if wanted and cause:
-            raise McaptrackError(f"{self._opened.path}: no picture of {self._topic} can be decoded: {cause}")
+            raise McaptrackError(f"{self._opened.path}: {self._topic}: no picture can be decoded: {cause}")
         while wanted:
             entered, fed = self._entry(wanted[0]), dict[int, bool]()
             start = entered or 0  # without a key picture from the beginning, because some streams use gradual refresh
