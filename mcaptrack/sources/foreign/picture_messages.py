@@ -289,16 +289,16 @@ def _span(parts: Sequence[Samples]) -> Span | None:
     """
     import cv2
 
-    pooled = []
+    pooled = [np.zeros(0, np.float32)]
     for samples in parts:
         kind = samples.dtype
-        values = samples if kind == np.uint16 else samples.astype(np.float32)
-        blurred = cv2.medianBlur(np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="))), 3).ravel()
-        is_known = np.isfinite(blurred) & (blurred != 0)
-        if kind.kind in "iu":
-            is_known &= blurred != np.iinfo(kind).max
-        every = -(-len(blurred) // _SAMPLES)
-        pooled.append(blurred[::every][is_known[::every]])
+        for channel in np.moveaxis(samples, -1, 0) if samples.size else ():
+            values = cv2.medianBlur(np.ascontiguousarray(channel.astype(np.float32)), 3).ravel()
+            is_value = np.isfinite(values) & (values != 0)
+            if kind.kind in "iu":
+                is_value &= values != np.float32(np.iinfo(kind).max)
+            every = -(-len(values) // _SAMPLES)
+            pooled.append(values[::every][is_value[::every]])
     values = np.concatenate(pooled)
     if not len(values):
         return None

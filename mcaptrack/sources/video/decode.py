@@ -157,9 +157,9 @@ def _still(picture: EncodedPicture, is_grey: bool) -> Image:
     if not tile and not is_deep(picture.data):
         return np.asarray(_decoded_still(picture, cv2.IMREAD_GRAYSCALE if is_grey else cv2.IMREAD_COLOR), np.uint8)
     samples = _decoded_still(picture, cv2.IMREAD_UNCHANGED)
-    if samples.ndim == 2:
-        return shown(samples, "y", tile, picture.span, is_grey)
-    return shown(samples, "bgra"[: samples.shape[2]], "", picture.span, is_grey)  # colours were made of the mosaic
+    if samples.ndim == 3 and samples.shape[2] in (3, 4):  # if it was a mosaic, colours were made of it
+        return shown(samples, "bgra"[: samples.shape[2]], "", picture.span, is_grey)
+    return shown(samples if samples.ndim == 2 else samples[..., 0], "y", tile, picture.span, is_grey)
 
 
 def _decoded_still(picture: EncodedPicture, how: int) -> Samples:
@@ -178,7 +178,7 @@ def _decoded_still(picture: EncodedPicture, how: int) -> Samples:
 
 
 def wide_samples(picture: EncodedPicture) -> Samples | None:
-    """The samples of a picture with more than 8 bits, (H, W, N); None for others, and for videos.
+    """The samples of a picture with more than 8 bits, (H, W, N), without alpha; None for others, and for videos.
 
     Those of a mosaic are half as wide and high, with the four of each square.
     Raises McaptrackError as ``decode_gray``.
@@ -199,7 +199,8 @@ def wide_samples(picture: EncodedPicture) -> Samples | None:
     if tile and samples.shape[2] == 1:
         height, width = (size // 2 * 2 for size in samples.shape[:2])
         parts = [samples[y:height:2, x:width:2, 0] for y in (0, 1) for x in (0, 1)]
-        samples = np.stack(parts, axis=-1)
+        return np.stack(parts, axis=-1) if samples.dtype != np.uint8 else None
+    samples = samples[..., :3]
     return None if samples.dtype == np.uint8 else samples
 
 
