@@ -202,7 +202,12 @@ def test_a_record_may_have_a_message_of_its_own(tmp_path):
     parts = encoded("h264")
     packed = [record("h264", parts[0]), *[without_sets("h264", part) for part in parts]]
     wanted = frames(written(tmp_path / "plain.mcap", "video", "h264", parts))
-    np.testing.assert_array_equal(frames(written(tmp_path / "a.mcap", "video", "h264", packed)), wanted)
+    path = written(tmp_path / "a.mcap", "video", "h264", packed)
+    np.testing.assert_array_equal(frames(path), wanted)
+    with log.read(path) as opened:
+        pictures = Pictures(opened, TOPIC)
+        assert len(list(pictures.frames([COUNT]))) == 1
+        assert pictures.decoded <= 4  # from the last key picture on, not from the record
 
 
 @pytest.mark.parametrize("called", ["h264", "mjpeg", "png", ""])
