@@ -23,7 +23,6 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.foreign import MessageType, picture_decoder
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.sources.video.decode import RAW_ENCODINGS, PixelLayout, raw_bgr, raw_with
 from mcaptrack.viewing.blur.people import hide
 from mcaptrack.viewing.blur.recording import picture_replacer
 from tests.commands import call, printed
@@ -243,41 +242,6 @@ def test_pictures_of_a_robot_keep_their_messages_and_cameras_without_boxes_are_n
             if image[part].size:
                 now, before = (np.abs(np.diff(one[part].astype(int), axis=0)).mean() for one in (image, shot.image))
                 assert now < 0.8 * before + 2
-
-
-LAYOUTS = [PixelLayout(18, 10), PixelLayout(18, 10, 100)]
-
-
-@pytest.mark.parametrize("layout", LAYOUTS, ids=["dense", "padded"])
-@pytest.mark.parametrize("encoding", RAW_ENCODINGS)
-def test_uncompressed_pictures_get_the_hidden_pixels_and_keep_all_other_bytes(encoding, layout):
-    size = {"rgb8": 3, "bgr8": 3, "8uc3": 3, "rgba8": 4, "bgra8": 4, "8uc4": 4, "mono16": 2, "16uc1": 2, "32fc1": 4}
-    each = size.get(encoding, 2 if encoding in ("uyvy", "yuv422", "yuyv", "yuv422_yuy2") else 1)
-    rows = 15 if encoding in ("nv12", "nv21") else 10
-    step = layout.step or 18 * each
-    rng = np.random.default_rng(1)
-    data = rng.integers(30, 220, rows * step).astype(np.uint8).tobytes()
-    if encoding == "32fc1":
-        data = rng.random((10, step // 4)).astype("<f4").tobytes()
-    colour = np.full((10, 18, 3), (180, 90, 60), np.uint8)
-    mask = np.zeros((10, 18), bool)
-    mask[2:8, 4:12] = True
-    out = raw_with(encoding, data, layout, colour, mask)
-    assert len(out) == len(data)
-    before, after = (raw_bgr(encoding, one, layout).astype(int) for one in (data, out))
-    is_grey = (each == 1 and "bayer" not in encoding) or encoding in ("mono16", "16uc1", "32fc1") or each == 2
-    wanted = cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)[0, 0] if is_grey else (180, 90, 60)
-    if encoding in ("nv12", "nv21") or (each == 2 and encoding not in ("mono16", "16uc1")):
-        wanted = np.rint(16 + int(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)[0, 0]) * 219 / 255)
-    assert abs(after[3:7, 5:11] - wanted).max() <= 2
-    apart = np.s_[:, :2] if "bayer" in encoding else np.s_[:, :4]
-    assert (after[apart] == before[apart]).all()
-    assert (np.frombuffer(out, np.uint8) != np.frombuffer(data, np.uint8)).any()
-    assert raw_with(encoding, data, layout, colour, np.zeros_like(mask)) == data
-    if encoding in ("nv12", "nv21"):  # blue and red differences stand in turns
-        chroma = np.frombuffer(out, np.uint8)[10 * step + 2 * step :][4:12].reshape(-1, 2)
-        red, blue = cv2.cvtColor(colour, cv2.COLOR_BGR2YCrCb)[0, 0, 1:].tolist()
-        assert (chroma == ([blue, red] if encoding == "nv12" else [red, blue])).all()
 
 
 def test_only_the_picture_of_a_message_changes_in_every_encoding():

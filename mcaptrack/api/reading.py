@@ -284,7 +284,7 @@ class LogReader:
         Parameters
         ----------
         topic : str, default "video"
-            The channel, or the end of its topic: "video" for /camera/video.
+            The channel, or the end of its topic: "video" for /camera/video, or for the pictures of the only camera.
         times : sequence of int or array of datetime64, optional
             Times in whole nanoseconds: decode the picture that is shown at each, the last one that is not later. By
             default all pictures.

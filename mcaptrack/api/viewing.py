@@ -29,7 +29,6 @@ from mcaptrack.viewing.serving import Server
 _OPENED: Final = "What is opened"
 _VIEWER: Final = "Server and viewer"
 #: The names of codecs of videos.
-_CODECS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 
 
 @dataclass(frozen=True)
@@ -284,12 +283,14 @@ def _report(path: Path, opened: logs.Log, notes: Notes) -> tuple[str, bytes] | N
 
 def _say_trouble(opened: logs.Log, notes: Notes) -> None:
     """Say where viewers may have trouble with the pictures of a log, and what helps."""
+    from mcaptrack.sources.video import WORDS
+
     topics: dict[str, list[str]] = {}
     for topic, codec in links.video_formats(opened).items():
         topics.setdefault(codec, []).append(topic)
     again = call("ingest", Path("VIDEO"), image_format="jpeg")
     for codec, those in topics.items():
-        trouble = f"pictures in {', '.join(those)} are {_CODECS.get(codec, codec)}"
+        trouble = f"pictures in {', '.join(those)} are {WORDS[codec]}"
         if codec == "h264":
             notes.say(
                 f"{trouble}: on a slow machine Lichtblick may show none while it is paused, and late ones during play. "

@@ -43,6 +43,11 @@ class RunsStages(EachLog["RunResult"]):
         """Return the result for one of many logs in one line."""
         return _line_of(done, self.shows_events)
 
+    def code(self, results: Sequence[RunResult]) -> int:
+        """Return the exit code: 3 if no picture of a camera could be decoded."""
+        is_lost = any(notice.code == "no-pictures" for done in results for notice in done.warnings)
+        return common.LOST if is_lost else common.DONE
+
     def data(self, done: RunResult) -> dict[str, Any]:
         """Return the result of one log as values of JSON."""
         return _as_json(done)

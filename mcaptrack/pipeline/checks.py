@@ -19,6 +19,7 @@ from mcaptrack.schema.provenance import INGEST, SCENE_SUFFIX, VIEW, VIEW_SUFFIX,
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, Camera, chain_of, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.sources.foreign.decoding import plain_name
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
 
@@ -147,6 +148,9 @@ def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
         else:
             add = call("ingest", "VIDEO", into=opened.path)
             hint = f"add pictures with {add}, or name what to begin with by `topic=`"
+            for topic in topics:
+                if kind := foreign.PICTURES_NOT_READ.get(plain_name(opened.channels[topic].schema_name)):
+                    hint = f"{topic} is {kind}, which is not read; {hint}"
     return f"{opened.path} has no channel {job.source} for {job.stage}; {has}. {hint}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Final, NamedTuple
@@ -17,13 +16,10 @@ from mcaptrack.transforms import STAGES
 
 #: The scene that a run fuses cameras to.
 SCENE: Final = "/world"
+#: How the reason begins why a camera with pictures of no use is left out.
+UNREAD: Final = "has pictures that can't be read"
 #: The channels that a run can begin with, if a camera has no pictures and no boxes of others.
 _BEGINNINGS: Final = tuple(STAGES[name].input_topic for name in ("track", "sample", "predict"))
-#: What image_transport of ROS adds to the topic of pictures for a second form of them.
-_TRANSPORTS: Final = ("compressed", "theora", "ffmpeg", "avif", "zstd")
-#: Topics of depth cameras, and the pixel formats of distances.
-_DEPTH: Final = re.compile(r"(?<![a-z])depth(?![a-z])", re.IGNORECASE)
-_RANGES: Final = ("16uc1", "32fc1", "mono16")
 
 
 class ChosenCameras(NamedTuple):
@@ -93,11 +89,14 @@ def _lack(opened: log.Log, camera: Camera) -> str:
         return f"has neither pictures nor boxes, but {list_names(has, 5)}"
     if not opened.channels[camera.pictures].messages:
         return f"has no pictures: {camera.pictures} has no messages"
+    if depth := foreign.depth_of(opened, camera.pictures):
+        return f"has depths in {camera.pictures} ({depth}), in which people are not detected; `topic=` runs it"
     try:
         if size_of_pictures(opened, camera.pictures) is None:
-            return f"has no picture in {camera.pictures} that can be decoded"
+            why = foreign.facts_of(opened, camera.pictures).recogniser.cause
+            return f"{UNREAD}: none in {camera.pictures} can be decoded{f', because {why}' if why else ''}"
     except McaptrackError as error:
-        return f"has pictures that can't be read: {error}"
+        return f"{UNREAD}: {error}"
     return ""
 
 
@@ -108,13 +107,8 @@ def _unfit(opened: log.Log, camera: Camera) -> str:
     topic = camera.pictures
     if topic is None or has_own_channels(opened, camera):
         return ""
-    base, _, transport = topic.rpartition("/")
-    raw = opened.channels.get(base)
-    if transport in _TRANSPORTS and raw is not None and raw.messages and foreign.holds_pictures(raw):
-        return f"has the pictures of {base} a second time ({transport}); `camera=` runs it"
-    if _DEPTH.search(topic) and next(foreign.pictures(opened, topic))[1].format in _RANGES:
-        return f"has depths in {topic}, in which people are not detected; `camera=` runs it"
-    return ""
+    better = foreign.better_form(opened, topic)
+    return f"has the pictures of {better} a second time, in {topic}; `camera=` runs it" if better else ""
 
 
 def begins_with(opened: log.Log, prefix: str) -> str:

@@ -179,8 +179,15 @@ def pictures_of(
     max_bytes = MAX_BYTES if traits_of(job.transform).passes > 1 else 0
 
     def decoded() -> Iterator[Frame]:
-        is_first = not stamps
-        return decode(encoded(is_first), None, damaged if is_first else None, unreadable if is_first else [])
+        is_first, last = not stamps, -1
+        frames = decode(encoded(is_first), None, damaged if is_first else None, unreadable if is_first else [])
+        for frame in frames:
+            if is_first and frame.index < last:
+                text = "pictures are shown in another order than messages have (B-frames); their times are of messages"
+                warn(f"{channel.topic}: {text}", "clock")
+                is_first = False
+            last = frame.index
+            yield frame
 
     return total.hexdigest, Ahead(KeptPictures(decoded, max_bytes))
 

@@ -24,6 +24,7 @@ from mcaptrack.pipeline.staleness import is_of_corrections, is_stale, read_plane
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
+from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, is_made_by_stage, provenance_of
@@ -227,12 +228,16 @@ class _Planner:
             return self.sources.get(stage, usual)
         camera = camera_at(self.opened, self.prefix)
         reads = STAGES[stage].reads
+        depth = foreign.depth_of(self.opened, camera.pictures) if camera.pictures else ""
         if reads is VIDEO and camera.pictures:
+            if depth:
+                text = f"{camera.pictures} has depths ({depth}), in which people are not detected"
+                raise McaptrackError(f"{self.opened.path}: {text}; `topic=` looks for them there all the same")
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
                 self._notes.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
             return camera.pictures
-        if reads is DETECTIONS and camera.boxes and not camera.pictures:
+        if reads is DETECTIONS and camera.boxes and (depth or not camera.pictures):
             self._notes.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
             return camera.boxes
         return usual

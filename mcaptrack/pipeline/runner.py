@@ -24,7 +24,7 @@ from mcaptrack.pipeline.pictures import pictures_of
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, plane_in_words, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.staleness import digest_of, read_planes, warn_clock_jumps
-from mcaptrack.pipeline.steps import BEFORE, Input, Progress, Work
+from mcaptrack.pipeline.steps import BEFORE, LATE_BEGINNING, Input, Progress, Work
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import EVENT_KINDS, EVENTS, TRACKS, VIDEO, Frame
@@ -32,6 +32,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import join_frames, row_ends, unique_values
 from mcaptrack.schema.provenance import FUSE, VIEW, Provenance
+from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import STAGES, Stage, Transform
@@ -346,8 +347,11 @@ def _done(work: Work) -> dict[str, Made]:
         with collected() as warnings:
             _transform(work, counts)
             work.finish()
-            if not warnings:  # otherwise a warning has given the reason
+            if not warnings and not _has_warned_of_unread(work, max(counts)):  # else a warning has given the reason
                 warn_no_rows(job.stage, job.source, work.transform, work.source.frames, work.main())
+            if work.transform.reads is VIDEO and job.source in opened.channels:
+                for note in foreign.facts_of(opened, job.source).notes:
+                    warn(note, "pictures")
     except McaptrackError as error:
         where = "" if str(opened.path) in str(error) else f"{opened.path}: {job.source}: "
         raise type(error)(f"{where}{error}") from None
@@ -360,6 +364,16 @@ def _done(work: Work) -> dict[str, Made]:
         for topic, (schema, frames) in work.outputs.items()
         if topic in job.kept()
     }
+
+
+def _has_warned_of_unread(work: Work, count_read: int) -> bool:
+    """Warn if no picture of a channel could be decoded."""
+    messages = work.source.messages()
+    if work.transform.reads is not VIDEO or count_read or not messages:
+        return False
+    cause = foreign.facts_of(work.state.opened, work.job.source).recogniser.cause or LATE_BEGINNING
+    warn(f"{work.job.source}: no picture in its {messages} messages can be decoded: {cause}", "no-pictures")
+    return True
 
 
 def _transform(work: Work, counts: list[int]) -> None:

@@ -99,7 +99,8 @@ class EveryCamera:
         self.prefixes, self.scenes = chosen.prefixes, chosen.scenes
         self.left_out |= chosen.left_out
         for name, why in self.left_out.items():
-            warn(f"the camera {name} is left out: it {why}", "left-out")
+            code: notices.Code = "no-pictures" if why.startswith(pipeline.UNREAD) else "left-out"
+            warn(f"the camera {name} is left out: it {why}", code)
         if len(self.prefixes) > 1:
             listed = ", ".join(prefix[1:] for prefix in self.prefixes)
             say(f"running {len(self.prefixes)} cameras, {listed}; `camera=` names those to run")

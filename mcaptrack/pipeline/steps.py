@@ -42,6 +42,8 @@ from mcaptrack.transforms.retrack.offline import settle_classes
 from mcaptrack.transforms.stages import StepAfter, StepBefore
 from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 
+#: Why pictures of a video are left out.
+LATE_BEGINNING: Final = "a video has to begin with a key picture that has its parameter sets"
 #: The memory that a run needs, in bytes: whatever its length, and for each second that a person is seen (re-tracking
 #: has all samples in memory).
 _BASE, _A_PERSON_SECOND = 400_000_000, 3_000
@@ -76,12 +78,8 @@ class Input(NamedTuple):
         """Warn of messages that were left out of the ``count_read`` that a transform got, and of damaged ones."""
         messages = self.messages()
         left_out = messages - count_read - len(self.unreadable)
-        if reads is VIDEO and left_out > 0:
-            warn(
-                f"{topic}: {left_out} of {messages} messages were left out: a video has to begin with a key picture "
-                "that has its parameter sets",
-                "left-out",
-            )
+        if reads is VIDEO and 0 < left_out < messages:
+            warn(f"{topic}: {left_out} of {messages} messages were left out: {LATE_BEGINNING}", "left-out")
         if self.unreadable:
             warn(
                 f"{topic}: {len(self.unreadable)} of {messages} pictures can't be decoded and are left out, the first: "

@@ -305,7 +305,8 @@ class _Channels:
         return Camera(
             prefix,
             tuple(names),
-            self._default_pictures(names) or _only(pictures or (self._picture_topics([nearest]) if nearest else [])),
+            self._default_pictures(names)
+            or foreign.best_form(pictures or (self._picture_topics([nearest]) if nearest else [])),
             _only(self._detection_topics(names) or self._space_topics(names)),
             self._label_topic(names, TRUTH) or f"{prefix}/{TRUTH}",
             self._corrected(self._label_topic(names, GROUND_PLANE) or f"{prefix}/{GROUND_PLANE}"),

@@ -21,6 +21,7 @@ from mcaptrack.log.journal import recover_command
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import VIDEO
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray, read_head
 
 #: The backward search for a key picture: messages in the second step, the factor for each further step, and the maximum
@@ -61,13 +62,16 @@ Pixels = Callable[[Iterable[EncodedPicture], Container[int]], Iterator[Frame]]
 
 
 def find_pictures(opened: log.Log, topic: str) -> str:
-    """Return the channel of pictures with this topic, or with a topic that ends with it.
+    """Return the channel of pictures with this topic, or with a topic that ends with it; of "video" the only camera's.
 
     Raises McaptrackError if there is none, or several.
     """
     topics = [channel.topic for channel in opened.channels.values() if foreign.holds_pictures(channel)]
     matching = [name for name in topics if topic in (name, name.removeprefix("/"))]
     matching = matching or [name for name in topics if name.endswith("/" + topic.strip("/"))]
+    if topic == VIDEO and not matching:  # the name of pictures that were ingested stands for those of the only camera
+        forms = [name for name in topics if not foreign.better_form(opened, name)]
+        matching = [name for name in forms if not foreign.depth_of(opened, name)] or forms
     if len(matching) != 1:
         has = f"pictures in {', '.join(sorted(topics))}" if topics else "no pictures"
         raise McaptrackError(f"{opened.path} has {len(matching) or 'no'} channels {topic} with pictures; it has {has}")
@@ -105,6 +109,9 @@ class Pictures:
         wanted = sorted(set(numbers))
         if wanted and not 0 <= wanted[0] <= wanted[-1] < len(self.t_ns):
             raise McaptrackError(f"{self._opened.path}: {self._topic} has {len(self.t_ns)} pictures, not {wanted[-1]}")
+        cause = foreign.facts_of(self._opened, self._topic).recogniser.cause
+        if wanted and cause:
+            raise McaptrackError(f"{self._opened.path}: {self._topic}: no picture can be decoded: {cause}")
         while wanted:
             entered, fed = self._entry(wanted[0]), dict[int, bool]()
             start = entered or 0  # without a key picture from the beginning, because some streams use gradual refresh

@@ -4,29 +4,47 @@ FFmpeg does the work, through PyAV (its wheels include FFmpeg).
 """
 
 from mcaptrack.sources.video.codecs import is_video_codec, read_head
-from mcaptrack.sources.video.decode import RAW_ENCODINGS, EncodedPicture, PixelLayout, decode_bgr, decode_gray
+from mcaptrack.sources.video.decode import EncodedPicture, decode_bgr, decode_gray, wide_samples
 from mcaptrack.sources.video.encode import H264Encoder, VideoOptions, encode_image, write_clip, write_mp4
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, SEQINFO, SeqInfo, find_seqinfo
+from mcaptrack.sources.video.pixels import (
+    PIXEL_FORMATS,
+    PixelFormat,
+    PixelLayout,
+    Samples,
+    Span,
+    is_mosaic,
+    pixel_format,
+)
 from mcaptrack.sources.video.reader import PictureMessage, Video, open_video
+from mcaptrack.sources.video.recognise import WORDS, Recogniser
 
 __all__ = [
     "IMAGE_SUFFIXES",
-    "RAW_ENCODINGS",
+    "PIXEL_FORMATS",
     "SEQINFO",
+    "WORDS",
     "EncodedPicture",
     "H264Encoder",
     "PictureMessage",
+    "PixelFormat",
     "PixelLayout",
+    "Recogniser",
+    "Samples",
     "SeqInfo",
+    "Span",
     "Video",
     "VideoOptions",
     "decode_bgr",
     "decode_gray",
     "encode_image",
     "find_seqinfo",
+    "is_mosaic",
     "is_video_codec",
     "open_video",
+    "pixel_format",
     "read_head",
+    "wide_samples",
     "write_clip",
     "write_mp4",
 ]

@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
 from typing import Final, NamedTuple
 
-_START_CODE: Final = b"\x00\x00\x01"
+#: Before NAL units in Annex B; the first byte may be missing.
+START_CODE: Final = b"\x00\x00\x00\x01"
+_SHORT_CODE: Final = START_CODE[1:]
 #: Bytes of a slice's NAL unit that are enough for the fields that are read.
 _HEAD: Final = 24
 
@@ -74,10 +76,10 @@ class Bits:
 
 def nal_starts(data: bytes) -> Iterator[int]:
     """The offsets of NAL units in an Annex B stream, after their start codes; searched lazily."""
-    at = data.find(_START_CODE)
+    at = data.find(_SHORT_CODE)
     while at >= 0:
         yield at + 3
-        at = data.find(_START_CODE, at + 3)
+        at = data.find(_SHORT_CODE, at + 3)
 
 
 class NalFormat(NamedTuple):
@@ -125,7 +127,7 @@ class NalFormat(NamedTuple):
         """Insert parameter sets into an access unit, after its delimiter."""
         first = next(nal_starts(data), len(data))
         at = first + self.header_bytes + 1 if self.kind(data, first) == self.delimiter else 0
-        return data[:at] + b"".join(b"\x00\x00\x00\x01" + nal for nal in sets) + data[at:]
+        return data[:at] + b"".join(START_CODE + nal for nal in sets) + data[at:]
 
 
 # H.264 (ITU-T H.264, 7.3 and Annex B).
@@ -313,6 +315,12 @@ def _read_head_vp9(data: bytes) -> PictureHead:
     return PictureHead(True, is_key, is_key)
 
 
+def vp9_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height of a key picture of VP9; None for anything else."""
+    _, is_key, size = _vp9_header(data[:_VP9_HEAD])
+    return size if is_key else None
+
+
 def _vp9_frames(data: bytes) -> Iterator[tuple[int, int]]:
     """Start and end of the frames of a packet, by the superframe index at its end if it has one."""
     marker = data[-1] if data else 0
@@ -388,7 +396,7 @@ class _Obu(NamedTuple):
     end: int
 
 
-def _obus(data: bytes) -> Iterator[_Obu]:
+def obus(data: bytes) -> Iterator[_Obu]:
     """The open bitstream units (OBUs) of a temporal unit in the low-overhead format, up to one without a length."""
     at = 0
     while at < len(data):
@@ -411,7 +419,7 @@ def _obus(data: bytes) -> Iterator[_Obu]:
 def _inspect_av1(data: bytes) -> AccessUnit:
     """Parse a temporal unit."""
     pictures, is_key, sets = 0, False, []
-    for obu in _obus(data):
+    for obu in obus(data):
         if obu.end > len(data):
             break
         if obu.kind == _SEQUENCE:
@@ -426,7 +434,7 @@ def _inspect_av1(data: bytes) -> AccessUnit:
 def _read_head_av1(data: bytes) -> PictureHead:
     """Parse the first bytes of a message; only key frames that are shown count as key pictures."""
     has_sequence = False
-    for obu in _obus(data):
+    for obu in obus(data):
         has_sequence |= obu.kind == _SEQUENCE
         if obu.kind in (_FRAME_HEADER, _FRAME) and obu.body < len(data):
             return PictureHead(True, _av1_header(data[obu.body])[1], has_sequence)
@@ -435,7 +443,7 @@ def _read_head_av1(data: bytes) -> PictureHead:
 
 def _with_sequence_headers(data: bytes, sets: tuple[bytes, ...]) -> bytes:
     """Insert sequence headers into a temporal unit, after its delimiter."""
-    first = next(_obus(data), None)
+    first = next(obus(data), None)
     at = first.end if first and first.kind == _TEMPORAL_DELIMITER else 0
     return data[:at] + b"".join(sets) + data[at:]
 
@@ -443,7 +451,7 @@ def _with_sequence_headers(data: bytes, sets: tuple[bytes, ...]) -> bytes:
 def sequence_headers(configuration: bytes) -> tuple[bytes, ...]:
     """The sequence headers in the configuration record of a container (AV1 in ISO BMFF, 2.3)."""
     body = configuration[4:]
-    return tuple(body[obu.start : obu.end] for obu in _obus(body) if obu.kind == _SEQUENCE)
+    return tuple(body[obu.start : obu.end] for obu in obus(body) if obu.kind == _SEQUENCE)
 
 
 def _av1_header(byte: int) -> tuple[bool, bool]:

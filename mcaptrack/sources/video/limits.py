@@ -20,6 +20,8 @@ _MOST_MEGAPIXELS: Final = 2147
 #: The maximum picture size of H.264 (level 6.2): 139 264 macroblocks of 16 x 16 pixels.
 _H264_PIXELS: Final = 139_264 * 256
 _PNG, _JPEG, _BMP, _RIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"BM", b"RIFF"
+#: Where a PNG has the bits of its samples.
+_PNG_DEPTH: Final = 24
 _TIFF: Final = {b"II*\0": "little", b"MM\0*": "big"}
 _TIFF_WIDTH, _TIFF_HEIGHT, _TIFF_BITS, _TIFF_SAMPLES, _TIFF_SHORT = 256, 257, 258, 277, 3
 #: The memory limit is the pixel limit times this many bytes.
@@ -71,6 +73,11 @@ def check_still(still: StillHeader, where: object) -> None:
     check_size(width, height, where)
     if width * height * size > _BYTES * max_pixels():
         raise McaptrackError(f"{where} has {width} x {height} pixels of {size} bytes; {too_large()} of {_BYTES} bytes")
+
+
+def is_deep(data: bytes) -> bool:
+    """Whether a still image may have samples of more than 8 bits, by its first bytes."""
+    return data[:4] in _TIFF or (data.startswith(_PNG) and data[_PNG_DEPTH : _PNG_DEPTH + 1] > b"\x08")
 
 
 def still_size(data: bytes | mmap) -> StillHeader | None:

@@ -18,9 +18,9 @@ from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.sources.video.codecs import CODECS, FrameNumber, FrameNumbers, is_interlaced, sequence_headers
 from mcaptrack.sources.video.container import fraction, has_slots, is_transport, reading, videos
 from mcaptrack.sources.video.encode import VideoOptions
+from mcaptrack.sources.video.recognise import WORDS
 
 _PIXELS: Final = ("yuv420p", "yuvj420p")
-_WORDS: Final = {"h264": "H.264", "h265": "H.265", "vp9": "VP9", "av1": "AV1"}
 _DAMAGED: Final = "some of its packets are damaged"
 _ONLY_SOME: Final = "it is H.265, which viewers play only where the hardware does (`image_format='h265'` keeps it)"
 
@@ -247,7 +247,7 @@ def _rejected_by_codec(image_format: str, name: str, options: VideoOptions, cont
     if not image_format:
         return f"it is {name}, which viewers don't play"
     if options.image_format == "h264" and image_format != "h264":
-        return f"it is {_WORDS[image_format]}, not H.264"
+        return f"it is {WORDS[image_format]}, not H.264"
     if options.quality is not None:
         return "a quality was asked for"
     if context.pix_fmt not in _PIXELS:

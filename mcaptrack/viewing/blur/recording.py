@@ -27,7 +27,7 @@ from mcaptrack.sources.foreign.decoding import MessageType, ros_types
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import H264Encoder, encode_image
-from mcaptrack.sources.video.decode import raw_with
+from mcaptrack.sources.video.pixels import raw_with
 from mcaptrack.viewing.blur.people import HiddenPeople, hide
 from mcaptrack.viewing.rendering import rate_of
 
@@ -166,7 +166,7 @@ def _json(payload: bytes, data: bytes, word: str) -> bytes:
     fields = json.loads(payload)
     fields["data"] = base64.b64encode(data).decode() if isinstance(fields["data"], str) else list(data)
     if word:
-        fields["format"] = word
+        fields["format" if "format" in fields else "encoding"] = word
     return json.dumps(fields, separators=(",", ":")).encode()
 
 
@@ -180,8 +180,10 @@ def _ros(kind: MessageType) -> Replace:
 
     def replace(payload: bytes, data: bytes, word: str) -> bytes:
         store.max_sequence_length = len(payload)
-        changed: dict[str, Any] = {"data": np.frombuffer(data, np.uint8)} | ({"format": word} if word else {})
-        return bytes(write(dataclasses.replace(read(payload, name), **changed), name))
+        message = read(payload, name)
+        key = "format" if hasattr(message, "format") else "encoding"
+        changed: dict[str, Any] = {"data": np.frombuffer(data, np.uint8)} | ({key: word} if word else {})
+        return bytes(write(dataclasses.replace(message, **changed), name))
 
     return replace
 
@@ -246,13 +248,14 @@ class _Encoder:
     def __init__(self, opened: log.Log, topic: str) -> None:
         self._name = f"{opened.path}: {topic}"
         self._fps = rate_of(opened.times(topic))
+        self._is_compressed = foreign.is_compressed(opened.channel(topic).schema_name)
         self._codec: H264Encoder | None = None
         self._size, self._has_warned = (0, 0), False
 
     def __call__(self, t_ns: int, picture: foreign.Picture, image: Image, mask: Bools) -> tuple[bytes, str]:
         """The data of a picture, and its new format, "" for the same one."""
-        if picture.layout is not None:
-            return raw_with(picture.format, picture.data, picture.layout, image, mask), ""
+        if picture.layout is not None and not self._is_compressed:
+            return raw_with(picture.format, picture.data, picture.layout, image, mask, picture.span), ""
         if picture.format in _JPEG:
             return encode_image(image, "jpeg"), ""
         if picture.format in ("h264", "h265", "vp9", "av1"):
@@ -265,7 +268,7 @@ class _Encoder:
             return self._codec.encode(even, t_ns), "" if picture.format == "h264" else "h264"
         if picture.format != "png":
             self._warn_of_format(picture.format, "png")
-        return encode_image(image, "png"), "" if picture.format == "png" else "png"
+        return encode_image(image, "png"), "" if picture.format == "png" and not picture.is_depth else "png"
 
     def _warn_of_format(self, before: str, after: str) -> None:
         if not self._has_warned:
