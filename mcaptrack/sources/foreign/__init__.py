@@ -20,6 +20,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.foreign.boxes import (
     BOXES_3D_READ,
@@ -31,8 +32,8 @@ from mcaptrack.sources.foreign.boxes import (
 )
 from mcaptrack.sources.foreign.boxes import Classes as Classes
 from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
-from mcaptrack.sources.foreign.decoding import MessageType as MessageType
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, plain_name, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.definitions import MessageType as MessageType
 from mcaptrack.sources.foreign.flatten import message_type_of
 
 if TYPE_CHECKING:

@@ -10,13 +10,16 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.sources.foreign.decoding import MessageType, decoder_with_errors, protobuf_unpacker, unpacker
+from mcaptrack.notices import warn
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, protobuf_unpacker, unpacker
+from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defined
 
 Path = tuple[str, ...]
 Value = bool | int | float | str | bytes | list[Any] | None
@@ -30,13 +33,26 @@ class _Messages(tuple[Any, ...]):
     """A list of messages, which becomes JSON even if it is empty, so that a column keeps its type."""
 
 
+#: The definitions of open logs that were found by their messages, by topic.
+_DEFINED: Final[WeakKeyDictionary[log.Log, dict[str, MessageType]]] = WeakKeyDictionary()
+
+
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
-    """The message type of a channel of a log."""
+    """The message type of a channel of a log; a warning says which definition fits if the log has none."""
     channel = opened.channel(topic)
     index = opened.part(channel.topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
-    return MessageType(*fields, channel.message_encoding)
+    kind = MessageType(*fields, channel.message_encoding)
+    if is_defined(kind):
+        return kind
+    kinds = _DEFINED.setdefault(opened, {})
+    if topic not in kinds:
+        payloads = (message.payload for message in opened.messages(topic))
+        kinds[topic], origin = defined(kind, payloads, f"{opened.path}: {topic}")
+        if origin:
+            warn(f"{opened.path}: {topic} does not say what {kind.name} is; its definition is {origin}", "definitions")
+    return kinds[topic]
 
 
 def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:

@@ -48,17 +48,6 @@ def names_file(path: Path, name: str) -> bool:
         return True
 
 
-def is_packed(path: Path, name: str) -> bool:
-    """Whether a metadata.yaml says that the messages of this file are compressed one by one."""
-    if not holds_metadata(path):
-        return False
-    try:
-        bag, names = read_metadata(path)
-    except McaptrackError:
-        return False
-    return bag.packed and name in names
-
-
 def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     """Read a metadata.yaml; returns it and the files that it names. Raises McaptrackError if it is invalid."""
     text = read_beginning(path, plain_yaml.MAX_BYTES + 1)

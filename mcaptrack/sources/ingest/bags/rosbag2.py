@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,12 +20,13 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defined, is_packed
 from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
-from mcaptrack.sources.sidecar import METADATA
+from mcaptrack.sources.sidecar import METADATA, holds_packed
 from mcaptrack.sources.video import IMAGE_SUFFIXES
 
 _MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -137,7 +137,7 @@ class _Files(RecordingReader):
             left = decompression.limit_of(path.stat().st_size)
             for connection, message in self._messages(number):
                 payload = message.payload
-                if self.bag.packed or self._is_packed(connection, payload):
+                if self.bag.packed or (connection.encoding == MessageEncoding.CDR and is_packed(payload)):
                     payload = _unpack_message(payload, path, message.t_ns, left)
                     left -= len(payload)
                     yield connection, message._replace(payload=payload)
@@ -155,10 +155,6 @@ class _Files(RecordingReader):
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         """The messages of a file as they are stored."""
         raise NotImplementedError
-
-    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
-        """Whether a message is compressed, where metadata.yaml doesn't say it of all."""
-        return False
 
     def _connection(self, repeats: dict[object, int], described: Connection, messages: int) -> Connection:
         """The connection that a part of the recording describes: the parts have the same ones.
@@ -187,30 +183,6 @@ class _Files(RecordingReader):
                 )
 
 
-# Definitions of standard ROS messages, from rosbags, for recordings that don't contain them.
-
-
-@cache
-def known_definition(kind: str, distro: str, digest: str) -> tuple[str, str]:
-    """The definition of a message type, and the ROS distribution that it is from.
-
-    That is the given distribution, or else the newest one with the same type hash; ("", "") if there is none.
-    """
-    from rosbags.typesys import Stores, get_typestore
-
-    all_stores = {store.value.removeprefix("ros2_"): store for store in Stores if store.value.startswith("ros2_")}
-    named = {distro: all_stores[distro]} if distro in all_stores else {}
-    for name, store in (named or dict(reversed(all_stores.items()))).items():
-        types = get_typestore(store)
-        try:
-            if digest.startswith("RIHS01_") and types.hash_rihs01(kind) != digest:
-                continue
-            return types.generate_msgdef(kind, ros_version=2)[0], f"ROS 2 {name.capitalize()}"
-        except Exception:  # noqa: BLE001, PERF203, S112, RUF100  # it raises various exceptions for unknown types
-            continue
-    return "", ""
-
-
 class Databases(_Files):
     """SQLite databases."""
 
@@ -218,11 +190,8 @@ class Databases(_Files):
         self._databases: list[SqliteTables] = []
         self._topics: list[dict[int, Connection]] = []
         self._distro = bag.distro
-        self._undefined: dict[str, str] = {}
+        self._found: dict[str, tuple[str, str, bytes]] = {}
         super().__init__(paths, whole, bag)
-        for kind, where in sorted(self._undefined.items()):
-            text = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
-            self.findings.notes.append(f"{whole} does not say what {kind} is; {text}")
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
@@ -235,12 +204,14 @@ class Databases(_Files):
                     writer.add_metadata("rosbag2", {"serialized_metadata": _text(text)})
 
     def _open(self, number: int) -> None:
-        path = self.paths[number]
-        database = SqliteTables(path, _TABLES)
-        self.closing.callback(database.close)
-        self._databases.append(database)
-        if not all(columns <= set(database.columns(table)) for table, columns in _NEEDED.items()):
-            raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
+        if not number:  # definitions are tried on the messages of all files
+            for path in self.paths:
+                database = SqliteTables(path, _TABLES)
+                self.closing.callback(database.close)
+                self._databases.append(database)
+                if not all(columns <= set(database.columns(table)) for table, columns in _NEEDED.items()):
+                    raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
+        database = self._databases[number]
         definitions = self._definitions(database)
         has = database.columns("topics")
         optional = [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
@@ -249,7 +220,7 @@ class Databases(_Files):
             topic, kind, encoding, *more = map(_text, values)
             extra = dict(zip(optional, more, strict=True))
             digest = extra.get("type_description_hash", "")
-            schema, defined_digest = definitions.get(kind) or (self._schema(kind, digest), "")
+            schema, defined_digest = definitions.get(kind) or (self._schema(kind, encoding, digest), "")
             qos = extra.get("offered_qos_profiles", "")
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
             described[key] = Connection(topic, schema, encoding, metadata)
@@ -295,13 +266,25 @@ class Databases(_Files):
             if encoding in (SchemaEncoding.ROS2, SchemaEncoding.ROS2IDL) and (text or kind.endswith("/Empty"))
         }
 
-    def _schema(self, kind: str, digest: str) -> tuple[str, str, bytes]:
-        """The schema record of a message type that the database does not define."""
-        text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
-        return (kind, SchemaEncoding.ROS2, text.encode()) if self._undefined[kind] else (kind, "", b"")
+    def _schema(self, name: str, encoding: str, digest: str) -> tuple[str, str, bytes]:
+        """The schema record of a message type that the database does not define: of the definition that fits."""
+        if name not in self._found:
+            kind, origin = MessageType(name, "", b"", encoding), ""
+            if not is_defined(kind):
+                kind, origin = defined(kind, self._payloads(name), str(self.whole), self._distro.lower(), digest)
+            if origin:
+                text = f"{self.whole} does not say what {name} is; its definition is {origin}"
+                self.findings.notes.append(text)
+            self._found[name] = kind[:3]
+        return self._found[name]
 
-    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
-        return payload.startswith(_ZSTD) and connection.encoding == MessageEncoding.CDR  # CDR starts with a zero byte
+    def _payloads(self, name: str) -> Iterator[bytes]:
+        """The messages of a type, in all files."""
+        for database in self._databases:
+            for key, kind in database.rows("topics", ["id", "type"]):
+                if _text(kind) == name:
+                    those = database.rows("messages", ["data"], where=("topic_id", key))
+                    yield from (data for (data,) in those if isinstance(data, bytes))
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         connections, path = self._topics[number], self.paths[number]
@@ -325,7 +308,7 @@ class Logs(_Files):
         super().__init__(paths, whole, bag)
         profiles = {log.header(opened)[0] for opened in self.logs}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
-        self.as_log = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
+        self.as_log = self.logs[0] if len(self.logs) == 1 and not (bag.packed or holds_packed(self.logs[0])) else None
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, and all attachments and metadata records of the files."""

@@ -62,11 +62,14 @@ class SqliteTables:
         """The columns of one of the tables; empty if there is no such table."""
         return self._columns[table]
 
-    def rows(self, table: str, columns: Sequence[str]) -> Iterator[tuple[Any, ...]]:
-        """These columns of all rows, in table order; text as bytes."""
+    def rows(
+        self, table: str, columns: Sequence[str], where: tuple[str, object] | None = None
+    ) -> Iterator[tuple[Any, ...]]:
+        """These columns of all rows, or of those ``where`` a column has a value, in table order; text as bytes."""
         names = ", ".join(f'"{name}"' for name in columns)
+        chosen = f' WHERE "{where[0]}" IS ?' if where else ""
         left = int(_MAX_EXPANSION * self._size)
-        for row in self._query(f'SELECT {names} FROM "{table}" NOT INDEXED'):  # noqa: S608
+        for row in self._query(f'SELECT {names} FROM "{table}" NOT INDEXED{chosen}', where[1:] if where else ()):  # noqa: S608
             left -= _ROW_BYTES + sum(len(value) for value in row if isinstance(value, bytes))
             if left < 0:
                 raise McaptrackError(f"{self.path} is damaged: its table {table} holds more than the file can")
@@ -163,10 +166,10 @@ class SqliteTables:
 
         self._database.set_authorizer(may)
 
-    def _query(self, query: str) -> Iterator[tuple[Any, ...]]:
+    def _query(self, query: str, values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
         self._steps = 0
         try:
-            yield from self._database.execute(query)
+            yield from self._database.execute(query, values)
         except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:  # messages of SQLite may quote damaged text
             if self._interruption is not None:
                 raise self._interruption from None

@@ -1,0 +1,473 @@
+"""Definitions of ROS messages: of a recording itself, of a folder that the user names, and of the distributions of ROS.
+
+A recording need not define its messages: sqlite bags before ROS 2 Iron don't. Distributions define some types
+differently, so each definition is tried on the messages, and that one is taken with which they decode to their last
+byte.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from copy import copy
+from functools import cache, lru_cache
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from mcap.well_known import MessageEncoding, SchemaEncoding
+
+from mcaptrack import foxglove
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
+from mcaptrack.schema import SCHEMAS
+from mcaptrack.schema.encodings import CDR, ros_definition, schema_of_ros
+from mcaptrack.schema.names import plain_name, ros_type
+
+#: Types as rosbags has them: constants and fields by name.
+Types = dict[str, Any]
+#: A function that gives the constants and fields of a type; None if it doesn't know it.
+LookUp = Callable[[str], Any]
+
+#: Longer definitions are refused, because parsing them takes long.
+_MAX_DEFINITION: Final = 2**20
+_MAX_FILES: Final = 100_000
+#: So many messages are tried at most, and at least if only one definition is left.
+_TRIED: Final = 2000
+_ENOUGH: Final = 20
+#: CDR messages may be filled up to a multiple of this.
+_FILL: Final = 4
+#: Definitions in IDL: how they begin, the heads of files, directives of a preprocessor, and enumerations.
+_IDL: Final = re.compile(r"(?:\s+|//.*|/\*(?s:.*?)\*/|#.*)*(?:=+\s*IDL:|(?:module|struct|typedef|enum|const)\b|@)")
+_IDL_HEAD: Final = re.compile(r"^=+\nIDL: .*\n", re.MULTILINE)
+_IDL_DIRECTIVE: Final = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
+_IDL_ENUM: Final = re.compile(r"(?:@bit_bound\s*\(\s*(\d+)\s*\)\s*)?(?:@\w+\s*)?\benum\s+(\w+)\s*\{[^}]*\}")
+#: What changes how messages in IDL are encoded, and isn't read.
+_IDL_UNREAD: Final = re.compile(r"@optional|@mutable|@extensibility\(\s*MUTABLE\s*\)|\bunion\b")
+_SEPARATOR: Final = re.compile(r"^=+[ \t]*$", re.MULTILINE)
+
+#: The messages of vision_msgs, which rosbags doesn't know: those of version 4 and what older versions have instead.
+_HYPOTHESIS: Final = "geometry_msgs/PoseWithCovariance pose"
+_VISION_4: Final[Mapping[str, str]] = {
+    "Point2D": "float64 x\nfloat64 y",
+    "Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
+    "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "BoundingBox2DArray": "std_msgs/Header header\nvision_msgs/BoundingBox2D[] boxes",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "BoundingBox3DArray": "std_msgs/Header header\nvision_msgs/BoundingBox3D[] boxes",
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": f"vision_msgs/ObjectHypothesis hypothesis\n{_HYPOTHESIS}",
+    "Detection2D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox2D bbox\nstring id",
+    "Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox3D bbox\nstring id",
+    "Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
+    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+_VISION_3: Final = {**_VISION_4, "BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y"}
+_BEFORE_3: Final = {
+    name: _VISION_4[name].replace("string id", f"sensor_msgs/{source}")
+    for name, source in (("Detection2D", "Image source_img"), ("Detection3D", "PointCloud2 source_cloud"))
+}
+_VISION_2: Final = {
+    **_VISION_3,
+    "ObjectHypothesis": "string id\nfloat64 score",
+    "ObjectHypothesisWithPose": f"string id\nfloat64 score\n{_HYPOTHESIS}",
+    **{name: f"{text}\nbool is_tracking\nstring tracking_id" for name, text in _BEFORE_3.items()},
+}
+_VISION_1: Final = {
+    **_VISION_3,
+    "ObjectHypothesis": "int64 id\nfloat64 score",
+    "ObjectHypothesisWithPose": f"int64 id\nfloat64 score\n{_HYPOTHESIS}",
+    **_BEFORE_3,
+}
+#: The messages of vision_msgs by distribution; later ones have version 4.
+_VISION: Final = {
+    "ros1_noetic": _VISION_1,
+    "ros2_dashing": _VISION_2,
+    "ros2_eloquent": _VISION_2,
+    "ros2_foxy": _VISION_2,
+    "ros2_galactic": _VISION_3,
+}
+
+
+class MessageType(NamedTuple):
+    """The message type of a channel: its schema record and its message encoding."""
+
+    name: str
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+
+
+class _Candidate(NamedTuple):
+    """A definition of a type with all types of its fields, and the distributions of ROS, or files, that have it."""
+
+    types: Types
+    origins: list[str]
+
+
+# The definitions of a folder that the user names.
+
+
+_FOLDERS: Final[ContextVar[tuple[Path, ...]]] = ContextVar("definitions", default=())
+
+
+@contextmanager
+def definitions_of(folders: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None) -> Iterator[None]:
+    """In this block, types that recordings don't define are looked up in these folders of .msg and .idl files first.
+
+    Raises McaptrackError for a folder without any.
+    """
+    several = (folders,) if isinstance(folders, str | os.PathLike) else folders or ()
+    paths = tuple(Path(os.path.abspath(os.fspath(folder))) for folder in several)
+    for path in paths:
+        if not _files_in(path):
+            there = "is no folder" if not path.is_dir() else "has no .msg or .idl files, as pkg/msg/Name.msg"
+            raise McaptrackError(f"`definitions=` names {path}, which {there}")
+    token = _FOLDERS.set(paths)
+    try:
+        yield
+    finally:
+        _FOLDERS.reset(token)
+
+
+@lru_cache(maxsize=8)
+def _files_in(folder: Path) -> dict[str, Path]:
+    """The files of definitions in a folder, by the name of their type; by the last part of it if they name no package.
+
+    Packages have their files in PKG/msg/, as in a workspace or in what ROS installs.
+    """
+    found = islice((path for path in folder.rglob("*") if path.suffix in (".msg", ".idl")), _MAX_FILES)
+    files: dict[str, Path] = {}
+    for path in sorted(found, key=lambda path: (path.suffix == ".idl", path)):  # rosidl makes each .idl of a .msg
+        package = path.parent.parent.name if path.parent.name == "msg" else ""
+        files.setdefault(ros_type(f"{package}/msg/{path.stem}") if package else path.stem, path)
+    return files
+
+
+def _look_up_file(folder: Path, name: str) -> Any:
+    files = _files_in(folder)
+    path = files.get(name) or files.get(name.rpartition("/")[2])
+    return None if path is None else _parsed_file(path, name).get(name)
+
+
+@lru_cache(maxsize=1024)
+def _parsed_file(path: Path, name: str) -> Types:
+    try:
+        data = path.read_bytes()
+        encoding = SchemaEncoding.ROS2IDL if path.suffix == ".idl" else SchemaEncoding.ROS2
+        return parsed(name, encoding, data)
+    except (OSError, ValueError) as error:
+        raise McaptrackError(f"{path} can't be read: {error}") from None
+
+
+# Parse definitions.
+
+
+def parsed(name: str, schema_encoding: str, data: bytes) -> Types:
+    """The types that a definition defines: the named one and those of its fields. Raises ValueError."""
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    if len(data) > _MAX_DEFINITION:
+        raise ValueError(f"it has {len(data)} characters")
+    text = data.decode("utf-8", "replace").replace("\r\n", "\n")
+    if not text.strip():
+        return {}
+    try:
+        if schema_encoding not in (SchemaEncoding.ROS2IDL, "omgidl") and not _IDL.match(text):
+            return get_types_from_msg(_SEPARATOR.sub("=" * 80, text), name)  # type: ignore[return-value]
+        if unread := _IDL_UNREAD.search(text):
+            raise ValueError(f"{unread.group()} of IDL is not read")
+        plain = _IDL_ENUM.sub(lambda enum: f"typedef uint{enum[1] or 32} {enum[2]}", _IDL_DIRECTIVE.sub("", text))
+        parts = [get_types_from_idl(part) for part in _IDL_HEAD.split(plain) if part.strip()]
+    except Exception as error:  # third-party parsers, which raise various exceptions
+        raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from None
+    return _as_in_ros({inner: fields for part in parts for inner, fields in part.items()}, name)
+
+
+def _as_in_ros(types: Types, name: str) -> Types:
+    """Types of IDL by their names in ROS, and without the underscores that DDS adds to fields."""
+
+    def renamed(kind: Any) -> Any:
+        from rosbags.interfaces import Nodetype
+
+        node, inner = kind
+        if node == Nodetype.NAME:
+            return node, ros_type(inner)
+        return kind if node == Nodetype.BASE else (node, (renamed(inner[0]), inner[1]))
+
+    out: Types = {}
+    for inner, (constants, fields) in types.items():
+        end = "_" if fields and all(field.endswith("_") for field, _ in fields) else ""
+        out[ros_type(inner)] = (constants, [(field.removesuffix(end), renamed(kind)) for field, kind in fields])
+    if name not in out:  # a schema that calls its type otherwise than its definition
+        last = name.rpartition("/")[2]
+        alike = [inner for inner in out if inner.rpartition("/")[2] == last]
+        used = {inner for _, fields in out.values() for _, kind in fields for inner in _names_in(kind)}
+        alike = alike or [inner for inner in out if inner not in used and out[inner][1]]
+        if len(alike) != 1:
+            raise ValueError(f"it defines {', '.join(out) or 'nothing'}, not {name}")
+        out[name] = out[alike[0]]
+    return out
+
+
+def _names_in(kind: Any) -> Iterator[str]:
+    """The other type in the type of a field, if any."""
+    from rosbags.interfaces import Nodetype
+
+    node, inner = kind
+    if node == Nodetype.NAME:
+        yield inner
+    elif node != Nodetype.BASE:
+        yield from _names_in(inner[0])
+
+
+def _whole(name: str, look_ups: Sequence[LookUp]) -> Types:
+    """A type and all types of its fields, each by the first function that knows it. Raises ValueError."""
+    types: Types = {}
+    missing = [name]
+    while missing:
+        wanted = missing.pop()
+        if wanted not in types:
+            known = (look_up(wanted) for look_up in look_ups)
+            types[wanted] = next((fields for fields in known if fields is not None), None)
+            if types[wanted] is None:
+                raise ValueError(f"{wanted} is not defined")
+            missing += [inner for _, kind in types[wanted][1] for inner in _names_in(kind)]
+    return types
+
+
+def _store_of(types: Types) -> Any:
+    """A store of rosbags with these types."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
+
+
+# The types of a channel.
+
+
+def ros_types(kind: MessageType) -> tuple[Any, str]:
+    """The types of a ROS message (a store of rosbags), and its name in it: by its definition, or else that of ROS.
+
+    Raises McaptrackError if its definition can't be understood, or if there is none.
+    """
+    name = ros_type(kind.name)
+    if not name:
+        raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
+    # Each reader sets the longest sequence of its own store; what was compiled for the type is shared.
+    return copy(_typestore(name, kind, _FOLDERS.get())), name
+
+
+@lru_cache(maxsize=64)
+def _typestore(name: str, kind: MessageType, folders: tuple[Path, ...]) -> Any:
+    """The types of a channel, kept: the code that reads a type is compiled when it is first used, which takes longer
+    than a short log.
+    """
+    why = "the log has no definition of it, and it is not a standard type of ROS"
+    newest = next(iter(_distributions(kind.encoding)))
+    try:
+        own = parsed(name, kind.schema_encoding, kind.schema)
+        store = _store_of(_whole(name, [own.get, *_of_folders(folders), *_of_distribution(newest)]))
+        store.get_msgdef(name)
+    except Exception as error:  # noqa: BLE001, RUF100  # a third-party parser that raises various exceptions
+        if kind.schema:
+            why = f"the log's definition of it can't be understood ({' '.join(str(error).split())[:120]})"
+        raise McaptrackError(f"{kind.name} can't be read: {why}; `definitions=` names a folder with others") from None
+    return store
+
+
+def _of_folders(folders: Sequence[Path]) -> list[LookUp]:
+    return [lambda name, folder=folder: _look_up_file(folder, name) for folder in folders]  # type: ignore[misc]
+
+
+def _distributions(encoding: str) -> list[str]:
+    """The distributions of ROS whose messages rosbags knows, as it names them, the newest first."""
+    from rosbags.typesys import Stores
+
+    version = "ros1_" if encoding == MessageEncoding.ROS1 else "ros2_"
+    return [store.value for store in reversed(Stores) if store.value.startswith(version)]
+
+
+@cache
+def _vision(distribution: str) -> Types:
+    version = _VISION.get(distribution, _VISION_4)
+    defined = (parsed(f"vision_msgs/msg/{name}", SchemaEncoding.ROS2, text.encode()) for name, text in version.items())
+    return {name: fields for types in defined for name, fields in types.items()}
+
+
+def _of_distribution(distribution: str) -> list[LookUp]:
+    """What a distribution of ROS defines, of its own packages and of vision_msgs."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return [get_typestore(Stores(distribution)).fielddefs.get, _vision(distribution).get]
+
+
+def typestore_of(distribution: str) -> Any:
+    """A store of rosbags with the types of a distribution of ROS, such as ros2_humble, and of vision_msgs."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores(distribution))
+    store.register(_vision(distribution))
+    return store
+
+
+# Definitions that a recording doesn't have, by its messages.
+
+
+def is_defined(kind: MessageType) -> bool:
+    """Whether a message type has its definition, needs none, or has no name by which it could be looked up."""
+    is_ros = kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR)
+    return not (is_ros and kind.name) or bool(kind.schema.strip())
+
+
+def defined(
+    kind: MessageType, payloads: Iterable[bytes], where: str, distribution: str = "", digest: str = ""
+) -> tuple[MessageType, str]:
+    """A message type with the definition that fits its messages, and where this is from; as it is if there is none.
+
+    Warns where none fits, and where several do that read other values; ``where`` begins the warning. Of these that of
+    ``distribution`` is taken, or else the newest. ``digest`` is the hash of the type in ROS 2, if it is known.
+    """
+    name = ros_type(kind.name)
+    candidates = _candidates(name, kind, distribution, digest) if name else []
+    fitting, count = _fitting(candidates, name, kind.encoding, payloads)
+    if not fitting:
+        tried = f"; none of {'; '.join(map(_origin, candidates))} fits its messages" if candidates else ""
+        text = f"{where} does not say what {kind.name} is; its definition is not known{tried}"
+        warn(f"{text}: name a folder with its .msg or .idl file (`definitions=`)", "definitions")
+        return kind, ""
+    first = fitting[0]
+    others = [other for other in fitting[1:] if count and _layout(other.types, name) != _layout(first.types, name)]
+    if others:
+        text = f"{where} does not say what {kind.name} is; {_origin(first)} is taken, and its messages also fit"
+        warn(f"{text} {'; '.join(map(_origin, others))} (`definitions=` names a folder with others)", "definitions")
+    version = 1 if kind.encoding == MessageEncoding.ROS1 else 2
+    text = _store_of(first.types).generate_msgdef(name, ros_version=version)[0]
+    encoding = SchemaEncoding.ROS1 if version == 1 else SchemaEncoding.ROS2
+    checked = f", which fits {'all its' if count < _ENOUGH else 'its'} messages" if count else ""
+    return MessageType(kind.name, encoding, text.encode(), kind.encoding), f"{_origin(first)}{checked}"
+
+
+def _candidates(name: str, kind: MessageType, distribution: str, digest: str) -> list[_Candidate]:
+    """The definitions of a type, each once: of the folders that the user names, or else of the distributions of ROS."""
+    folders = _FOLDERS.get()
+    named = [folder for folder in folders if _look_up_file(folder, name) is not None]
+    order = sorted(_distributions(kind.encoding), key=lambda other: other.removeprefix("ros2_") != distribution)
+    candidates: list[_Candidate] = []
+    for other in order:
+        try:
+            types = _whole(name, [*_of_folders(folders), *_of_distribution(other), _look_up_ours])
+        except ValueError:
+            continue
+        same = next((candidate for candidate in candidates if candidate.types == types), None)
+        if same is None:
+            if named or not digest.startswith("RIHS01_") or _store_of(types).hash_rihs01(name) == digest:
+                candidates.append(_Candidate(types, [*map(str, named)] or [other]))
+        elif not named:
+            same.origins.append(other)
+    return candidates
+
+
+def _look_up_ours(name: str) -> Any:
+    """The definition of a message of mcaptrack, or of Foxglove, in ROS 2."""
+    plain = plain_name(name)
+    schema = SCHEMAS.get(schema_of_ros(name))
+    if schema is not None:
+        return parsed(name, SchemaEncoding.ROS2, ros_definition(schema.definition).encode()).get(name)
+    if plain.startswith("foxglove.") and name.startswith("foxglove_msgs/"):
+        try:
+            return parsed(name, *foxglove.record_in(plain, CDR)[1:]).get(name)
+        except (KeyError, AttributeError):
+            return None
+    return None
+
+
+def _origin(candidate: _Candidate) -> str:
+    """Where a definition is from, in words: "that of ROS 2 Foxy to Galactic"."""
+    names = candidate.origins
+    if not names[0].startswith(("ros1_", "ros2_")):
+        return f"that in {', '.join(names)}"
+    order = sorted(names, key=_distributions(_ENCODING[names[0][:5]]).index)
+    ends = [order[-1], *order[:1]] if len(order) > 1 else order
+    return f"that of ROS {names[0][3]} {' to '.join(name[5:].capitalize() for name in ends)}"
+
+
+_ENCODING: Final = {"ros1_": MessageEncoding.ROS1, "ros2_": MessageEncoding.CDR}
+
+
+def _fitting(
+    candidates: Sequence[_Candidate], name: str, encoding: str, payloads: Iterable[bytes]
+) -> tuple[list[_Candidate], int]:
+    """The candidates with which messages decode to their last byte, and how many messages that are."""
+    readers = {number: _exact_reader(candidate.types, name, encoding) for number, candidate in enumerate(candidates)}
+    layouts = {number: _layout(candidate.types, name) for number, candidate in enumerate(candidates)}
+    count = 0
+    for payload in islice(payloads, _TRIED if candidates else 0):
+        count += 1
+        readers = {number: fits for number, fits in readers.items() if fits(payload)}
+        if not readers or (count >= _ENOUGH and len({layouts[number] for number in readers}) == 1):
+            break
+    return [candidates[number] for number in readers], count
+
+
+def _exact_reader(types: Types, name: str, encoding: str) -> Callable[[bytes], bool]:
+    """A function that says whether a message decodes to its last byte."""
+    store = _store_of(types)
+    read = store.get_msgdef(name)
+    by_head = {b"\0\1": read.deserialize_cdr_le, b"\0\0": read.deserialize_cdr_be}
+
+    def fits(payload: bytes) -> bool:
+        payload = unpacked(payload)
+        store.max_sequence_length = max(len(payload), 1)
+        try:
+            if encoding == MessageEncoding.ROS1:
+                store.deserialize_ros1(payload, name)
+                return True
+            _, end = by_head[payload[:2]](payload[4:], 0, read.cls, store)
+        except Exception:  # noqa: BLE001, RUF100  # of bytes that are no such message
+            return False
+        left = payload[4 + end :]
+        return 4 + end <= len(payload) and len(left) < _FILL and not any(left)
+
+    return fits
+
+
+def _layout(types: Types, name: str) -> tuple[Any, ...]:
+    """What the bytes of a message are by a definition: equal for definitions that differ in names only."""
+    from rosbags.interfaces import Nodetype
+
+    def flat(kind: Any) -> Any:
+        node, inner = kind
+        if node == Nodetype.NAME:
+            return tuple(part for _, field in types[inner][1] for part in flat(field))
+        return (inner[0],) if node == Nodetype.BASE else ((node, flat(inner[0]), inner[1]),)
+
+    return flat((Nodetype.NAME, name))  # type: ignore[no-any-return]
+
+
+# Messages that are compressed one by one.
+
+
+_ZSTD: Final = b"\x28\xb5\x2f\xfd"
+_MAX_MESSAGE_BYTES: Final = 2**28
+
+
+def is_packed(payload: bytes) -> bool:
+    """Whether a CDR message is compressed, as rosbag2 does with all of a bag; others begin with a zero byte."""
+    return payload.startswith(_ZSTD)
+
+
+def unpacked(payload: bytes) -> bytes:
+    """A CDR message, decompressed if it is compressed. Raises ValueError."""
+    if not is_packed(payload):
+        return payload
+    from mcaptrack.sources.ingest.bags.decompression import unzstd
+
+    return unzstd(payload, _MAX_MESSAGE_BYTES)
