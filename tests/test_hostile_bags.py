@@ -517,7 +517,7 @@ def test_a_message_of_a_bag_is_not_larger_than_one_of_a_log(commands, folder):
 def endless_database(path: Path) -> None:
     """Not quite: more messages than are read within a second."""
     columns = "messages(topic_id, timestamp, data)"
-    changed(path, f"INSERT INTO {columns} {COUNTED.format(600_000)} SELECT 1, n, x'00010000' FROM r")
+    changed(path, f"INSERT INTO {columns} {COUNTED.format(600_000)} SELECT 1, n, x'0001000001000000' || x'00' FROM r")
 
 
 def endless_bag(path: Path) -> None:

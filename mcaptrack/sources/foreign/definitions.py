@@ -22,7 +22,6 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.notices import warn
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.schema.encodings import CDR, ros_definition, schema_of_ros
 from mcaptrack.schema.names import plain_name, ros_type
@@ -40,6 +39,7 @@ _TRIED: Final = 2000
 _ENOUGH: Final = 20
 #: CDR messages may be filled up to a multiple of this.
 _FILL: Final = 4
+_ADVICE: Final = "`definitions=` names a folder with .msg or .idl files"
 #: Definitions in IDL: how they begin, the heads of files, directives of a preprocessor, and enumerations.
 _IDL: Final = re.compile(r"(?:\s+|//.*|/\*(?s:.*?)\*/|#.*)*(?:=+\s*IDL:|(?:module|struct|typedef|enum|const)\b|@)")
 _IDL_HEAD: Final = re.compile(r"^=+\nIDL: .*\n", re.MULTILINE)
@@ -327,32 +327,39 @@ def is_defined(kind: MessageType) -> bool:
     return not (is_ros and kind.name) or bool(kind.schema.strip())
 
 
-def defined(
-    kind: MessageType, payloads: Iterable[bytes], where: str, distribution: str = "", digest: str = ""
-) -> tuple[MessageType, str]:
-    """A message type with the definition that fits its messages, and where this is from; as it is if there is none.
+class Defined(NamedTuple):
+    """A message type with a definition, and in words where this is from; ``doubts`` is what speaks against it.
 
-    Warns where none fits, and where several do that read other values; ``where`` begins the warning. Of these that of
-    ``distribution`` is taken, or else the newest. ``digest`` is the hash of the type in ROS 2, if it is known.
+    Without a definition that fits, the type is as it was, ``origin`` is "", and ``doubts`` says so.
+    """
+
+    kind: MessageType
+    origin: str
+    doubts: str
+
+
+def defined(kind: MessageType, payloads: Iterable[bytes], distribution: str = "", digest: str = "") -> Defined:
+    """A message type with the definition that fits its messages.
+
+    Of several that read other values it is that of ``distribution``, or else the newest. ``digest`` is the hash of the
+    type in ROS 2, if it is known.
     """
     name = ros_type(kind.name)
     candidates = _candidates(name, kind, distribution, digest) if name else []
-    fitting, count = _fitting(candidates, name, kind.encoding, payloads)
+    fitting, fits, count = _fitting(candidates, name, kind.encoding, payloads)
     if not fitting:
-        tried = f"; none of {'; '.join(map(_origin, candidates))} fits its messages" if candidates else ""
-        text = f"{where} does not say what {kind.name} is; its definition is not known{tried}"
-        warn(f"{text}: name a folder with its .msg or .idl file (`definitions=`)", "definitions")
-        return kind, ""
+        tried = f", and {' and '.join(map(_origin, candidates))} doesn't fit its messages" if candidates else ""
+        return Defined(kind, "", f"its definition is not known{tried} ({_ADVICE})")
     first = fitting[0]
-    others = [other for other in fitting[1:] if count and _layout(other.types, name) != _layout(first.types, name)]
-    if others:
-        text = f"{where} does not say what {kind.name} is; {_origin(first)} is taken, and its messages also fit"
-        warn(f"{text} {'; '.join(map(_origin, others))} (`definitions=` names a folder with others)", "definitions")
+    others = [other for other in fitting[1:] if fits and _layout(other.types, name) != _layout(first.types, name)]
+    also = [f"its messages also fit {'; '.join(map(_origin, others))}"] if others else []
+    also += [f"it fits {fits} of {count} messages"] if fits < count else []
     version = 1 if kind.encoding == MessageEncoding.ROS1 else 2
     text = _store_of(first.types).generate_msgdef(name, ros_version=version)[0]
     encoding = SchemaEncoding.ROS1 if version == 1 else SchemaEncoding.ROS2
-    checked = f", which fits {'all its' if count < _ENOUGH else 'its'} messages" if count else ""
-    return MessageType(kind.name, encoding, text.encode(), kind.encoding), f"{_origin(first)}{checked}"
+    origin = f"its definition is {_origin(first)}{', which fits its messages' if count and not also else ''}"
+    doubts = f"{origin} and a guess: {', and '.join(also)} ({_ADVICE})" if also else ""
+    return Defined(MessageType(kind.name, encoding, text.encode(), kind.encoding), origin, doubts)
 
 
 def _candidates(name: str, kind: MessageType, distribution: str, digest: str) -> list[_Candidate]:
@@ -404,17 +411,25 @@ _ENCODING: Final = {"ros1_": MessageEncoding.ROS1, "ros2_": MessageEncoding.CDR}
 
 def _fitting(
     candidates: Sequence[_Candidate], name: str, encoding: str, payloads: Iterable[bytes]
-) -> tuple[list[_Candidate], int]:
-    """The candidates with which messages decode to their last byte, and how many messages that are."""
-    readers = {number: _exact_reader(candidate.types, name, encoding) for number, candidate in enumerate(candidates)}
-    layouts = {number: _layout(candidate.types, name) for number, candidate in enumerate(candidates)}
-    count = 0
+) -> tuple[list[_Candidate], int, int]:
+    """The candidates with which most messages decode to their last byte, how many these are, and of how many."""
+    readers = [_exact_reader(candidate.types, name, encoding) for candidate in candidates]
+    layouts = [_layout(candidate.types, name) for candidate in candidates]
+    scores, count = [0] * len(candidates), 0
     for payload in islice(payloads, _TRIED if candidates else 0):
+        try:
+            message = unpacked(payload)
+        except ValueError:
+            continue  # a message that can't be decompressed says nothing
         count += 1
-        readers = {number: fits for number, fits in readers.items() if fits(payload)}
-        if not readers or (count >= _ENOUGH and len({layouts[number] for number in readers}) == 1):
+        scores = [score + fits(message) for score, fits in zip(scores, readers, strict=True)]
+        whole = {layout for layout, score in zip(layouts, scores, strict=True) if score == count}
+        if count >= _ENOUGH and (len(whole) == 1 or not any(scores)):
             break
-    return [candidates[number] for number in readers], count
+    best = max(scores, default=0)
+    if 2 * best < count:
+        return [], 0, count
+    return [candidate for candidate, score in zip(candidates, scores, strict=True) if score == best], best, count
 
 
 def _exact_reader(types: Types, name: str, encoding: str) -> Callable[[bytes], bool]:
@@ -424,9 +439,8 @@ def _exact_reader(types: Types, name: str, encoding: str) -> Callable[[bytes], b
     by_head = {b"\0\1": read.deserialize_cdr_le, b"\0\0": read.deserialize_cdr_be}
 
     def fits(payload: bytes) -> bool:
-        payload = unpacked(payload)
-        store.max_sequence_length = max(len(payload), 1)
         try:
+            store.max_sequence_length = max(len(payload), 1)
             if encoding == MessageEncoding.ROS1:
                 store.deserialize_ros1(payload, name)
                 return True

@@ -49,9 +49,8 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
     kinds = _DEFINED.setdefault(opened, {})
     if topic not in kinds:
         payloads = (message.payload for message in opened.messages(topic))
-        kinds[topic], origin = defined(kind, payloads, f"{opened.path}: {topic}")
-        if origin:
-            warn(f"{opened.path}: {topic} does not say what {kind.name} is; its definition is {origin}", "definitions")
+        kinds[topic], origin, doubts = defined(kind, payloads)
+        warn(f"{opened.path}: {topic} does not say what {kind.name} is; {doubts or origin}", "definitions")
     return kinds[topic]
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Final
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
@@ -32,6 +32,8 @@ from mcaptrack.sources.video import IMAGE_SUFFIXES
 _MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
+#: Definitions are tried on the messages of at most this many topics of a type.
+_TOPICS_TRIED: Final = 20
 #: At most this many unknown topic ids are named.
 _MAX_STRANGE: Final = 10
 _NEEDED: Final = {
@@ -191,7 +193,11 @@ class Databases(_Files):
         self._topics: list[dict[int, Connection]] = []
         self._distro = bag.distro
         self._found: dict[str, tuple[str, str, bytes]] = {}
+        self._doubts: dict[str, list[str]] = {}
         super().__init__(paths, whole, bag)
+        for doubts, names in self._doubts.items():
+            if doubts:
+                warn(f"{whole} does not say what {list_names(names)} is; {doubts}", "definitions")
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
@@ -269,21 +275,22 @@ class Databases(_Files):
     def _schema(self, name: str, encoding: str, digest: str) -> tuple[str, str, bytes]:
         """The schema record of a message type that the database does not define: of the definition that fits."""
         if name not in self._found:
-            kind, origin = MessageType(name, "", b"", encoding), ""
+            kind = MessageType(name, "", b"", encoding)
             if not is_defined(kind):
-                kind, origin = defined(kind, self._payloads(name), str(self.whole), self._distro.lower(), digest)
-            if origin:
-                text = f"{self.whole} does not say what {name} is; its definition is {origin}"
-                self.findings.notes.append(text)
+                with closing(self._payloads(name)) as payloads:
+                    kind, origin, doubts = defined(kind, payloads, self._distro.lower(), digest)
+                self._doubts.setdefault(doubts, []).append(name)
+                if not doubts:
+                    self.findings.notes.append(f"{self.whole} does not say what {name} is; {origin}")
             self._found[name] = kind[:3]
         return self._found[name]
 
     def _payloads(self, name: str) -> Iterator[bytes]:
         """The messages of a type, in all files."""
         for database in self._databases:
-            for key, kind in database.rows("topics", ["id", "type"]):
-                if _text(kind) == name:
-                    those = database.rows("messages", ["data"], where=("topic_id", key))
+            keys = [key for key, kind in database.rows("topics", ["id", "type"]) if _text(kind) == name]
+            for key in keys[:_TOPICS_TRIED]:
+                with closing(database.rows("messages", ["data"], where=("topic_id", key))) as those:
                     yield from (data for (data,) in those if isinstance(data, bytes))
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
