@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
 
 from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
-from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, named, no_progress, output
+from mcaptrack.api.options import (
+    FILES,
+    Definitions,
+    EachLog,
+    Force,
+    PathLike,
+    Progress,
+    Reports,
+    named,
+    no_progress,
+    output,
+)
 from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish, publish_folder, refuse_overwrite
@@ -74,6 +85,7 @@ def export(
     ] = "parquet",
     topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
     blobs: Annotated[bool, Option(FILES)] = False,
+    definitions: Definitions = None,
     force: Force = False,
     progress: Reports = no_progress,
 ) -> ExportResult:
@@ -134,30 +146,34 @@ def export(
 
     """
     from mcaptrack import log as logs
+    from mcaptrack.sources.foreign.definitions import definitions_of
     from mcaptrack.tables.export import default_folder, main_file
     from mcaptrack.tables.export import export as write_tables
 
     path = log_location(log)
-    if form in get_args(ExchangeFormat):
-        return _export_file(
-            path, optional_path(output), cast("ExchangeFormat", form), names_of(topic), blobs, force, progress
-        )
-    if form in _BAGS:
-        return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
-    if form not in get_args(TableFormat):
-        return _export_by_package(path, optional_path(output), form, topic, blobs, force)
-    folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
-    if folder.exists() and not folder.is_dir():
-        raise McaptrackError(f"{folder} is a file; tables go to a folder")
-    if blobs and not topic:
-        raise McaptrackError("`blobs=True` needs a channel to write; name it with `topic=`")
-    with warnings_about(path) as warnings:
-        with logs.read(path) as opened:
-            done = write_tables(opened, folder, progress, form=kind, topics=names_of(topic), blobs=blobs, force=force)
-        for note in done.notes:
-            warn(note, "left-out")
-    owed = (main_file(path, folder, kind),)
-    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
+    with definitions_of(definitions):
+        if form in get_args(ExchangeFormat):
+            return _export_file(
+                path, optional_path(output), cast("ExchangeFormat", form), names_of(topic), blobs, force, progress
+            )
+        if form in _BAGS:
+            return _export_bag(path, optional_path(output), _BAGS[form], topic, blobs, force, progress)
+        if form not in get_args(TableFormat):
+            return _export_by_package(path, optional_path(output), form, topic, blobs, force)
+        folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
+        if folder.exists() and not folder.is_dir():
+            raise McaptrackError(f"{folder} is a file; tables go to a folder")
+        if blobs and not topic:
+            raise McaptrackError("`blobs=True` needs a channel to write; name it with `topic=`")
+        with warnings_about(path) as warnings:
+            with logs.read(path) as opened:
+                done = write_tables(
+                    opened, folder, progress, form=kind, topics=names_of(topic), blobs=blobs, force=force
+                )
+            for note in done.notes:
+                warn(note, "left-out")
+        owed = (main_file(path, folder, kind),)
+        return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
 
 
 def _export_bag(

@@ -44,6 +44,15 @@ Sidecar = Annotated[
         "that ROS tools read, otherwise into the log.",
     ),
 ]
+Definitions = Annotated[
+    PathLike | Sequence[PathLike] | None,
+    Option(
+        FILES,
+        metavar="FOLDER",
+        shown=False,
+        help="Folder with definitions (.msg or .idl, as in ROS packages) of messages that the log does not define.",
+    ),
+]
 Views = Annotated[
     bool,
     Option(FILES, help="Draw the results for viewers, too; `mcaptrack run` does so at its end."),

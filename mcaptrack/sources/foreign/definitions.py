@@ -270,16 +270,16 @@ def _typestore(name: str, kind: MessageType, folders: tuple[Path, ...]) -> Any:
     """The types of a channel, kept: the code that reads a type is compiled when it is first used, which takes longer
     than a short log.
     """
-    why = "the log has no definition of it, and it is not a standard type of ROS"
     newest = next(iter(_distributions(kind.encoding)))
     try:
         own = parsed(name, kind.schema_encoding, kind.schema)
-        store = _store_of(_whole(name, [own.get, *_of_folders(folders), *_of_distribution(newest)]))
+        store = _store_of(_whole(name, [own.get, *([*_of_folders(folders), *_of_distribution(newest)] if own else [])]))
         store.get_msgdef(name)
     except Exception as error:  # noqa: BLE001, RUF100  # a third-party parser that raises various exceptions
+        why = "the log has no definition of it that fits its messages"
         if kind.schema:
             why = f"the log's definition of it can't be understood ({' '.join(str(error).split())[:120]})"
-        raise McaptrackError(f"{kind.name} can't be read: {why}; `definitions=` names a folder with others") from None
+        raise McaptrackError(f"{kind.name} can't be read: {why}; {_ADVICE}") from None
     return store
 
 
