@@ -179,7 +179,7 @@ def parsed(name: str, schema_encoding: str, data: bytes) -> Types:
         return {}
     try:
         if schema_encoding not in (SchemaEncoding.ROS2IDL, "omgidl") and not _IDL.match(text):
-            return get_types_from_msg(_SEPARATOR.sub("=" * 80, text), name)  # type: ignore[return-value]
+            return get_types_from_msg(_SEPARATOR.sub("=" * 80, text), name)
         if unread := _IDL_UNREAD.search(text):
             raise ValueError(f"{unread.group()} of IDL is not read")
         plain = _IDL_ENUM.sub(lambda enum: f"typedef uint{enum[1] or 32} {enum[2]}", _IDL_DIRECTIVE.sub("", text))

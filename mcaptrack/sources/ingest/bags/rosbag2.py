@@ -8,7 +8,7 @@ were recorded before definitions were kept in them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Final
@@ -285,7 +285,7 @@ class Databases(_Files):
             self._found[name] = kind[:3]
         return self._found[name]
 
-    def _payloads(self, name: str) -> Iterator[bytes]:
+    def _payloads(self, name: str) -> Generator[bytes]:
         """The messages of a type, in all files."""
         for database in self._databases:
             keys = [key for key, kind in database.rows("topics", ["id", "type"]) if _text(kind) == name]

@@ -8,7 +8,7 @@ limited by the size of the file, and signals interrupt every query. Nothing is w
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -64,7 +64,7 @@ class SqliteTables:
 
     def rows(
         self, table: str, columns: Sequence[str], where: tuple[str, object] | None = None
-    ) -> Iterator[tuple[Any, ...]]:
+    ) -> Generator[tuple[Any, ...]]:
         """These columns of all rows, or of those ``where`` a column has a value, in table order; text as bytes."""
         names = ", ".join(f'"{name}"' for name in columns)
         chosen = f' WHERE "{where[0]}" IS ?' if where else ""
