@@ -119,8 +119,8 @@ def encoding_for(opened: log.Log) -> Encoding:
         return PROTOBUF
     if holds_packed(opened):
         raise McaptrackError(
-            f"the messages of {opened.path} are compressed one by one; results in it would not be, and ROS tools could "
-            "not read them; leave `sidecar=False` out, or use `sidecar=True`"
+            f"messages of {opened.path} are compressed one by one; results in {opened.path.name} would not be, "
+            "and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
         )
     profile, library = log.header(opened)
     is_ros1 = profile == Profile.ROS1 and not library.startswith(log.LIBRARY)

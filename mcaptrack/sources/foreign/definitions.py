@@ -288,7 +288,7 @@ def _of_folders(folders: Sequence[Path]) -> list[LookUp]:
 
 
 def _distributions(encoding: str) -> list[str]:
-    """The distributions of ROS whose messages rosbags knows, as it names them, the newest first."""
+    """The names of distributions of ROS in rosbags, the newest first."""
     from rosbags.typesys import Stores
 
     version = "ros1_" if encoding == MessageEncoding.ROS1 else "ros2_"
@@ -303,7 +303,7 @@ def _vision(distribution: str) -> Types:
 
 
 def _of_distribution(distribution: str) -> list[LookUp]:
-    """What a distribution of ROS defines, of its own packages and of vision_msgs."""
+    """Functions that know the messages of a distribution of ROS: of its own packages, and of vision_msgs."""
     from rosbags.typesys import Stores, get_typestore
 
     return [get_typestore(Stores(distribution)).fielddefs.get, _vision(distribution).get]
@@ -454,7 +454,7 @@ def _exact_reader(types: Types, name: str, encoding: str) -> Callable[[bytes], b
 
 
 def _layout(types: Types, name: str) -> tuple[Any, ...]:
-    """What the bytes of a message are by a definition: equal for definitions that differ in names only."""
+    """The kinds of values in a message, in order: the same for definitions that differ in names only."""
     from rosbags.interfaces import Nodetype
 
     def flat(kind: Any) -> Any:

@@ -123,6 +123,9 @@ class _Files(RecordingReader):
         self.declared_counts: dict[Connection, int] = {}
         self._known_connections: dict[tuple[object, ...], Connection] = {}
         self._message_counts: dict[Connection, int] = {}
+        #: Definitions of types that the recording doesn't define, and types by what speaks against these.
+        self._found: dict[MessageType, tuple[str, str, bytes]] = {}
+        self._doubts: dict[str, list[str]] = {}
         try:
             for number in range(len(paths)):
                 self._open(number)
@@ -131,6 +134,9 @@ class _Files(RecordingReader):
             raise
         self._compare()
         self.connections = list(self.declared_counts)
+        for doubts, names in self._doubts.items():
+            if doubts:
+                warn(f"{whole} does not say what {list_names(names)} is; {doubts}", "definitions")
 
     def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
@@ -152,6 +158,23 @@ class _Files(RecordingReader):
             writer.add_attachment(METADATA, "application/yaml", self.bag.text)
 
     def _open(self, number: int) -> None:
+        raise NotImplementedError
+
+    def _defined(self, kind: MessageType, distribution: str = "", digest: str = "") -> tuple[str, str, bytes]:
+        """The schema record of a message type: of the definition that fits if the recording doesn't define it."""
+        if is_defined(kind):
+            return kind[:3]
+        if kind not in self._found:
+            with closing(self._payloads(kind)) as payloads:
+                found = defined(kind, payloads, distribution, digest)
+            self._found[kind] = found.kind[:3]
+            self._doubts.setdefault(found.doubts, []).append(kind.name)
+            if not found.doubts:
+                self.findings.notes.append(f"{self.whole} does not say what {kind.name} is; {found.origin}")
+        return self._found[kind]
+
+    def _payloads(self, kind: MessageType) -> Generator[bytes]:
+        """The messages of a type, in all files."""
         raise NotImplementedError
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
@@ -192,12 +215,7 @@ class Databases(_Files):
         self._databases: list[SqliteTables] = []
         self._topics: list[dict[int, Connection]] = []
         self._distro = bag.distro
-        self._found: dict[str, tuple[str, str, bytes]] = {}
-        self._doubts: dict[str, list[str]] = {}
         super().__init__(paths, whole, bag)
-        for doubts, names in self._doubts.items():
-            if doubts:
-                warn(f"{whole} does not say what {list_names(names)} is; {doubts}", "definitions")
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
@@ -226,7 +244,9 @@ class Databases(_Files):
             topic, kind, encoding, *more = map(_text, values)
             extra = dict(zip(optional, more, strict=True))
             digest = extra.get("type_description_hash", "")
-            schema, defined_digest = definitions.get(kind) or (self._schema(kind, encoding, digest), "")
+            own = definitions.get(kind)
+            bare = MessageType(kind, "", b"", encoding)
+            schema, defined_digest = own or (self._defined(bare, self._distro.lower(), digest), "")
             qos = extra.get("offered_qos_profiles", "")
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
             described[key] = Connection(topic, schema, encoding, metadata)
@@ -272,23 +292,9 @@ class Databases(_Files):
             if encoding in (SchemaEncoding.ROS2, SchemaEncoding.ROS2IDL) and (text or kind.endswith("/Empty"))
         }
 
-    def _schema(self, name: str, encoding: str, digest: str) -> tuple[str, str, bytes]:
-        """The schema record of a message type that the database does not define: of the definition that fits."""
-        if name not in self._found:
-            kind = MessageType(name, "", b"", encoding)
-            if not is_defined(kind):
-                with closing(self._payloads(name)) as payloads:
-                    kind, origin, doubts = defined(kind, payloads, self._distro.lower(), digest)
-                self._doubts.setdefault(doubts, []).append(name)
-                if not doubts:
-                    self.findings.notes.append(f"{self.whole} does not say what {name} is; {origin}")
-            self._found[name] = kind[:3]
-        return self._found[name]
-
-    def _payloads(self, name: str) -> Generator[bytes]:
-        """The messages of a type, in all files."""
+    def _payloads(self, kind: MessageType) -> Generator[bytes]:
         for database in self._databases:
-            keys = [key for key, kind in database.rows("topics", ["id", "type"]) if _text(kind) == name]
+            keys = [key for key, name in database.rows("topics", ["id", "type"]) if _text(name) == kind.name]
             for key in keys[:_TOPICS_TRIED]:
                 with closing(database.rows("messages", ["data"], where=("topic_id", key))) as those:
                     yield from (data for (data,) in those if isinstance(data, bytes))
@@ -315,7 +321,8 @@ class Logs(_Files):
         super().__init__(paths, whole, bag)
         profiles = {log.header(opened)[0] for opened in self.logs}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
-        self.as_log = self.logs[0] if len(self.logs) == 1 and not (bag.packed or holds_packed(self.logs[0])) else None
+        is_whole = not (bag.packed or any(definition for *_, definition in self._found.values()))
+        self.as_log = self.logs[0] if len(self.logs) == 1 and is_whole and not holds_packed(self.logs[0]) else None
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, and all attachments and metadata records of the files."""
@@ -324,19 +331,26 @@ class Logs(_Files):
             log.copy_attachments_and_metadata(opened, writer, without=[CLOCK] if has_clock else [])
 
     def _open(self, number: int) -> None:
-        path = self.paths[number]
-        opened = self.closing.enter_context(log.read(path, sidecar=False))
+        if not number:
+            self.logs += [self.closing.enter_context(log.read(path, sidecar=False)) for path in self.paths]
+        path, opened = self.paths[number], self.logs[number]
         if log.results_path(path).exists():
             warn(f"{log.results_path(path)} holds results of {path.name}; they are left out", "left-out")
-        self.logs.append(opened)
         connections: dict[int, Connection] = {}
         repeats: dict[object, int] = {}
         for channel in opened.index.channels.values():
             record = opened.index.schemas.get(channel.schema_id)
-            schema = (record.name, record.encoding, record.data) if record else ("", "", b"")
+            fields = (record.name, record.encoding, record.data) if record else ("", "", b"")
+            schema = self._defined(MessageType(*fields, channel.message_encoding))
             described = Connection(channel.topic, schema, channel.message_encoding, channel.metadata)
             connections[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(connections)
+
+    def _payloads(self, kind: MessageType) -> Generator[bytes]:
+        for opened in self.logs:
+            for topic, channel in opened.channels.items():
+                if (opened.record_name(channel), channel.message_encoding) == (kind.name, kind.encoding):
+                    yield from (message.payload for message in opened.messages(topic))
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         return ((self._channels[number][channel], message) for channel, message in log.stream(self.logs[number]))
