@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from copy import copy
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -49,49 +49,11 @@ _IDL_ENUM: Final = re.compile(r"(?:@bit_bound\s*\(\s*(\d+)\s*\)\s*)?(?:@\w+\s*)?
 _IDL_UNREAD: Final = re.compile(r"@optional|@mutable|@extensibility\(\s*MUTABLE\s*\)|\bunion\b")
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*$", re.MULTILINE)
 
-#: The messages of vision_msgs, which rosbags doesn't know: those of version 4 and what older versions have instead.
-_HYPOTHESIS: Final = "geometry_msgs/PoseWithCovariance pose"
-_VISION_4: Final[Mapping[str, str]] = {
-    "Point2D": "float64 x\nfloat64 y",
-    "Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
-    "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
-    "BoundingBox2DArray": "std_msgs/Header header\nvision_msgs/BoundingBox2D[] boxes",
-    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "BoundingBox3DArray": "std_msgs/Header header\nvision_msgs/BoundingBox3D[] boxes",
-    "ObjectHypothesis": "string class_id\nfloat64 score",
-    "ObjectHypothesisWithPose": f"vision_msgs/ObjectHypothesis hypothesis\n{_HYPOTHESIS}",
-    "Detection2D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-    "vision_msgs/BoundingBox2D bbox\nstring id",
-    "Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-    "vision_msgs/BoundingBox3D bbox\nstring id",
-    "Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
-    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
-}
-_VISION_3: Final = {**_VISION_4, "BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y"}
-_BEFORE_3: Final = {
-    name: _VISION_4[name].replace("string id", f"sensor_msgs/{source}")
-    for name, source in (("Detection2D", "Image source_img"), ("Detection3D", "PointCloud2 source_cloud"))
-}
-_VISION_2: Final = {
-    **_VISION_3,
-    "ObjectHypothesis": "string id\nfloat64 score",
-    "ObjectHypothesisWithPose": f"string id\nfloat64 score\n{_HYPOTHESIS}",
-    **{name: f"{text}\nbool is_tracking\nstring tracking_id" for name, text in _BEFORE_3.items()},
-}
-_VISION_1: Final = {
-    **_VISION_3,
-    "ObjectHypothesis": "int64 id\nfloat64 score",
-    "ObjectHypothesisWithPose": f"int64 id\nfloat64 score\n{_HYPOTHESIS}",
-    **_BEFORE_3,
-}
-#: The messages of vision_msgs by distribution; later ones have version 4.
-_VISION: Final = {
-    "ros1_noetic": _VISION_1,
-    "ros2_dashing": _VISION_2,
-    "ros2_eloquent": _VISION_2,
-    "ros2_foxy": _VISION_2,
-    "ros2_galactic": _VISION_3,
-}
+#: The messages of vision_msgs, which rosbags doesn't know: of a version those that differ from the next one.
+_VISION: Final = Path(__file__).with_name("vision_msgs")
+#: The version of vision_msgs of a distribution; later ones have version 4.
+_VISION_OF: Final = {"ros1_noetic": 1, "ros2_dashing": 2, "ros2_eloquent": 2, "ros2_foxy": 2, "ros2_galactic": 3}
+_NEWEST_VISION: Final = 4
 
 
 class MessageType(NamedTuple):
@@ -295,26 +257,27 @@ def _distributions(encoding: str) -> list[str]:
     return [store.value for store in reversed(Stores) if store.value.startswith(version)]
 
 
-@cache
-def _vision(distribution: str) -> Types:
-    version = _VISION.get(distribution, _VISION_4)
-    defined = (parsed(f"vision_msgs/msg/{name}", SchemaEncoding.ROS2, text.encode()) for name, text in version.items())
-    return {name: fields for types in defined for name, fields in types.items()}
-
-
 def _of_distribution(distribution: str) -> list[LookUp]:
     """Functions that know the messages of a distribution of ROS: of its own packages, and of vision_msgs."""
     from rosbags.typesys import Stores, get_typestore
 
-    return [get_typestore(Stores(distribution)).fielddefs.get, _vision(distribution).get]
+    versions = range(_VISION_OF.get(distribution, _NEWEST_VISION), _NEWEST_VISION + 1)
+    vision = _of_folders([_VISION / str(version) for version in versions])
+
+    def look_up_vision(name: str) -> Any:
+        known = (look_up(name) for look_up in vision if name.startswith("vision_msgs/"))
+        return next((fields for fields in known if fields is not None), None)
+
+    return [get_typestore(Stores(distribution)).fielddefs.get, look_up_vision]
 
 
 def typestore_of(distribution: str) -> Any:
-    """A store of rosbags with the types of a distribution of ROS, such as ros2_humble, and of vision_msgs."""
+    """A store of rosbags with the types of a distribution of ROS, such as ros2_humble, and with vision_msgs."""
     from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores(distribution))
-    store.register(_vision(distribution))
+    store, look_ups = get_typestore(Stores(distribution)), _of_distribution(distribution)
+    for name in ("vision_msgs/msg/Detection2DArray", "vision_msgs/msg/Detection3DArray"):
+        store.register(_whole(name, look_ups))
     return store
 
 
