@@ -300,11 +300,68 @@ def test_the_option_is_one_of_every_command_that_reads_messages(tmp_path):
         outcome = call(*line, bare, "--topic", "/t", "--definitions", folder, "-o", tmp_path / f"{line[0]}.mcap")
         assert outcome.code == 0, outcome
         assert "which fits its messages" in outcome.err
-    for wrong, why in ((tmp_path / "none", "is no folder"), (tmp_path / "empty", "has no .msg or .idl files")):
-        (tmp_path / "empty").mkdir(exist_ok=True)
+    (tmp_path / "empty").mkdir()
+    for wrong, why in (
+        (tmp_path / "none", ": no folder, and not one of "),
+        (tmp_path / "empty", ", which has no .msg"),
+    ):
         outcome = call("track", bare, "--definitions", wrong)
         assert outcome.code == 1
-        assert f"--definitions names {wrong}, which {why}" in outcome.err
+        assert f"--definitions names {wrong}{why}" in outcome.err
+
+
+WRONG = {
+    "a type that nothing defines": (
+        b"std_msgs/Header header\nlost_msgs/Thing thing\n",
+        "lost_msgs/msg/Thing is not defined",
+    ),
+    "itself": (b"vision_msgs/Detection2DArray again\n", "maximum recursion depth exceeded"),
+    "no definition": (b"\xff\xfe\0", "can't be read as a definition"),
+    "too long": (b"uint8 x\n" * 200_000, "at most 1048576 are read"),
+    "a union": (
+        b"module a { module msg { union U switch (long) { case 1: long x; }; }; };",
+        "union of IDL is not read",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_definition_of_the_user_that_is_none_is_refused(tmp_path, name):
+    text, why = WRONG[name]
+    (tmp_path / "defs").mkdir()
+    (tmp_path / "defs" / "Detection2DArray.msg").write_bytes(text)
+    _, payloads = message("vision_msgs/Detection2DArray")
+    bare = write(tmp_path / "bare.mcap", "vision_msgs/msg/Detection2DArray", "ros2msg", "", payloads)
+    outcome = call("track", bare, "--topic", "/t", "--definitions", tmp_path / "defs")
+    assert (outcome.code, outcome.err.count("\n")) == (1, 1), outcome
+    assert why in outcome.err
+
+
+def test_a_distribution_is_named():
+    """Messages without any boxes fit all, and are of the one that the user says."""
+    kind = MessageType("visualization_msgs/msg/MarkerArray", "", b"", "cdr")
+    with definitions_of("Foxy"):
+        found = defined(kind, [b"\0\1\0\0" + bytes(4)] * 3)
+    assert (found.origin, found.doubts) == ("its definition is that of ROS 2 Foxy, which fits its messages", "")
+    _, payloads = message("visualization_msgs/MarkerArray", Stores.ROS2_HUMBLE)
+    with definitions_of("foxy"):
+        found = defined(kind, payloads)
+    assert found.doubts.startswith("its definition is not known, and that of ROS 2 Foxy doesn't fit its messages")
+
+
+def test_a_log_without_definitions_has_them_after_it_is_ingested(tmp_path):
+    """All else stays as it was; a log that has its definitions is copied chunk by chunk."""
+    types, payloads = message("vision_msgs/Detection2DArray", Stores.ROS2_FOXY)
+    bare = write(tmp_path / "bare.mcap", "vision_msgs/msg/Detection2DArray", "ros2msg", "", payloads)
+    with collected() as warnings:
+        mcaptrack.ingest(bare, tmp_path / "a.mcap")
+    with collected() as later, log.read(tmp_path / "a.mcap") as opened:
+        assert [found.payload for found in opened.messages("/t")] == payloads
+        assert len(foreign.named_detections(opened, "/t").frames) == len(payloads)
+        (schema,) = opened.index.schemas.values()
+    assert warnings + [each for each in later if each.code == "definitions"] == []
+    assert b"is_tracking" in schema.data
+    assert types
 
 
 def test_messages_that_are_compressed_one_by_one_are_read_as_others_are(tmp_path):

@@ -50,7 +50,8 @@ Definitions = Annotated[
         FILES,
         metavar="FOLDER",
         shown=False,
-        help="Folder with definitions (.msg or .idl, as in ROS packages) of messages that the log does not define.",
+        help="Folder with definitions (.msg or .idl, as in ROS packages) of messages that the log does not define; or "
+        "the distribution of ROS that they are from, such as humble.",
     ),
 ]
 Views = Annotated[

@@ -22,6 +22,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import read_beginning
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.schema.encodings import CDR, ros_definition, schema_of_ros
 from mcaptrack.schema.names import plain_name, ros_type
@@ -56,6 +57,10 @@ _VISION_OF: Final = {"ros1_noetic": 1, "ros2_dashing": 2, "ros2_eloquent": 2, "r
 _NEWEST_VISION: Final = 4
 
 
+#: Encodings of messages of distributions of ROS, by how rosbags calls these.
+_ENCODING: Final = {"ros1_": MessageEncoding.ROS1, "ros2_": MessageEncoding.CDR}
+
+
 class MessageType(NamedTuple):
     """The message type of a channel: its schema record and its message encoding."""
 
@@ -66,35 +71,59 @@ class MessageType(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A definition of a type with all types of its fields, and the distributions of ROS, or files, that have it."""
+    """A definition of a type with all types of its fields, and the distributions of ROS, or folders, that have it.
+
+    ``layout`` are the kinds of values in a message; ``fits`` says whether a message decodes to its last byte.
+    """
 
     types: Types
     origins: list[str]
+    layout: tuple[Any, ...]
+    fits: Callable[[bytes], bool]
 
 
 # The definitions of a folder that the user names.
 
 
-_FOLDERS: Final[ContextVar[tuple[Path, ...]]] = ContextVar("definitions", default=())
+class _Chosen(NamedTuple):
+    """The folders of definitions that the user names, and the distribution of ROS."""
+
+    folders: tuple[Path, ...] = ()
+    distribution: str = ""
+
+
+_NONE: Final = _Chosen()
+_CHOSEN: Final[ContextVar[_Chosen]] = ContextVar("definitions", default=_NONE)
 
 
 @contextmanager
-def definitions_of(folders: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None) -> Iterator[None]:
+def definitions_of(names: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None) -> Iterator[None]:
     """In this block, types that recordings don't define are looked up in these folders of .msg and .idl files first.
 
-    Raises McaptrackError for a folder without any.
+    A name may also be that of a distribution of ROS, such as humble: then only its definitions are tried. Raises
+    McaptrackError for what is neither.
     """
-    several = (folders,) if isinstance(folders, str | os.PathLike) else folders or ()
-    paths = tuple(Path(os.path.abspath(os.fspath(folder))) for folder in several)
-    for path in paths:
+    chosen = _NONE
+    for name in (names,) if isinstance(names, str | os.PathLike) else names or ():
+        path = Path(os.path.abspath(name))
+        distributions = [other[5:] for encoding in _ENCODING.values() for other in _distributions(encoding)]
+        if str(name).lower() in distributions and not path.exists():
+            chosen = chosen._replace(distribution=str(name).lower())
+        elif not path.is_dir():
+            raise McaptrackError(f"`definitions=` names {name}: no folder, and not one of {', '.join(distributions)}")
+        else:
+            chosen = chosen._replace(folders=(*chosen.folders, path))
+    if chosen != _NONE:
+        for cached in (_files_in, _parsed_file, _typestore):
+            cached.cache_clear()
+    for path in chosen.folders:
         if not _files_in(path):
-            there = "is no folder" if not path.is_dir() else "has no .msg or .idl files, as pkg/msg/Name.msg"
-            raise McaptrackError(f"`definitions=` names {path}, which {there}")
-    token = _FOLDERS.set(paths)
+            raise McaptrackError(f"`definitions=` names {path}, which has no .msg or .idl files, as pkg/msg/Name.msg")
+    token = _CHOSEN.set(chosen)
     try:
         yield
     finally:
-        _FOLDERS.reset(token)
+        _CHOSEN.reset(token)
 
 
 @lru_cache(maxsize=8)
@@ -103,7 +132,8 @@ def _files_in(folder: Path) -> dict[str, Path]:
 
     Packages have their files in PKG/msg/, as in a workspace or in what ROS installs.
     """
-    found = islice((path for path in folder.rglob("*") if path.suffix in (".msg", ".idl")), _MAX_FILES)
+    of_kind = (path for path in folder.rglob("*") if path.suffix in (".msg", ".idl") and path.is_file())
+    found = islice(of_kind, _MAX_FILES)
     files: dict[str, Path] = {}
     for path in sorted(found, key=lambda path: (path.suffix == ".idl", path)):  # rosidl makes each .idl of a .msg
         package = path.parent.parent.name if path.parent.name == "msg" else ""
@@ -120,11 +150,11 @@ def _look_up_file(folder: Path, name: str) -> Any:
 @lru_cache(maxsize=1024)
 def _parsed_file(path: Path, name: str) -> Types:
     try:
-        data = path.read_bytes()
+        data = read_beginning(path, _MAX_DEFINITION + 1)
         encoding = SchemaEncoding.ROS2IDL if path.suffix == ".idl" else SchemaEncoding.ROS2
         return parsed(name, encoding, data)
     except (OSError, ValueError) as error:
-        raise McaptrackError(f"{path} can't be read: {error}") from None
+        raise McaptrackError(f"{path} can't be read as a definition: {error}") from None
 
 
 # Parse definitions.
@@ -135,7 +165,7 @@ def parsed(name: str, schema_encoding: str, data: bytes) -> Types:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     if len(data) > _MAX_DEFINITION:
-        raise ValueError(f"it has {len(data)} characters")
+        raise ValueError(f"it has {len(data)} bytes; at most {_MAX_DEFINITION} are read")
     text = data.decode("utf-8", "replace").replace("\r\n", "\n")
     if not text.strip():
         return {}
@@ -224,7 +254,7 @@ def ros_types(kind: MessageType) -> tuple[Any, str]:
     if not name:
         raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
     # Each reader sets the longest sequence of its own store; what was compiled for the type is shared.
-    return copy(_typestore(name, kind, _FOLDERS.get())), name
+    return copy(_typestore(name, kind, _CHOSEN.get().folders)), name
 
 
 @lru_cache(maxsize=64)
@@ -309,12 +339,12 @@ def defined(kind: MessageType, payloads: Iterable[bytes], distribution: str = ""
     """
     name = ros_type(kind.name)
     candidates = _candidates(name, kind, distribution, digest) if name else []
-    fitting, fits, count = _fitting(candidates, name, kind.encoding, payloads)
+    fitting, fits, count = _fitting(candidates, payloads)
     if not fitting:
         tried = f", and {' and '.join(map(_origin, candidates))} doesn't fit its messages" if candidates else ""
         return Defined(kind, "", f"its definition is not known{tried} ({_ADVICE})")
     first = fitting[0]
-    others = [other for other in fitting[1:] if fits and _layout(other.types, name) != _layout(first.types, name)]
+    others = [other for other in fitting[1:] if fits and other.layout != first.layout]
     also = [f"its messages also fit {'; '.join(map(_origin, others))}"] if others else []
     also += [f"it fits {fits} of {count} messages"] if fits < count else []
     version = 1 if kind.encoding == MessageEncoding.ROS1 else 2
@@ -326,22 +356,28 @@ def defined(kind: MessageType, payloads: Iterable[bytes], distribution: str = ""
 
 
 def _candidates(name: str, kind: MessageType, distribution: str, digest: str) -> list[_Candidate]:
-    """The definitions of a type, each once: of the folders that the user names, or else of the distributions of ROS."""
-    folders = _FOLDERS.get()
+    """The definitions of a type, each once: of the folders that the user names, or else of the distributions of ROS.
+
+    Raises McaptrackError if a folder defines the type, but not the types of its fields.
+    """
+    folders, chosen = _CHOSEN.get()
     named = [folder for folder in folders if _look_up_file(folder, name) is not None]
-    order = sorted(_distributions(kind.encoding), key=lambda other: other.removeprefix("ros2_") != distribution)
+    order = sorted(_distributions(kind.encoding), key=lambda other: other[5:] != distribution)
+    order = [other for other in order if other[5:] == chosen] or order
     candidates: list[_Candidate] = []
     for other in order:
         try:
             types = _whole(name, [*_of_folders(folders), *_of_distribution(other), _look_up_ours])
-        except ValueError:
-            continue
-        same = next((candidate for candidate in candidates if candidate.types == types), None)
-        if same is None:
-            if named or not digest.startswith("RIHS01_") or _store_of(types).hash_rihs01(name) == digest:
-                candidates.append(_Candidate(types, [*map(str, named)] or [other]))
-        elif not named:
-            same.origins.append(other)
+            same = next((candidate for candidate in candidates if candidate.types == types), None)
+            if same is not None:
+                same.origins.append(other)
+            elif named or not digest.startswith("RIHS01_") or _store_of(types).hash_rihs01(name) == digest:
+                fits = _exact_reader(types, name, kind.encoding)
+                candidates.append(_Candidate(types, [*map(str, named)] or [other], _layout(types, name), fits))
+        except (ValueError, LookupError, RecursionError) as error:
+            if named and other == order[-1] and not candidates:
+                why = f"{named[0]} defines {name}, but its messages can't be read by it: {error}"
+                raise McaptrackError(" ".join(why.split())[:300]) from None
     return candidates
 
 
@@ -362,22 +398,15 @@ def _look_up_ours(name: str) -> Any:
 def _origin(candidate: _Candidate) -> str:
     """Where a definition is from, in words: "that of ROS 2 Foxy to Galactic"."""
     names = candidate.origins
-    if not names[0].startswith(("ros1_", "ros2_")):
-        return f"that in {', '.join(names)}"
+    if not names[0].startswith(tuple(_ENCODING)):
+        return f"that in {names[0]}"
     order = sorted(names, key=_distributions(_ENCODING[names[0][:5]]).index)
     ends = [order[-1], *order[:1]] if len(order) > 1 else order
     return f"that of ROS {names[0][3]} {' to '.join(name[5:].capitalize() for name in ends)}"
 
 
-_ENCODING: Final = {"ros1_": MessageEncoding.ROS1, "ros2_": MessageEncoding.CDR}
-
-
-def _fitting(
-    candidates: Sequence[_Candidate], name: str, encoding: str, payloads: Iterable[bytes]
-) -> tuple[list[_Candidate], int, int]:
+def _fitting(candidates: Sequence[_Candidate], payloads: Iterable[bytes]) -> tuple[list[_Candidate], int, int]:
     """The candidates with which most messages decode to their last byte, how many these are, and of how many."""
-    readers = [_exact_reader(candidate.types, name, encoding) for candidate in candidates]
-    layouts = [_layout(candidate.types, name) for candidate in candidates]
     scores, count = [0] * len(candidates), 0
     for payload in islice(payloads, _TRIED if candidates else 0):
         try:
@@ -385,14 +414,13 @@ def _fitting(
         except ValueError:
             continue  # a message that can't be decompressed says nothing
         count += 1
-        scores = [score + fits(message) for score, fits in zip(scores, readers, strict=True)]
-        whole = {layout for layout, score in zip(layouts, scores, strict=True) if score == count}
+        scores = [score + each.fits(message) for score, each in zip(scores, candidates, strict=True)]
+        whole = {each.layout for score, each in zip(scores, candidates, strict=True) if score == count}
         if count >= _ENOUGH and (len(whole) == 1 or not any(scores)):
             break
     best = max(scores, default=0)
-    if 2 * best < count:
-        return [], 0, count
-    return [candidate for candidate, score in zip(candidates, scores, strict=True) if score == best], best, count
+    fitting = [each for score, each in zip(scores, candidates, strict=True) if score == best and 2 * best >= count]
+    return fitting, best, count
 
 
 def _exact_reader(types: Types, name: str, encoding: str) -> Callable[[bytes], bool]:

@@ -145,7 +145,7 @@ class _Files(RecordingReader):
             left = decompression.limit_of(path.stat().st_size)
             for connection, message in self._messages(number):
                 payload = message.payload
-                if self.bag.packed or (connection.encoding == MessageEncoding.CDR and is_packed(payload)):
+                if (self.bag.packed or connection.encoding == MessageEncoding.CDR) and is_packed(payload):
                     payload = _unpack_message(payload, path, message.t_ns, left)
                     left -= len(payload)
                     yield connection, message._replace(payload=payload)
@@ -321,8 +321,8 @@ class Logs(_Files):
         super().__init__(paths, whole, bag)
         profiles = {log.header(opened)[0] for opened in self.logs}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
-        is_whole = not (bag.packed or any(definition for *_, definition in self._found.values()))
-        self.as_log = self.logs[0] if len(self.logs) == 1 and is_whole and not holds_packed(self.logs[0]) else None
+        is_whole = len(self.logs) == 1 and not any(definition for *_, definition in self._found.values())
+        self.as_log = self.logs[0] if is_whole and not holds_packed(self.logs[0]) else None
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, and all attachments and metadata records of the files."""

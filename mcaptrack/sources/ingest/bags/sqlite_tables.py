@@ -176,7 +176,8 @@ class SqliteTables:
             why = "it can't be understood" if isinstance(error, UnicodeDecodeError) else str(error)
             if self._steps > self._max_steps:
                 why = "its tables go on for longer than the file can"
-            raise McaptrackError(f"{self.path} is damaged: {why}") from None
+            saved = "; `sqlite3 FILE .recover` may save a part of it" if "malformed" in why else ""
+            raise McaptrackError(f"{self.path} is damaged: {why}{saved}") from None
 
 
 def _text(value: Any) -> str:
