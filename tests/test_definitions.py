@@ -251,7 +251,9 @@ def test_of_definitions_that_fit_alike_that_of_the_distribution_is_taken():
     newest, foxy = defined(kind, [empty] * 3), defined(kind, [empty] * 3, "foxy")
     assert "texture_resource" in newest.kind.schema.decode()
     assert "texture_resource" not in foxy.kind.schema.decode()
-    assert "a guess: its messages also fit that of ROS 2 " in foxy.doubts
+    assert foxy.doubts.startswith(
+        "its definition is a guess, that of ROS 2 Foxy to Galactic: its messages also fit that of "
+    )
     types, payloads = message("visualization_msgs/MarkerArray", Stores.ROS2_HUMBLE)
     sure = defined(kind, [empty] * 30 + payloads, "foxy")
     assert sure.doubts == ""
@@ -342,7 +344,7 @@ def test_a_distribution_is_named():
     kind = MessageType("visualization_msgs/msg/MarkerArray", "", b"", "cdr")
     with definitions_of("Foxy"):
         found = defined(kind, [b"\0\1\0\0" + bytes(4)] * 3)
-    assert (found.origin, found.doubts) == ("its definition is that of ROS 2 Foxy, which fits its messages", "")
+    assert (found.origin, found.doubts) == ("that of ROS 2 Foxy, which fits its messages", "")
     _, payloads = message("visualization_msgs/MarkerArray", Stores.ROS2_HUMBLE)
     with definitions_of("foxy"):
         found = defined(kind, payloads)
@@ -358,9 +360,11 @@ def test_a_log_without_definitions_has_them_after_it_is_ingested(tmp_path):
     with collected() as later, log.read(tmp_path / "a.mcap") as opened:
         assert [found.payload for found in opened.messages("/t")] == payloads
         assert len(foreign.named_detections(opened, "/t").frames) == len(payloads)
-        (schema,) = opened.index.schemas.values()
+        (schema,), (channel,) = opened.index.schemas.values(), opened.channels.values()
     assert warnings + [each for each in later if each.code == "definitions"] == []
     assert b"is_tracking" in schema.data
+    said = "that of ROS 2 Dashing to Foxy, which fits its messages"
+    assert channel.metadata == {"mcaptrack.definition": said}
     assert types
 
 

@@ -40,6 +40,8 @@ _TRIED: Final = 2000
 _ENOUGH: Final = 20
 #: CDR messages may be filled up to a multiple of this.
 _FILL: Final = 4
+#: Where metadata of a channel say which definition was taken for it.
+_METADATA: Final = "mcaptrack.definition"
 _ADVICE: Final = "`definitions=` names a folder with .msg or .idl files"
 #: Definitions in IDL: how they begin, the heads of files, directives of a preprocessor, and enumerations.
 _IDL: Final = re.compile(r"(?:\s+|//.*|/\*(?s:.*?)\*/|#.*)*(?:=+\s*IDL:|(?:module|struct|typedef|enum|const)\b|@)")
@@ -330,6 +332,11 @@ class Defined(NamedTuple):
     origin: str
     doubts: str
 
+    @property
+    def metadata(self) -> dict[str, str]:
+        """The metadata of a channel with this definition."""
+        return {_METADATA: self.doubts or self.origin} if self.origin else {}
+
 
 def defined(kind: MessageType, payloads: Iterable[bytes], distribution: str = "", digest: str = "") -> Defined:
     """A message type with the definition that fits its messages.
@@ -350,8 +357,8 @@ def defined(kind: MessageType, payloads: Iterable[bytes], distribution: str = ""
     version = 1 if kind.encoding == MessageEncoding.ROS1 else 2
     text = _store_of(first.types).generate_msgdef(name, ros_version=version)[0]
     encoding = SchemaEncoding.ROS1 if version == 1 else SchemaEncoding.ROS2
-    origin = f"its definition is {_origin(first)}{', which fits its messages' if count and not also else ''}"
-    doubts = f"{origin} and a guess: {', and '.join(also)} ({_ADVICE})" if also else ""
+    origin = f"{_origin(first)}{', which fits its messages' if count and not also else ''}"
+    doubts = f"its definition is a guess, {origin}: {', and '.join(also)} ({_ADVICE})" if also else ""
     return Defined(MessageType(kind.name, encoding, text.encode(), kind.encoding), origin, doubts)
 
 

@@ -50,7 +50,10 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
     if topic not in kinds:
         payloads = (message.payload for message in opened.messages(topic))
         kinds[topic], origin, doubts = defined(kind, payloads)
-        warn(f"{opened.path}: {topic} does not say what {kind.name} is; {doubts or origin}", "definitions")
+        warn(
+            f"{opened.path}: {topic} does not say what {kind.name} is; {doubts or f'its definition is {origin}'}",
+            "definitions",
+        )
     return kinds[topic]
 
 

@@ -20,7 +20,7 @@ from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
-from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defined, is_packed
+from mcaptrack.sources.foreign.definitions import Defined, MessageType, defined, is_defined, is_packed
 from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
@@ -123,9 +123,8 @@ class _Files(RecordingReader):
         self.declared_counts: dict[Connection, int] = {}
         self._known_connections: dict[tuple[object, ...], Connection] = {}
         self._message_counts: dict[Connection, int] = {}
-        #: Definitions of types that the recording doesn't define, and types by what speaks against these.
-        self._found: dict[MessageType, tuple[str, str, bytes]] = {}
-        self._doubts: dict[str, list[str]] = {}
+        #: Definitions of types that the recording doesn't define.
+        self._found: dict[MessageType, Defined] = {}
         try:
             for number in range(len(paths)):
                 self._open(number)
@@ -134,9 +133,9 @@ class _Files(RecordingReader):
             raise
         self._compare()
         self.connections = list(self.declared_counts)
-        for doubts, names in self._doubts.items():
-            if doubts:
-                warn(f"{whole} does not say what {list_names(names)} is; {doubts}", "definitions")
+        for doubts in dict.fromkeys(found.doubts for found in self._found.values() if found.doubts):
+            names = [kind.name for kind, found in self._found.items() if found.doubts == doubts]
+            warn(f"{whole} does not say what {list_names(names)} is; {doubts}", "definitions")
 
     def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
@@ -160,17 +159,16 @@ class _Files(RecordingReader):
     def _open(self, number: int) -> None:
         raise NotImplementedError
 
-    def _defined(self, kind: MessageType, distribution: str = "", digest: str = "") -> tuple[str, str, bytes]:
-        """The schema record of a message type: of the definition that fits if the recording doesn't define it."""
+    def _defined(self, kind: MessageType, distribution: str = "", digest: str = "") -> Defined:
+        """A message type with the definition that fits if the recording doesn't define it."""
         if is_defined(kind):
-            return kind[:3]
+            return Defined(kind, "", "")
         if kind not in self._found:
             with closing(self._payloads(kind)) as payloads:
-                found = defined(kind, payloads, distribution, digest)
-            self._found[kind] = found.kind[:3]
-            self._doubts.setdefault(found.doubts, []).append(kind.name)
-            if not found.doubts:
-                self.findings.notes.append(f"{self.whole} does not say what {kind.name} is; {found.origin}")
+                self._found[kind] = defined(kind, payloads, distribution, digest)
+            if not self._found[kind].doubts:
+                text = f"{self.whole} does not say what {kind.name} is; its definition is {self._found[kind].origin}"
+                self.findings.notes.append(text)
         return self._found[kind]
 
     def _payloads(self, kind: MessageType) -> Generator[bytes]:
@@ -244,12 +242,12 @@ class Databases(_Files):
             topic, kind, encoding, *more = map(_text, values)
             extra = dict(zip(optional, more, strict=True))
             digest = extra.get("type_description_hash", "")
-            own = definitions.get(kind)
-            bare = MessageType(kind, "", b"", encoding)
-            schema, defined_digest = own or (self._defined(bare, self._distro.lower(), digest), "")
+            own, own_digest = definitions.get(kind, (("", "", b""), ""))
+            of_type = MessageType(kind, *own[1:], encoding)
+            found = Defined(of_type, "", "") if own[0] else self._defined(of_type, self._distro.lower(), digest)
             qos = extra.get("offered_qos_profiles", "")
-            metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
-            described[key] = Connection(topic, schema, encoding, metadata)
+            metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or own_digest, **found.metadata}
+            described[key] = Connection(topic, found.kind[:3], encoding, metadata)
         counts = self._count(database, described)
         repeats: dict[object, int] = {}
         self._topics.append(
@@ -321,7 +319,7 @@ class Logs(_Files):
         super().__init__(paths, whole, bag)
         profiles = {log.header(opened)[0] for opened in self.logs}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
-        is_whole = len(self.logs) == 1 and not any(definition for *_, definition in self._found.values())
+        is_whole = len(self.logs) == 1 and not any(found.origin for found in self._found.values())
         self.as_log = self.logs[0] if is_whole and not holds_packed(self.logs[0]) else None
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
@@ -341,8 +339,9 @@ class Logs(_Files):
         for channel in opened.index.channels.values():
             record = opened.index.schemas.get(channel.schema_id)
             fields = (record.name, record.encoding, record.data) if record else ("", "", b"")
-            schema = self._defined(MessageType(*fields, channel.message_encoding))
-            described = Connection(channel.topic, schema, channel.message_encoding, channel.metadata)
+            found = self._defined(MessageType(*fields, channel.message_encoding))
+            metadata = channel.metadata | found.metadata
+            described = Connection(channel.topic, found.kind[:3], channel.message_encoding, metadata)
             connections[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(connections)
 
