@@ -25,7 +25,7 @@ from mcaptrack.sources.foreign.definitions import MessageType, defined, definiti
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from tests.bags import database
 from tests.commands import call
-from tests.undefined import T0, message, names_no_definitions, package
+from tests.undefined import T0, message, names_no_definitions, package, store_of
 
 #: How one type is written: ROS 2, ROS 1, IDL, DDS, Python, and with what writers put before it.
 SPELLINGS = {
@@ -397,3 +397,32 @@ def test_a_type_with_a_name_in_a_database_in_other_letters_is_the_same(tmp_path)
         assert len(foreign.named_detections(opened, "/t").frames) == len(payloads)
     assert sqlite3.connect(tmp_path / "a.db3").execute("SELECT count(*) FROM messages").fetchone() == (len(payloads),)
     assert types
+
+
+@pytest.mark.parametrize(
+    ("number", "name"), [(3, "PL_CDR"), (7, "XCDR2"), (9, "delimited XCDR2"), (11, "PL_CDR of XCDR2")]
+)
+def test_other_encodings_of_dds_are_named(tmp_path, number, name):
+    types, payloads = message("vision_msgs/Detection2DArray")
+    other = bytes([0, number]) + payloads[0][2:]
+    path = write(
+        tmp_path / "a.mcap", "vision_msgs/msg/Detection2DArray", "ros2msg", names_no_definitions(types), [other]
+    )
+    with (
+        log.read(path) as opened,
+        pytest.raises(McaptrackError, match=f"its bytes are {name}; CDR of version 1 is read"),
+    ):
+        foreign.named_detections(opened, "/t")
+
+
+def test_messages_of_either_byte_order_are_read(tmp_path):
+    """Also where the definition has to be found by them."""
+    types, _ = message("vision_msgs/Detection2DArray")
+    store = store_of(Stores.ROS2_HUMBLE)
+    name = "vision_msgs/msg/Detection2DArray"
+    first = store.deserialize_cdr(message("vision_msgs/Detection2DArray")[1][0], name)
+    both = [bytes(store.serialize_cdr(first, name, little_endian=little)) for little in (True, False)]
+    assert both[0] != both[1]
+    for text in ("", names_no_definitions(types)):
+        one, other = rows(write(tmp_path / "a.mcap", name, "ros2msg", text, both))
+        assert one == other

@@ -31,6 +31,12 @@ Unpack = Callable[[bytes], Any]
 #: The supported message encodings.
 ENCODINGS: Final = (MessageEncoding.Protobuf, MessageEncoding.JSON, MessageEncoding.ROS1, MessageEncoding.CDR)
 _MAX_DESCRIPTOR: Final = 4 * 2**20
+#: Encodings of DDS that aren't read, by how messages begin.
+_OTHER_CDR: Final = {
+    bytes([0, number + little]): name
+    for number, name in ((2, "PL_CDR"), (6, "XCDR2"), (8, "delimited XCDR2"), (10, "PL_CDR of XCDR2"))
+    for little in (0, 1)
+}
 
 
 def decoder_with_errors(
@@ -105,6 +111,8 @@ def _ros_unpacker(kind: MessageType) -> Unpack:
 
     def unpack(payload: bytes) -> Any:
         payload = unpacked(payload) if is_cdr else payload
+        if is_cdr and payload[:2] in _OTHER_CDR:
+            raise ValueError(f"its bytes are {_OTHER_CDR[payload[:2]]}; CDR of version 1 is read")
         # A sequence can't have more members than the message has bytes; one of an empty type could be endless.
         store.max_sequence_length = max(len(payload), 1)
         return read(payload, name)
