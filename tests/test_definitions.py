@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
 import sqlite3
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
-from mcaptrack import log
+from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema.names import plain_name
@@ -426,3 +428,28 @@ def test_messages_of_either_byte_order_are_read(tmp_path):
     for text in ("", names_no_definitions(types)):
         one, other = rows(write(tmp_path / "a.mcap", name, "ros2msg", text, both))
         assert one == other
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS.values(), ids=SPELLINGS)
+def test_names_are_the_same_in_every_encoding(tmp_path, spelling):
+    """JSON of bridges, ROS 1, and protobuf: also where its name begins with a dot, as descriptors write it."""
+    asked = ASKS["compressed pictures"][1]
+    head = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "eye"}
+    data = json.dumps({"header": head, "format": "png", "data": [1, 2]}).encode()
+    name = spelling.format("sensor_msgs", "CompressedImage")
+    assert answers(write(tmp_path / "a.mcap", name, "jsonschema", "{}", [data], "json"), asked)[1] == ["png"]
+    text = "std_msgs/Header header\nstring format\nuint8[] data\n" + "=" * 80 + "\nMSG: std_msgs/Header\n"
+    text += "uint32 seq\ntime stamp\nstring frame_id\n"
+    ros1 = struct.pack("<4I3sI3sI2s", 7, 1, 2, 3, b"eye", 3, b"png", 2, b"ab")
+    assert answers(write(tmp_path / "b.mcap", name, "ros1msg", text, [ros1], "ros1"), asked)[1] == ["png"]
+    proto = foxglove.message_class(foxglove.IMAGE)(format="png", data=b"ab").SerializeToString()
+    for of_foxglove in (foxglove.IMAGE, f".{foxglove.IMAGE}", spelling.format("foxglove_msgs", "CompressedImage")):
+        path = tmp_path / "c.mcap"
+        with path.open("wb") as stream:
+            writer = McapWriter(stream)
+            writer.start("", "robot")
+            schema = writer.register_schema(of_foxglove, "protobuf", foxglove.schema_record(foxglove.IMAGE)[2])
+            writer.add_message(writer.register_channel("/t", "protobuf", schema), T0, proto, T0)
+            writer.finish()
+        with log.read(path) as opened:
+            assert asked(opened) == ["png"]
