@@ -28,6 +28,7 @@ Code = Literal[
     "classes",
     "clock",
     "clock-jump",
+    "definitions",
     "device",
     "ellipses",
     "estimated-ground-plane",

@@ -25,7 +25,7 @@ from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.ingest.bags import decompression, rosbag2
-from mcaptrack.sources.ingest.bags.metadata_yaml import is_packed, names_file
+from mcaptrack.sources.ingest.bags.metadata_yaml import names_file
 from mcaptrack.sources.ingest.bags.recording import ReadingNotes
 from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
@@ -261,9 +261,20 @@ class TestRosbag2:
         extra = [("qos",), ("qos",), ("qos",), ("qos", "")][version - 1] if version >= 2 else ()
         types = [STRING1, "sensor_msgs/msg/Image", "robot_msgs/msg/Secret", STRING1]
         topics = [(n + 1, name, kind, "cdr", *extra) for n, (name, kind) in enumerate(zip("abca", types, strict=True))]
-        messages = [(1 + number % 4, T0 + number, b"\0\1\0\0" + bytes([number])) for number in range(9)]
+        word, image, head, time = (
+            ROS2.types[kind] for kind in (*types[:2], "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+        )
+        picture = image(head(time(1, 2), "eye"), 0, 0, "", 0, 0, np.empty(0, np.uint8))
+        payloads = [
+            bytes(ROS2.serialize_cdr(word("hello"), STRING1)),
+            bytes(ROS2.serialize_cdr(picture, types[1])),
+            b"\0\1\0\0?",
+            bytes(ROS2.serialize_cdr(word("there"), STRING1)),
+        ]
+        messages = [(1 + number % 4, T0 + number, payloads[number % 4]) for number in range(9)]
         database(tmp_path / "a.db3", version, messages, topics)
-        report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
+        with collected() as warnings:
+            report = make(tmp_path / "a.db3", tmp_path / "a.mcap")
         assert recorded(tmp_path / "a.mcap") == sorted(("abca"[key - 1], t, t, data) for key, t, data in messages)
         found = channels(tmp_path / "a.mcap")
         wanted = [("a", STRING1, 3), ("b", types[1], 2), ("c", types[2], 2), ("a", STRING1, 2)]
@@ -274,8 +285,10 @@ class TestRosbag2:
         assert found[0][3]["offered_qos_profiles"] == ("qos" if version >= 2 else "")
         words = " ".join(report.notes)
         assert "does not say what sensor_msgs/msg/Image is; its definition is that of ROS 2" in words
-        assert ("Humble" in words) == (version >= 3)
-        assert "robot_msgs/msg/Secret is; its definition is not known" in words
+        assert "its definition is that of ROS 2 Dashing to Lyrical, which fits its messages" in words
+        (warning,) = warnings
+        assert "robot_msgs/msg/Secret is; its definition is not known" in warning.message
+        assert warning.code == "definitions"
 
     def test_definitions_are_kept_as_they_are(self, tmp_path):
         idl = "=" * 80 + "\nIDL: robot_msgs/msg/Secret\nmodule robot_msgs {};"
@@ -580,10 +593,10 @@ def test_one_file_has_what_metadata_beside_it_says_of_it(folder):
         bag.close()
     path = folder / "metadata.yaml"
     for name, is_its_own in (("z.db3", True), ("a.db3", False)):
-        assert names_file(path, name) == is_packed(path, name) == is_its_own
+        assert names_file(path, name) == is_its_own
     for text, is_named in (("rosbag2_bagfile_information: [", True), ("else: 1", False)):
         path.write_text(text)
-        assert (names_file(path, "a"), is_packed(path, "a")) == (is_named, False)
+        assert names_file(path, "a") == is_named
 
 
 @pytest.mark.parametrize("kind", ["db3", "mcap"])
@@ -612,6 +625,8 @@ def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeyp
     assert read(600) == sizes
     with pytest.raises(McaptrackError, match=f"{name}: the message at 2 ns can't be decompressed"):
         read(599)
-    (tmp_path / "metadata.yaml").write_text(described(name, topics={"/talk": 3}))
-    if kind == "mcap":
-        assert read(0) == [len(data) for data in packed]
+    (tmp_path / "metadata.yaml").unlink()  # it is found by the messages
+    monkeypatch.undo()
+    with closing(open_files([tmp_path / name], tmp_path / name)) as bag:
+        assert bag.as_log is None
+        assert [len(message.payload) for _, message in bag.messages(ReadingNotes())] == sizes

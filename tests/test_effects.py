@@ -34,6 +34,7 @@ from tests.commands import GROUP, call, done
 from tests.effects.commands import CASES
 from tests.models import DATA, stocked
 from tests.tiers import one_in
+from tests.undefined import write_undefined
 from tests.worlds import small_scene, write_eventful
 
 
@@ -102,6 +103,7 @@ def template(template, tmp_path_factory) -> Path:
     (folder / "verbose.toml").write_text("\n".join(f"[{name}]\nverbose = true" for name in GROUP.commands))
     _add_channels_of_others(folder / "a.mcap")
     plain(folder / "robot.mcap", "ros2")
+    write_undefined(folder)
     write_eventful(folder / "eventful.mcap")
     done("export", folder / "fresh.mcap", "-o", folder / "taken")
     for path in [*(folder / "taken").glob("*/recording=fresh")]:

@@ -160,10 +160,10 @@ class TestCompressed:
             picture = picture_decoder(kind)(payload)
             assert (picture.stamp_ns, picture.format, picture.data) == (STAMP_NS, "h264", b"\0\0\0\1")
 
-    def test_without_a_definition_those_of_ros_itself_are_known(self):
-        for ros1 in (True, False):
-            kind, payload = ros_compressed(PNG, "png", ros1)
-            assert picture_decoder(kind._replace(schema=b""))(payload).data == PNG
+    def test_a_definition_that_leaves_out_a_standard_type_has_that_of_ros(self):
+        kind, payload = ros_compressed(PNG, "png", False)
+        with pytest.raises(McaptrackError, match="no definition of it that fits"):
+            picture_decoder(kind._replace(schema=b""))
         short = kind._replace(
             name="sensor_msgs/CompressedImage", schema=b"std_msgs/Header header\nstring format\nuint8[] data\n"
         )

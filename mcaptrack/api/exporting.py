@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
 
 from mcaptrack.api.common import log_location, names_of, optional_path, split_names, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
-from mcaptrack.api.options import FILES, EachLog, Force, PathLike, Progress, Reports, named, no_progress, output
+from mcaptrack.api.options import (
+    FILES,
+    Definitions,
+    EachLog,
+    Force,
+    PathLike,
+    Progress,
+    Reports,
+    named,
+    no_progress,
+    output,
+)
 from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish, publish_folder, refuse_overwrite
@@ -125,6 +136,7 @@ def export(
     blobs: Annotated[bool, Option(FILES)] = False,
     start_s: Annotated[float | None, Option(FILES, 0, 1e9)] = None,
     end_s: Annotated[float | None, Option(FILES, 0, 1e9)] = None,
+    definitions: Definitions = None,
     force: Force = False,
     progress: Reports = no_progress,
 ) -> ExportResult:
@@ -195,29 +207,31 @@ def export(
 
     """
     from mcaptrack import log as logs
+    from mcaptrack.sources.foreign.definitions import definitions_of
     from mcaptrack.tables.export import default_folder, main_file
     from mcaptrack.tables.export import export as write_tables
 
     path = log_location(log)
     part = _Part(names_of(topic), all_topics, split_names("columns", columns), blobs, start_s, end_s)
-    if form in get_args(ExchangeFormat):
-        return _export_file(path, optional_path(output), cast("ExchangeFormat", form), part, force, progress)
-    if form in _BAGS:
-        return _export_bag(path, optional_path(output), _BAGS[form], part, force, progress)
-    if form not in get_args(TableFormat):
-        return _export_by_package(path, optional_path(output), form, part, force)
-    folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
-    if folder.exists() and not folder.is_dir():
-        raise McaptrackError(f"{folder} is a file; tables go to a folder")
-    part.check()
-    with warnings_about(path) as warnings:
-        with logs.read(path) as opened:
-            topics = None if all_topics else part.topics
-            done = write_tables(opened, folder, progress, form=kind, topics=topics, part=part.of(opened), force=force)
-        for note in done.notes:
-            warn(note, "left-out")
-    owed = (main_file(path, folder, kind),)
-    return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
+    with definitions_of(definitions):
+        if form in get_args(ExchangeFormat):
+            return _export_file(path, optional_path(output), cast("ExchangeFormat", form), part, force, progress)
+        if form in _BAGS:
+            return _export_bag(path, optional_path(output), _BAGS[form], part, force, progress)
+        if form not in get_args(TableFormat):
+            return _export_by_package(path, optional_path(output), form, part, force)
+        folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
+        if folder.exists() and not folder.is_dir():
+            raise McaptrackError(f"{folder} is a file; tables go to a folder")
+        part.check()
+        with warnings_about(path) as warnings:
+            with logs.read(path) as opened:
+                which, chosen = None if all_topics else part.topics, part.of(opened)
+                done = write_tables(opened, folder, progress, form=kind, topics=which, part=chosen, force=force)
+            for note in done.notes:
+                warn(note, "left-out")
+        owed = (main_file(path, folder, kind),)
+        return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
 
 
 def _export_bag(

@@ -17,6 +17,7 @@ from mcaptrack.api.options import (
     FPS_PATTERN,
     LABELS,
     PLUGIN,
+    Definitions,
     Force,
     GroundPlane,
     PathLike,
@@ -139,6 +140,7 @@ def ingest(
     scene: Annotated[str | None, Option(_READING, shown=False)] = None,
     role: Annotated[InputRole | None, Option(LABELS, flag="as")] = None,
     into: Annotated[PathLike | None, Option(FILES)] = None,
+    definitions: Definitions = None,
     sidecar: Sidecar = None,
     force: Force = False,
     progress: Reports = no_progress,
@@ -254,6 +256,7 @@ def ingest(
 
     """
     from mcaptrack.api.common import as_path, optional_path, paths_of, warnings_about
+    from mcaptrack.sources.foreign.definitions import definitions_of
     from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
     from mcaptrack.sources.ingest.labels.content import WantedClasses
@@ -286,7 +289,7 @@ def ingest(
         scene=scene,
     )
     make = partial(make_log, path, options=options, progress=progress)
-    with warnings_about(path) as warnings:
+    with definitions_of(definitions), warnings_about(path) as warnings:
         if into is None:
             target = _new_log(path, output, force)
             report = make(target)

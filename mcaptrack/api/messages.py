@@ -13,8 +13,8 @@ from mcap.records import Channel, Message, Schema
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import Log
-from mcaptrack.sources.foreign.decoding import MessageType
-from mcaptrack.sources.foreign.flatten import recorded_decoder
+from mcaptrack.sources.foreign.definitions import MessageType, is_defined
+from mcaptrack.sources.foreign.flatten import message_type_of, recorded_decoder
 
 Decode = Callable[[bytes], Any]
 
@@ -69,7 +69,7 @@ def decoded_messages(
         decoder = decoders.get(channel.id)
         try:
             if decoder is None:
-                decoder = decoders[channel.id] = _decoder(schema, channel, factories)
+                decoder = decoders[channel.id] = _decoder(opened, schema, channel, factories)
             decoded = decoder(message.data)
         except McaptrackError as error:
             where = f"{opened.path}: {channel.topic} at {message.log_time} ns"
@@ -90,15 +90,16 @@ def checked_factories(factories: Any) -> tuple[DecoderFactory, ...]:
     return given
 
 
-def _decoder(schema: Schema | None, channel: Channel, factories: Iterable[DecoderFactory]) -> Decode:
+def _decoder(opened: Log, schema: Schema | None, channel: Channel, factories: Iterable[DecoderFactory]) -> Decode:
     """The decoder of a channel: of the first factory that has one, or by the definition in the log."""
     for factory in factories:
         decoder = factory.decoder_for(channel.message_encoding, _with_own_id(schema))
         if decoder is not None:
             return decoder
     fields = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+    kind = MessageType(*fields, channel.message_encoding)
     try:
-        return recorded_decoder(MessageType(*fields, channel.message_encoding))
+        return recorded_decoder(kind if is_defined(kind) else message_type_of(opened, channel.topic))
     except McaptrackError as error:
         raise NoDecoderError(f"{error}; `decoder_factories=` takes decoders of the mcap package") from None
 

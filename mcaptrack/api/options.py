@@ -44,6 +44,16 @@ Sidecar = Annotated[
         "that ROS tools read, otherwise into the log.",
     ),
 ]
+Definitions = Annotated[
+    PathLike | Sequence[PathLike] | None,
+    Option(
+        FILES,
+        metavar="FOLDER",
+        shown=False,
+        help="Folder with definitions (.msg or .idl, as in ROS packages) of messages that the log does not define; or "
+        "the distribution of ROS that they are from, such as humble.",
+    ),
+]
 Views = Annotated[
     bool,
     Option(FILES, help="Draw the results for viewers, too; `mcaptrack run` does so at its end."),

@@ -11,6 +11,7 @@ from mcaptrack.api.common import as_location, split_names
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
 from mcaptrack.api.options import (
     FILES,
+    Definitions,
     EachLog,
     Force,
     Frame,
@@ -52,6 +53,7 @@ def run(
     camera: Annotated[str | Sequence[str] | None, Option(FILES, metavar="A,B", commas=True, shown="all")] = None,
     frame: Frame = None,
     output: Output = None,
+    definitions: Definitions = None,
     sidecar: Sidecar = None,
     events: Annotated[bool | EventOptions, Option(_AFTER)] = True,
     tables: Annotated[bool, Option(_AFTER)] = True,
@@ -172,6 +174,7 @@ def run(
     from mcaptrack.evaluation.zones import ZoneOptions
     from mcaptrack.pipeline import PlaneChoice, Watch, ZoneWatch, plan_all
     from mcaptrack.pipeline.several import unfitting
+    from mcaptrack.sources.foreign.definitions import definitions_of
 
     names = tuple(dict.fromkeys(split_names("camera", camera)))
     if len(names) > 1 and topic is not None:
@@ -207,9 +210,10 @@ def run(
     earlier = _log_before(as_location(log), follows)
     finishing = (watch, counted) if watch else (counted,)
     fuses = Fusing(names, fuse, joins)
-    return work(
-        where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier
-    )
+    with definitions_of(definitions):
+        return work(
+            where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier
+        )
 
 
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:

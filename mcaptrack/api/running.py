@@ -25,6 +25,7 @@ from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice
 from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say, refuse_failed, together
 from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.sources.foreign.definitions import definitions_of
 from mcaptrack.sources.sidecar import SidecarChoice
 from mcaptrack.transforms import FUSION, STAGES, Transform
 
@@ -400,6 +401,7 @@ def run_stage(
     frame: str | None = None,
     make: Callable[[str], Transform] | None = None,
     views: bool = False,
+    definitions: PathLike | Sequence[PathLike] | None = None,
 ) -> RunResult:
     """Run one stage with a transform; ``detect``, ``track`` and the others call this with their transform.
 
@@ -413,4 +415,5 @@ def run_stage(
         return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
     where = Where(log, camera, topic, output, sidecar, force)
-    return work(where, plan, progress, views=views, plane=PlaneChoice(frame=frame))
+    with definitions_of(definitions):
+        return work(where, plan, progress, views=views, plane=PlaneChoice(frame=frame))

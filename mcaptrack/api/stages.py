@@ -10,6 +10,7 @@ import mcaptrack
 from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, checked, declared
 from mcaptrack.api.options import (
     Camera,
+    Definitions,
     EachLog,
     Force,
     Frame,
@@ -48,6 +49,7 @@ def detect(
     to: To = None,
     camera: Camera = None,
     output: Output = None,
+    definitions: Definitions = None,
     sidecar: Sidecar = None,
     views: Views = False,
     force: Force = False,
@@ -88,7 +90,21 @@ def detect(
     from mcaptrack.api.running import run_stage, transform_of
 
     chosen = transform_of("detect", detector, options)
-    return run_stage("detect", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
+    return run_stage(
+        "detect",
+        chosen,
+        log,
+        topic,
+        to,
+        camera,
+        output,
+        sidecar,
+        force,
+        stages,
+        progress,
+        views=views,
+        definitions=definitions,
+    )
 
 
 @declared(most_used=("output", "topic", "to", "camera", "force"))
@@ -156,6 +172,7 @@ def track(
     camera: Camera = None,
     frame: Frame = None,
     output: Output = None,
+    definitions: Definitions = None,
     sidecar: Sidecar = None,
     views: Views = False,
     force: Force = False,
@@ -215,6 +232,7 @@ def track(
         frame=frame,
         make=make,
         views=views,
+        definitions=definitions,
     )
 
 

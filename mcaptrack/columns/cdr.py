@@ -531,7 +531,7 @@ class RosColumns:
             raise Malformed("it has no head", int(np.argmax(end - start < 4)))
         order = data[start + 1].astype(np.int64) | data[start].astype(np.int64) << 8
         if (order > 1).any():  # parameter lists, and the encodings of XCDR2
-            raise Malformed(f"its encapsulation {order.max():04x} is not read", int(np.argmax(order)))
+            raise Unsupported(f"messages in the encapsulation {order.max():04x} are not read")
         body = start + 4
         is_in_place = int((end - start).sum()) > _COPIED * len(start)
         group = order * _GRID + (body % _GRID if is_in_place else 0)

@@ -15,11 +15,11 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import collect
+from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.provenance import INGEST, SCENE_SUFFIX, VIEW, VIEW_SUFFIX, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import USUAL, Camera, chain_of, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
-from mcaptrack.sources.foreign.decoding import plain_name
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
 

@@ -23,12 +23,13 @@ from mcaptrack.pipeline.scene_views import SceneOnPictures
 from mcaptrack.pipeline.write import View
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import frame_times, has_any
+from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.provenance import VIEW, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, moving_camera
 from mcaptrack.sources.cameras import camera_at, chain_of, scenes_of
 from mcaptrack.sources.fixed_frame import transforms_of
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name
+from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.foreign.flatten import message_decoder, message_type_of
 from mcaptrack.transforms import FULL, STAGES
 

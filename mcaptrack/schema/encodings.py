@@ -19,6 +19,7 @@ from mcaptrack.geometry.arrays import Bools, Bytes, Ints
 from mcaptrack.geometry.ragged import ragged_range
 from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.codec import RowCodec
+from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.own import schema_of_channel
 from mcaptrack.schema.proto import KINDS, Definition
 
@@ -68,7 +69,6 @@ _FORMATS: Final = {kind: np.dtype(KINDS[column][0]) for column, kind in _TYPES.i
 }
 _TOPIC: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _LONGEST_TOPIC: Final = 247
-_NAME: Final = re.compile(r"(\w+)_msgs/(?:msg/)?(\w+)", re.ASCII)
 _LINE: Final = "=" * 80
 _SECTIONS: Final = re.compile(r"^=+[ \t]*\r?$", re.MULTILINE)
 _FIELD: Final = re.compile(r"(\S+)\s+(\w+)(?:\s+[^=\s].*)?", re.ASCII)
@@ -98,8 +98,8 @@ def ros_name(name: str) -> str:
 
 def schema_of_ros(name: str) -> str:
     """The name of the row schema that a ROS message would have; "" if its package can't be one of row schemas."""
-    match = _NAME.fullmatch(name)
-    return "{}.{}".format(*match.groups()) if match else ""
+    package, _, kind = plain_name(name).partition("/")
+    return f"{package.removesuffix('_msgs')}.{kind}" if package.endswith("_msgs") else ""
 
 
 def is_ros_topic(topic: str) -> bool:

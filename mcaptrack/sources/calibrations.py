@@ -17,10 +17,11 @@ from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.transform_tree import OTHER_CLOCK_S, Poses, TransformTree
 from mcaptrack.notices import warn
+from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.provenance import INGEST
 from mcaptrack.sources.cameras import Camera, provenance_of, shared_parts
 from mcaptrack.sources.fixed_frame import poses_at, transforms_of
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import picture_size
 

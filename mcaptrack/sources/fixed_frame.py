@@ -37,10 +37,11 @@ from mcaptrack.geometry.transform_tree import (
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, Frame, Rows
 from mcaptrack.schema.classes import UNKNOWN
+from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.boxes import Classes, Message3d
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, plain_name, stamp_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, stamp_of
 from mcaptrack.sources.foreign.flatten import message_type_of
 
 # All 3D boxes of a channel as arrays, in the frames that they were recorded in.

@@ -8,9 +8,11 @@ recording of ROS 2 are ROS messages, too.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 from mcap.well_known import Profile
 
@@ -115,15 +117,25 @@ def encoding_for(opened: log.Log) -> Encoding:
     """
     if opened.results is not None or not recording_of(opened):
         return PROTOBUF
-    for path in (opened.path, opened.real_path):
-        if isinstance(path, Path) and _stands_in_metadata(path, "is_packed"):
-            raise McaptrackError(
-                f"{path.with_name(METADATA)} says that messages are compressed one by one; results in {path.name} "
-                "would not be, and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
-            )
+    if holds_packed(opened):
+        raise McaptrackError(
+            f"messages of {opened.path} are compressed one by one; results in {opened.path.name} would not be, "
+            "and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
+        )
     profile, library = log.header(opened)
     is_ros1 = profile == Profile.ROS1 and not library.startswith(log.LIBRARY)
     return PROTOBUF if is_ros1 else CDR
+
+
+def holds_packed(opened: log.Log) -> bool:
+    """Whether messages of a recording are compressed one by one, as rosbag2 does with all of a bag or none."""
+    from mcaptrack.sources.foreign.definitions import is_packed
+
+    for channel in opened.recorded:
+        if channel.message_encoding == CDR and channel.messages:
+            with suppress(McaptrackError):  # of messages that can't be read, which those who need them say
+                return any(is_packed(message.payload) for message in islice(opened.messages(channel.topic), 1))
+    return False
 
 
 def check_topics(topics: Iterable[str], encoding: Encoding) -> None:
@@ -142,20 +154,13 @@ def recording_of(opened: log.Log) -> str:
     for path in (opened.path, opened.real_path):
         if isinstance(path, Url):
             continue
-        if _stands_in_metadata(path, "names_file"):
-            return f"named in {path.with_name(METADATA)}"
+        metadata = path.with_name(METADATA)
+        if metadata.exists():
+            from mcaptrack.sources.ingest.bags.metadata_yaml import names_file
+
+            if names_file(metadata, path.name):
+                return f"named in {metadata}"
     profile, library = log.header(opened)
     if profile in _PROFILES and not library.startswith(log.LIBRARY):
         return f"a {_PROFILES[profile]} recording"
     return ""
-
-
-def _stands_in_metadata(path: Path, question: Literal["is_packed", "names_file"]) -> bool:
-    """Answer a question about a log by the metadata.yaml beside it; False without one."""
-    metadata = path.with_name(METADATA)
-    if not metadata.exists():
-        return False
-    from mcaptrack.sources.ingest.bags import metadata_yaml
-
-    answer = metadata_yaml.is_packed if question == "is_packed" else metadata_yaml.names_file
-    return answer(metadata, path.name)

@@ -35,6 +35,7 @@ def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
         base, topic="--topic /other/detections" if command == "track" else "--topic /none", to="--to /camera/others",
         camera="--camera other", output="-o b.mcap", sidecar="--sidecar", force=(f"{base} -o fresh.mcap", "--force"),
         **({"frame": "--frame map"} if command == "track" else {}),
+        **({"definitions": (f"{command} bare.mcap --topic /t", "--definitions src")} if command in ("detect", "track") else {}),
         **({} if command == "motion" else {"views": "--views"}), **others,
     )  # fmt: skip
 
@@ -75,6 +76,7 @@ CASES: dict[str, dict[str, Case]] = {
         frames=("ingest truth.txt --fps 10", "--frames 500"),
         **{"as": ("ingest truth.txt --fps 10", "--as truth")},
         into=("ingest truth.txt --fps 10 --as tracks", "--into a.mcap"),
+        definitions=("ingest bare.db3 -o b.mcap", "--definitions src"),
         sidecar=("ingest truth.txt --fps 10 --as truth --camera left --into a.mcap", "--sidecar"),
         force=("ingest clip.mp4 -o a.mcap", "--force"),
     ),
@@ -96,6 +98,7 @@ CASES: dict[str, dict[str, Case]] = {
         topic="--topic /none",
         camera="--camera other",
         output="-o b.mcap",
+        definitions=("run bare.mcap --no-tables --topic /t", "--definitions src"),
         sidecar="--sidecar",
         events="--no-events",
         tables=("run a.mcap", "--no-tables"),
@@ -214,6 +217,7 @@ CASES: dict[str, dict[str, Case]] = {
         columns=("export a.mcap --topic /others", "--columns header"),
         start_s=("export a.mcap --topic /others", "--start-s 1"),
         end_s=("export a.mcap --topic /others", "--end-s 0.5"),
+        definitions=("export bare.mcap --topic /t", "--definitions src"),
         force=("export a.mcap -o taken", "--force"),
     ),
     "query": common(

@@ -17,6 +17,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame, Rows
+from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.foreign.boxes import (
     BOXES_3D_READ,
@@ -28,8 +29,7 @@ from mcaptrack.sources.foreign.boxes import (
 )
 from mcaptrack.sources.foreign.boxes import Classes as Classes
 from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
-from mcaptrack.sources.foreign.decoding import MessageType as MessageType
-from mcaptrack.sources.foreign.decoding import plain_name
+from mcaptrack.sources.foreign.definitions import MessageType as MessageType
 from mcaptrack.sources.foreign.picture_messages import PICTURES_NOT_READ as PICTURES_NOT_READ
 from mcaptrack.sources.foreign.picture_messages import PICTURES_READ as PICTURES_READ
 from mcaptrack.sources.foreign.picture_messages import Picture as Picture

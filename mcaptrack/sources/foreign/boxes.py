@@ -23,16 +23,9 @@ from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import DETECTIONS, Rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
-from mcaptrack.sources.foreign.decoding import (
-    MessageType,
-    decoder_with_errors,
-    integer,
-    number,
-    plain_name,
-    stamp_of,
-    text,
-    to_bytes,
-)
+from mcaptrack.schema.names import plain_name
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, number, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.definitions import MessageType
 
 _KIND: Final = "message_reader"
 #: Schemas of boxes of other software in pictures.

@@ -10,51 +10,33 @@ import base64
 import json
 import re
 from collections.abc import Callable
-from copy import copy
 from datetime import UTC, datetime
-from functools import lru_cache
 from graphlib import TopologicalSorter
 from math import nan
 from types import SimpleNamespace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.well_known import MessageEncoding
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.schema.names import plain_name
+from mcaptrack.sources.foreign.definitions import MessageType, ros_types, unpacked
 
 #: Payload -> message. Malformed payloads raise various exceptions, which the caller handles.
 Unpack = Callable[[bytes], Any]
 
 #: The supported message encodings.
 ENCODINGS: Final = (MessageEncoding.Protobuf, MessageEncoding.JSON, MessageEncoding.ROS1, MessageEncoding.CDR)
-#: Longer definitions are refused, because parsing them takes long.
-_MAX_DEFINITION: Final = 2**20
 _MAX_DESCRIPTOR: Final = 4 * 2**20
-_ROS_NAME: Final = re.compile(r"([A-Za-z]\w*)/(?:msg/)?([A-Za-z]\w*)", re.ASCII)
-_IDL_HEAD: Final = re.compile(r"^=+\r?\nIDL: .*\r?\n", re.MULTILINE)
-
-
-class MessageType(NamedTuple):
-    """The message type of a channel: its schema record and its message encoding."""
-
-    name: str
-    schema_encoding: str
-    schema: bytes
-    encoding: str
-
-
-def plain_name(schema_name: str) -> str:
-    """The normalised name of a schema: sensor_msgs/Image for sensor_msgs/msg/Image, and foxglove.RawImage for
-    foxglove_msgs/msg/RawImage.
-    """
-    match = _ROS_NAME.fullmatch(schema_name)
-    if not match:
-        return schema_name
-    package, name = match.groups()
-    return f"foxglove.{name}" if package == "foxglove_msgs" else f"{package}/{name}"
+#: Encodings of DDS that aren't read, by how messages begin.
+_OTHER_CDR: Final = {
+    bytes([0, number + little]): name
+    for number, name in ((2, "PL_CDR"), (6, "XCDR2"), (8, "delimited XCDR2"), (10, "PL_CDR of XCDR2"))
+    for little in (0, 1)
+}
 
 
 def decoder_with_errors(
@@ -82,8 +64,9 @@ def decoder_with_errors(
 
 def unpacker(kind: MessageType) -> Unpack:
     """A function that decodes messages of this type. Raises McaptrackError if the type is not supported."""
-    if kind.encoding == MessageEncoding.Protobuf and kind.name.startswith("foxglove."):
-        return lambda payload: foxglove.unpack(kind.name, payload)
+    plain = plain_name(kind.name)
+    if kind.encoding == MessageEncoding.Protobuf and plain.startswith("foxglove."):
+        return lambda payload: foxglove.unpack(plain, payload)
     if kind.encoding == MessageEncoding.Protobuf:
         return protobuf_unpacker(kind)
     if kind.encoding == MessageEncoding.JSON:
@@ -117,7 +100,7 @@ def protobuf_class(kind: MessageType) -> Any:
         pool = DescriptorPool()
         for name in TopologicalSorter(imports).static_order():  # the order of the files in a log is free
             pool.Add(files[name])
-        return GetMessageClass(pool.FindMessageTypeByName(kind.name))
+        return GetMessageClass(pool.FindMessageTypeByName(kind.name.lstrip(".").replace("/", ".")))
     except Exception as error:  # a third-party parser that raises various exceptions
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise McaptrackError(
@@ -127,51 +110,18 @@ def protobuf_class(kind: MessageType) -> Any:
 
 def _ros_unpacker(kind: MessageType) -> Unpack:
     store, name = ros_types(kind)
-    read = store.deserialize_ros1 if kind.encoding == MessageEncoding.ROS1 else store.deserialize_cdr
+    is_cdr = kind.encoding == MessageEncoding.CDR
+    read = store.deserialize_cdr if is_cdr else store.deserialize_ros1
 
     def unpack(payload: bytes) -> Any:
+        payload = unpacked(payload) if is_cdr else payload
+        if is_cdr and payload[:2] in _OTHER_CDR:
+            raise ValueError(f"its bytes are {_OTHER_CDR[payload[:2]]}; CDR of version 1 is read")
         # A sequence can't have more members than the message has bytes; one of an empty type could be endless.
-        store.max_sequence_length = len(payload)
+        store.max_sequence_length = max(len(payload), 1)
         return read(payload, name)
 
     return unpack
-
-
-def ros_types(kind: MessageType) -> tuple[Any, str]:
-    """The types of a ROS message (a store of rosbags), and its name in it. Raises McaptrackError as ``unpacker``."""
-    from rosbags.typesys import Stores
-
-    match = _ROS_NAME.fullmatch(kind.name)
-    if not match:
-        raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
-    name = "{}/msg/{}".format(*match.groups())
-    standard = Stores.ROS1_NOETIC if kind.encoding == MessageEncoding.ROS1 else Stores.LATEST
-    # Each reader sets the longest sequence of its own store; what was compiled for the type is shared.
-    return copy(_typestore(name, kind, standard)), name
-
-
-@lru_cache(maxsize=64)
-def _typestore(name: str, kind: MessageType, standard: Any) -> Any:
-    """The types of a channel: from its definition, supplemented by the standard types of ROS if necessary.
-
-    Kept, because the code that reads a type is compiled when it is first used, which takes longer than a short log.
-    """
-    from rosbags.typesys import Stores, get_typestore
-
-    why = "the log has no definition of it, and it is not a standard type of ROS"
-    for base in (Stores.EMPTY, standard):
-        store = get_typestore(base)
-        try:
-            types = _types(name, kind)
-            if types:
-                store.register(types)
-            store.get_msgdef(name)
-        except Exception as error:  # noqa: BLE001, RUF100  # a third-party parser that raises various exceptions
-            if kind.schema:
-                why = f"the log's definition of it can't be understood ({' '.join(str(error).split())[:120]})"
-        else:
-            return store
-    raise McaptrackError(f"{kind.name} can't be read: {why}")
 
 
 # Values of fields of decoded messages, in all encodings: times, whole numbers, texts and bytes.
@@ -240,21 +190,3 @@ def to_bytes(value: Any) -> bytes:
     if isinstance(value, bytes | list):
         return bytes(value)
     raise ValueError(f"a {type(value).__name__} where bytes belong")
-
-
-def _types(name: str, kind: MessageType) -> Any:
-    """The types that a schema record defines: the named one and those of its fields."""
-    from rosbags.typesys import get_types_from_idl, get_types_from_msg
-
-    text = kind.schema.decode("utf-8", "replace")
-    if len(text) > _MAX_DEFINITION:
-        raise ValueError(f"it has {len(text)} characters")
-    if not text.strip():
-        return {}
-    if kind.schema_encoding in (SchemaEncoding.ROS2IDL, "omgidl"):
-        types: dict[str, Any] = {}
-        for part in _IDL_HEAD.split(text):
-            if part.strip():
-                types |= get_types_from_idl(part)
-        return types
-    return get_types_from_msg(text, name)

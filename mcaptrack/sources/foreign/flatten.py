@@ -9,20 +9,21 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.notices import warn
 from mcaptrack.sources.foreign.decoding import (
-    MessageType,
     decoder_with_errors,
     protobuf_class,
     protobuf_unpacker,
-    ros_types,
     unpacker,
 )
+from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defined, ros_types
 
 if TYPE_CHECKING:
     from mcaptrack.columns import ProtobufColumns, RosColumns
@@ -35,13 +36,28 @@ _LIMIT_NS: Final = 2**63
 _TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
 
 
+#: The definitions of open logs that were found by their messages, by topic.
+_DEFINED: Final[WeakKeyDictionary[log.Log, dict[str, MessageType]]] = WeakKeyDictionary()
+
+
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
-    """The message type of a channel of a log."""
+    """The message type of a channel of a log; a warning says which definition fits if the log has none."""
     channel = opened.channel(topic)
     index = opened.part(channel.topic).index
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
-    return MessageType(*fields, channel.message_encoding)
+    kind = MessageType(*fields, channel.message_encoding)
+    if is_defined(kind):
+        return kind
+    kinds = _DEFINED.setdefault(opened, {})
+    if topic not in kinds:
+        payloads = (message.payload for message in opened.messages(topic))
+        kinds[topic], origin, doubts = defined(kind, payloads)
+        warn(
+            f"{opened.path}: {topic} does not say what {kind.name} is; {doubts or f'its definition is {origin}'}",
+            "definitions",
+        )
+    return kinds[topic]
 
 
 def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:

@@ -20,15 +20,9 @@ import numpy as np
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.sources.foreign.decoding import (
-    MessageType,
-    decoder_with_errors,
-    integer,
-    plain_name,
-    stamp_of,
-    text,
-    to_bytes,
-)
+from mcaptrack.schema.names import plain_name
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.definitions import MessageType
 from mcaptrack.sources.foreign.flatten import message_type_of
 
 if TYPE_CHECKING:

@@ -33,6 +33,7 @@ from mcaptrack.schema.encodings import CDR, encoded, ros_definition, ros_name
 from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.fixed_frame import transforms_of
+from mcaptrack.sources.foreign.definitions import typestore_of
 
 __all__ = ["Storage", "WrittenBag", "default_folder", "write_bag"]
 
@@ -141,38 +142,13 @@ _LINE_M: Final = 0.1
 _MARKERS: Final = 2**31
 
 
-# The ROS messages of bags: those that rosbags knows, and those of vision_msgs 4 (ROS 2 Humble and since).
-
-
-_VISION: Final = {
-    "Point2D": "float64 x\nfloat64 y",
-    "Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
-    "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
-    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "ObjectHypothesis": "string class_id\nfloat64 score",
-    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
-    "Detection2D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox2D bbox\n"
-        "string id"
-    ),
-    "Detection3D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox3D bbox\n"
-        "string id"
-    ),
-    "Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
-    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
-}
+# The ROS messages of bags: those of ROS 2 Humble.
 
 
 @cache
 def typestore() -> Any:
     """The types of ROS 2 Humble with vision_msgs."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in _VISION.items():
-        store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
-    return store
+    return typestore_of("ros2_humble")
 
 
 def message(name: str, *values: Any) -> Any:

@@ -23,7 +23,7 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, find_camera
-from mcaptrack.sources.foreign.decoding import MessageType, ros_types
+from mcaptrack.sources.foreign.definitions import MessageType, ros_types, unpacked
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import H264Encoder, encode_image
@@ -179,7 +179,8 @@ def _ros(kind: MessageType) -> Replace:
     )
 
     def replace(payload: bytes, data: bytes, word: str) -> bytes:
-        store.max_sequence_length = len(payload)
+        payload = unpacked(payload) if kind.encoding == MessageEncoding.CDR else payload
+        store.max_sequence_length = max(len(payload), 1)
         message = read(payload, name)
         key = "format" if hasattr(message, "format") else "encoding"
         changed: dict[str, Any] = {"data": np.frombuffer(data, np.uint8)} | ({key: word} if word else {})

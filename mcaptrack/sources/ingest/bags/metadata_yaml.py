@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, Final, NamedTuple
 
@@ -15,7 +16,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.bags import plain_yaml
-from mcaptrack.sources.ingest.bags.plain_yaml import Fields, Scalar, UnsupportedYamlError
+from mcaptrack.sources.ingest.bags.plain_yaml import Fields, UnsupportedYamlError
 from mcaptrack.sources.sidecar import METADATA
 
 ROOT: Final = "rosbag2_bagfile_information"
@@ -48,27 +49,23 @@ def names_file(path: Path, name: str) -> bool:
         return True
 
 
-def is_packed(path: Path, name: str) -> bool:
-    """Whether a metadata.yaml says that the messages of this file are compressed one by one."""
-    if not holds_metadata(path):
-        return False
-    try:
-        bag, names = read_metadata(path)
-    except McaptrackError:
-        return False
-    return bag.packed and name in names
-
-
 def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     """Read a metadata.yaml; returns it and the files that it names. Raises McaptrackError if it is invalid."""
+    import yaml
+
     text = read_beginning(path, plain_yaml.MAX_BYTES + 1)
     try:
         fields = Fields(plain_yaml.load(text), "it").map(ROOT)
         mode, compression = fields.text("compression_mode", ""), fields.text("compression_format", "")
-        topics = [_topic(Fields(entry, "a topic")) for entry in fields.values("topics_with_message_count")]
+        entries = [Fields(entry, "a topic") for entry in fields.values("topics_with_message_count")]
+        counts = [entry.whole("message_count") for entry in entries]
+        # Numbers as numbers, for profiles of quality of service.
+        typed = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))[ROOT]  # noqa: S506  # a safe loader
+        both = zip(entries, typed.get("topics_with_message_count") or (), counts, strict=False)
+        topics = [(*_topic(entry.map("topic_metadata"), values["topic_metadata"]), n) for entry, values, n in both]
         names = [_name(entry) for entry in fields.values("relative_file_paths")]
         bag = Bag(text, fields.text("ros_distro", ""), mode.lower() == "message", topics)
-    except UnsupportedYamlError as error:
+    except ValueError as error:
         raise McaptrackError(f"{path} is not the metadata of a rosbag2 bag ({str(error)[:200]})") from None
     twice = next((name for name, times in Counter(names).items() if times > 1), "")
     if twice:
@@ -78,13 +75,14 @@ def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     return bag, names
 
 
-def _topic(entry: Fields) -> tuple[str, str, str, str, str, int]:
-    topic = entry.map("topic_metadata")
+def _topic(topic: Fields, typed: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
+    import yaml
+
     name, kind, encoding = topic.text("name"), topic.text("type"), topic.text("serialization_format", "cdr")
-    qos = topic.any("offered_qos_profiles")
+    qos = typed.get("offered_qos_profiles") or ""
     # Text before ROS 2 Jazzy; since then nested YAML.
-    profiles = "" if qos is None else str(qos) if isinstance(qos, str) else plain_yaml.dump(qos)
-    return name, kind, encoding, profiles, topic.text("type_description_hash", ""), entry.whole("message_count")
+    profiles = qos if isinstance(qos, str) else yaml.safe_dump(qos, sort_keys=False, width=10_000)
+    return name, kind, encoding, profiles, topic.text("type_description_hash", "")
 
 
 def _name(entry: Any) -> str:
@@ -145,37 +143,47 @@ def update_metadata(path: Path) -> None:
 
 def _update(metadata: Path) -> bool:
     """Bring a metadata.yaml up to date; returns whether it was not."""
+    from ruamel.yaml import YAML
+
     bag, names = read_metadata(metadata)
     files = {name: _read(metadata.with_name(name)) for name in names}
-    whole = plain_yaml.load(bag.text)
-    before, info = plain_yaml.dump(whole), whole[ROOT]
+    yaml = YAML()  # which keeps what it doesn't change as it is written: quotes, comments, order
+    yaml.preserve_quotes, yaml.width = True, 10_000
+    whole = yaml.load(bag.text)
+    before, info = _written(yaml, whole), whole[ROOT]
     old = [(name, count) for name, *_, count in bag.topics]
     totals = sum((file.messages for file in files.values()), Counter[str]())
     kinds = {topic: kind for file in files.values() for topic, kind in file.kinds.items()}
     results = {topic for file in files.values() for topic in file.results}
     entries = [
-        entry | ({"message_count": _number(totals[name])} if name in results else {})
+        entry | ({"message_count": totals[name]} if name in results else {})
         for entry, (name, count) in zip(info["topics_with_message_count"] or [], old, strict=True)
         if not count or any(name in file.topics for file in files.values())
     ]
-    version = info.get("version", "")
-    version = int(version) if str(version).isdecimal() else 0
+    version = info.get("version")
+    version = version if isinstance(version, int) else 0
     entries += [_entry(topic, kinds[topic], totals[topic], version) for topic in sorted(totals.keys() - dict(old))]
     info["topics_with_message_count"] = entries
     new = [(str(entry["topic_metadata"]["name"]), int(entry["message_count"])) for entry in entries]
-    if "message_count" in info and str(info["message_count"]).isdecimal():
-        info["message_count"] = _number(int(info["message_count"]) + sum(n for _, n in new) - sum(n for _, n in old))
+    if isinstance(info.get("message_count"), int):
+        info["message_count"] += sum(n for _, n in new) - sum(n for _, n in old)
     _set_times(info, [file for file in files.values() if file.messages])
     for entry in info.get("files") or []:
         file = files.get(str(entry.get("path", ""))) if isinstance(entry, dict) else None
         if file and file.messages:
-            entry["message_count"] = _number(sum(file.messages.get(topic, 0) for topic in dict(new)))
+            entry["message_count"] = sum(file.messages.get(topic, 0) for topic in dict(new))
             _set_times(entry, [file])
-    after = plain_yaml.dump(whole)
+    after = _written(yaml, whole)
     if after == before:
         return False
     publish_bytes(follow_links(metadata), after.encode())
     return True
+
+
+def _written(yaml: Any, value: Any) -> str:
+    stream = StringIO()
+    yaml.dump(value, stream)
+    return stream.getvalue()
 
 
 def _read(path: Path) -> _Content:
@@ -193,12 +201,12 @@ def _read(path: Path) -> _Content:
 
 def _entry(topic: str, kind: str, count: int, version: int) -> dict[str, Any]:
     """The entry of a new topic, as this version of metadata.yaml has it."""
-    values: dict[str, Any] = {"name": _text(topic), "type": _text(kind), "serialization_format": _text(CDR)}
+    values: dict[str, Any] = {"name": topic, "type": kind, "serialization_format": CDR}
     if version >= _QOS_TEXT:
-        values["offered_qos_profiles"] = [] if version >= _QOS_LIST else _text("")
+        values["offered_qos_profiles"] = [] if version >= _QOS_LIST else ""
     if version >= _HASH:
-        values["type_description_hash"] = _text("")
-    return {"topic_metadata": values, "message_count": _number(count)}
+        values["type_description_hash"] = ""
+    return {"topic_metadata": values, "message_count": count}
 
 
 def _set_times(entry: dict[str, Any], files: list[_Content]) -> None:
@@ -211,12 +219,4 @@ def _set_times(entry: dict[str, Any], files: list[_Content]) -> None:
         ("duration", "nanoseconds", end_ns - start_ns),
     ):
         if isinstance(entry.get(name), dict) and part in entry[name]:
-            entry[name][part] = _number(value)
-
-
-def _number(value: int) -> Scalar:
-    return Scalar.of(str(value), is_plain=True)
-
-
-def _text(value: str) -> Scalar:
-    return Scalar.of(value, is_plain=False)
+            entry[name][part] = value

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Final, NoReturn, Self
+from typing import Any, ClassVar, Final, NoReturn
 from xml.parsers import expat
 
 from mcaptrack.errors import McaptrackError
@@ -23,26 +23,12 @@ _WHOLE: Final = re.compile(r"\d{1,19}", re.ASCII)
 _DIRECTIVE: Final = re.compile(rb"^%", re.MULTILINE)
 
 
-class Scalar(str):
-    """A scalar as written, without quotes."""
-
-    __slots__ = ("is_plain",)
-    is_plain: bool
-
-    @classmethod
-    def of(cls, text: str, is_plain: bool) -> Self:
-        """Make a scalar; ``is_plain``: it was written without quotes."""
-        scalar = cls(text)
-        scalar.is_plain = is_plain
-        return scalar
-
-
 class UnsupportedYamlError(ValueError):
     """Invalid YAML, or features that are not supported; the message says where and why."""
 
 
 def load(data: bytes, tags: Collection[str] = ()) -> Any:
-    """The only document of ``data``: a Scalar, a list, or a dict with text as its keys.
+    """The only document of ``data``: text, a list, or a dict with text as its keys.
 
     Values may have these tags, which change nothing. Raises UnsupportedYamlError.
     """
@@ -77,7 +63,7 @@ def _build(yaml: Any, events: Iterator[Any], tags: Collection[str]) -> Any:
             raise UnsupportedYamlError(f"{where}: tags are not read")
         value: Any
         if isinstance(event, yaml.ScalarEvent):
-            value = Scalar.of(event.value, event.implicit[0])
+            value = event.value
         elif isinstance(event, yaml.SequenceStartEvent):
             value = []
         elif isinstance(event, yaml.MappingStartEvent):
@@ -106,37 +92,6 @@ def _build(yaml: Any, events: Iterator[Any], tags: Collection[str]) -> Any:
     return documents[0]
 
 
-def dump(value: Any) -> str:
-    """Write a loaded value as YAML, one line for each value. Text that isn't a Scalar is written without quotes."""
-    import yaml
-
-    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    framed = [yaml.StreamStartEvent(), yaml.DocumentStartEvent(), *_events(yaml, value)]
-    text: str = yaml.emit([*framed, yaml.DocumentEndEvent(), yaml.StreamEndEvent()], Dumper=dumper, width=10_000)
-    return text
-
-
-def _events(yaml: Any, value: Any) -> Iterator[Any]:
-    if isinstance(value, list):
-        yield yaml.SequenceStartEvent(None, None, True, flow_style=False)
-        for item in value:
-            yield from _events(yaml, item)
-        yield yaml.SequenceEndEvent()
-    elif isinstance(value, dict):
-        yield yaml.MappingStartEvent(None, None, True, flow_style=False)
-        for key, item in value.items():
-            yield from _events(yaml, key)
-            yield from _events(yaml, item)
-        yield yaml.MappingEndEvent()
-    else:
-        value = value if isinstance(value, Scalar) else Scalar.of(value, is_plain=True)
-        yield yaml.ScalarEvent(None, None, (value.is_plain, not value.is_plain), str(value), style=_style(value))
-
-
-def _style(value: Scalar) -> str | None:
-    return None if value.is_plain else '"'
-
-
 class Fields:
     """The fields of a map, each of the kind that its reader asks for.
 
@@ -161,7 +116,7 @@ class Fields:
     def whole(self, name: str) -> int:
         """An integer field from 0 to 2^63 - 1."""
         value = self._fields.get(name)
-        number = int(value) if isinstance(value, Scalar) and value.is_plain and _WHOLE.fullmatch(value) else -1
+        number = int(value) if isinstance(value, str) and _WHOLE.fullmatch(value) else -1
         if not 0 <= number < 2**63:
             raise self._wrong(name, value, "a whole number")
         return number
@@ -179,17 +134,12 @@ class Fields:
         """A map field."""
         return Fields(self._fields.get(name), f"{self._where}: {name}")
 
-    def any(self, name: str) -> Any:
-        """A field of any type; None if it is empty or missing."""
-        value = self._fields.get(name)
-        return None if value is None or _is_null(value) else value
-
     def _wrong(self, name: str, value: Any, wanted: str) -> UnsupportedYamlError:
         return UnsupportedYamlError(f"{self._where}: {name} is {_kind(value)}, not {wanted}")
 
 
 def _is_null(value: Any) -> bool:
-    return isinstance(value, Scalar) and value.is_plain and value in _NULL
+    return isinstance(value, str) and value in _NULL
 
 
 def _kind(value: Any) -> str:

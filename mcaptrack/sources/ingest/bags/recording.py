@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from mcap.well_known import Profile
 
 from mcaptrack import log
-from mcaptrack.sources.foreign.decoding import MessageType
+from mcaptrack.sources.foreign.definitions import MessageType
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,30 +8,32 @@ were recorded before definitions were kept in them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from functools import cache
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Final
 
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
+from mcaptrack.sources.foreign.definitions import Defined, MessageType, defined, is_defined, is_packed
 from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
-from mcaptrack.sources.sidecar import METADATA
+from mcaptrack.sources.sidecar import METADATA, holds_packed
 from mcaptrack.sources.video import IMAGE_SUFFIXES
 
 _MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
+#: Definitions are tried on the messages of at most this many topics of a type.
+_TOPICS_TRIED: Final = 20
 #: At most this many unknown topic ids are named.
 _MAX_STRANGE: Final = 10
 _NEEDED: Final = {
@@ -121,6 +123,8 @@ class _Files(RecordingReader):
         self.declared_counts: dict[Connection, int] = {}
         self._known_connections: dict[tuple[object, ...], Connection] = {}
         self._message_counts: dict[Connection, int] = {}
+        #: Definitions of types that the recording doesn't define.
+        self._found: dict[MessageType, Defined] = {}
         try:
             for number in range(len(paths)):
                 self._open(number)
@@ -129,6 +133,9 @@ class _Files(RecordingReader):
             raise
         self._compare()
         self.connections = list(self.declared_counts)
+        for doubts in dict.fromkeys(found.doubts for found in self._found.values() if found.doubts):
+            names = [kind.name for kind, found in self._found.items() if found.doubts == doubts]
+            warn(f"{whole} does not say what {list_names(names)} is; {doubts}", "definitions")
 
     def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
         """All messages, file by file, in their order there."""
@@ -137,7 +144,7 @@ class _Files(RecordingReader):
             left = decompression.limit_of(path.stat().st_size)
             for connection, message in self._messages(number):
                 payload = message.payload
-                if self.bag.packed or self._is_packed(connection, payload):
+                if (self.bag.packed or connection.encoding == MessageEncoding.CDR) and is_packed(payload):
                     payload = _unpack_message(payload, path, message.t_ns, left)
                     left -= len(payload)
                     yield connection, message._replace(payload=payload)
@@ -152,13 +159,25 @@ class _Files(RecordingReader):
     def _open(self, number: int) -> None:
         raise NotImplementedError
 
+    def _defined(self, kind: MessageType, distribution: str = "", digest: str = "") -> Defined:
+        """A message type with the definition that fits if the recording doesn't define it."""
+        if is_defined(kind):
+            return Defined(kind, "", "")
+        if kind not in self._found:
+            with closing(self._payloads(kind)) as payloads:
+                self._found[kind] = defined(kind, payloads, distribution, digest)
+            if not self._found[kind].doubts:
+                text = f"{self.whole} does not say what {kind.name} is; its definition is {self._found[kind].origin}"
+                self.findings.notes.append(text)
+        return self._found[kind]
+
+    def _payloads(self, kind: MessageType) -> Generator[bytes]:
+        """The messages of a type, in all files."""
+        raise NotImplementedError
+
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         """The messages of a file as they are stored."""
         raise NotImplementedError
-
-    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
-        """Whether a message is compressed, where metadata.yaml doesn't say it of all."""
-        return False
 
     def _connection(self, repeats: dict[object, int], described: Connection, messages: int) -> Connection:
         """The connection that a part of the recording describes: the parts have the same ones.
@@ -187,30 +206,6 @@ class _Files(RecordingReader):
                 )
 
 
-# Definitions of standard ROS messages, from rosbags, for recordings that don't contain them.
-
-
-@cache
-def known_definition(kind: str, distro: str, digest: str) -> tuple[str, str]:
-    """The definition of a message type, and the ROS distribution that it is from.
-
-    That is the given distribution, or else the newest one with the same type hash; ("", "") if there is none.
-    """
-    from rosbags.typesys import Stores, get_typestore
-
-    all_stores = {store.value.removeprefix("ros2_"): store for store in Stores if store.value.startswith("ros2_")}
-    named = {distro: all_stores[distro]} if distro in all_stores else {}
-    for name, store in (named or dict(reversed(all_stores.items()))).items():
-        types = get_typestore(store)
-        try:
-            if digest.startswith("RIHS01_") and types.hash_rihs01(kind) != digest:
-                continue
-            return types.generate_msgdef(kind, ros_version=2)[0], f"ROS 2 {name.capitalize()}"
-        except Exception:  # noqa: BLE001, PERF203, S112, RUF100  # it raises various exceptions for unknown types
-            continue
-    return "", ""
-
-
 class Databases(_Files):
     """SQLite databases."""
 
@@ -218,11 +213,7 @@ class Databases(_Files):
         self._databases: list[SqliteTables] = []
         self._topics: list[dict[int, Connection]] = []
         self._distro = bag.distro
-        self._undefined: dict[str, str] = {}
         super().__init__(paths, whole, bag)
-        for kind, where in sorted(self._undefined.items()):
-            text = f"its definition is that of {where}" if where else "its definition is not known: it has no schema"
-            self.findings.notes.append(f"{whole} does not say what {kind} is; {text}")
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
@@ -235,12 +226,14 @@ class Databases(_Files):
                     writer.add_metadata("rosbag2", {"serialized_metadata": _text(text)})
 
     def _open(self, number: int) -> None:
-        path = self.paths[number]
-        database = SqliteTables(path, _TABLES)
-        self.closing.callback(database.close)
-        self._databases.append(database)
-        if not all(columns <= set(database.columns(table)) for table, columns in _NEEDED.items()):
-            raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
+        if not number:  # definitions are tried on the messages of all files
+            for path in self.paths:
+                database = SqliteTables(path, _TABLES)
+                self.closing.callback(database.close)
+                self._databases.append(database)
+                if not all(columns <= set(database.columns(table)) for table, columns in _NEEDED.items()):
+                    raise McaptrackError(f"{path} is a database, but none of rosbag2: it has no topics and messages")
+        database = self._databases[number]
         definitions = self._definitions(database)
         has = database.columns("topics")
         optional = [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
@@ -249,10 +242,12 @@ class Databases(_Files):
             topic, kind, encoding, *more = map(_text, values)
             extra = dict(zip(optional, more, strict=True))
             digest = extra.get("type_description_hash", "")
-            schema, defined_digest = definitions.get(kind) or (self._schema(kind, digest), "")
+            own, own_digest = definitions.get(kind, (("", "", b""), ""))
+            of_type = MessageType(kind, *own[1:], encoding)
+            found = Defined(of_type, "", "") if own[0] else self._defined(of_type, self._distro.lower(), digest)
             qos = extra.get("offered_qos_profiles", "")
-            metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or defined_digest}
-            described[key] = Connection(topic, schema, encoding, metadata)
+            metadata = {"offered_qos_profiles": qos, "topic_type_hash": digest or own_digest, **found.metadata}
+            described[key] = Connection(topic, found.kind[:3], encoding, metadata)
         counts = self._count(database, described)
         repeats: dict[object, int] = {}
         self._topics.append(
@@ -295,13 +290,12 @@ class Databases(_Files):
             if encoding in (SchemaEncoding.ROS2, SchemaEncoding.ROS2IDL) and (text or kind.endswith("/Empty"))
         }
 
-    def _schema(self, kind: str, digest: str) -> tuple[str, str, bytes]:
-        """The schema record of a message type that the database does not define."""
-        text, self._undefined[kind] = known_definition(kind, self._distro.lower(), digest)
-        return (kind, SchemaEncoding.ROS2, text.encode()) if self._undefined[kind] else (kind, "", b"")
-
-    def _is_packed(self, connection: Connection, payload: bytes) -> bool:
-        return payload.startswith(_ZSTD) and connection.encoding == MessageEncoding.CDR  # CDR starts with a zero byte
+    def _payloads(self, kind: MessageType) -> Generator[bytes]:
+        for database in self._databases:
+            keys = [key for key, name in database.rows("topics", ["id", "type"]) if _text(name) == kind.name]
+            for key in keys[:_TOPICS_TRIED]:
+                with closing(database.rows("messages", ["data"], where=("topic_id", key))) as those:
+                    yield from (data for (data,) in those if isinstance(data, bytes))
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         connections, path = self._topics[number], self.paths[number]
@@ -325,7 +319,8 @@ class Logs(_Files):
         super().__init__(paths, whole, bag)
         profiles = {log.header(opened)[0] for opened in self.logs}
         self.profile = profiles.pop() if len(profiles) == 1 else ""
-        self.as_log = self.logs[0] if len(self.logs) == 1 and not bag.packed else None
+        is_whole = len(self.logs) == 1 and not any(found.origin for found in self._found.values())
+        self.as_log = self.logs[0] if is_whole and not holds_packed(self.logs[0]) else None
 
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml, and all attachments and metadata records of the files."""
@@ -334,19 +329,27 @@ class Logs(_Files):
             log.copy_attachments_and_metadata(opened, writer, without=[CLOCK] if has_clock else [])
 
     def _open(self, number: int) -> None:
-        path = self.paths[number]
-        opened = self.closing.enter_context(log.read(path, sidecar=False))
+        if not number:
+            self.logs += [self.closing.enter_context(log.read(path, sidecar=False)) for path in self.paths]
+        path, opened = self.paths[number], self.logs[number]
         if log.results_path(path).exists():
             warn(f"{log.results_path(path)} holds results of {path.name}; they are left out", "left-out")
-        self.logs.append(opened)
         connections: dict[int, Connection] = {}
         repeats: dict[object, int] = {}
         for channel in opened.index.channels.values():
             record = opened.index.schemas.get(channel.schema_id)
-            schema = (record.name, record.encoding, record.data) if record else ("", "", b"")
-            described = Connection(channel.topic, schema, channel.message_encoding, channel.metadata)
+            fields = (record.name, record.encoding, record.data) if record else ("", "", b"")
+            found = self._defined(MessageType(*fields, channel.message_encoding))
+            metadata = channel.metadata | found.metadata
+            described = Connection(channel.topic, found.kind[:3], channel.message_encoding, metadata)
             connections[channel.id] = self._connection(repeats, described, opened.index.counts.get(channel.id, 0))
         self._channels.append(connections)
+
+    def _payloads(self, kind: MessageType) -> Generator[bytes]:
+        for opened in self.logs:
+            for topic, channel in opened.channels.items():
+                if (opened.record_name(channel), channel.message_encoding) == (kind.name, kind.encoding):
+                    yield from (message.payload for message in opened.messages(topic))
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         return ((self._channels[number][channel], message) for channel, message in log.stream(self.logs[number]))

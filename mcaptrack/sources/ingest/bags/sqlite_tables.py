@@ -8,7 +8,7 @@ limited by the size of the file, and signals interrupt every query. Nothing is w
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -62,11 +62,14 @@ class SqliteTables:
         """The columns of one of the tables; empty if there is no such table."""
         return self._columns[table]
 
-    def rows(self, table: str, columns: Sequence[str]) -> Iterator[tuple[Any, ...]]:
-        """These columns of all rows, in table order; text as bytes."""
+    def rows(
+        self, table: str, columns: Sequence[str], where: tuple[str, object] | None = None
+    ) -> Generator[tuple[Any, ...]]:
+        """These columns of all rows, or of those ``where`` a column has a value, in table order; text as bytes."""
         names = ", ".join(f'"{name}"' for name in columns)
+        chosen = f' WHERE "{where[0]}" IS ?' if where else ""
         left = int(_MAX_EXPANSION * self._size)
-        for row in self._query(f'SELECT {names} FROM "{table}" NOT INDEXED'):  # noqa: S608
+        for row in self._query(f'SELECT {names} FROM "{table}" NOT INDEXED{chosen}', where[1:] if where else ()):  # noqa: S608
             left -= _ROW_BYTES + sum(len(value) for value in row if isinstance(value, bytes))
             if left < 0:
                 raise McaptrackError(f"{self.path} is damaged: its table {table} holds more than the file can")
@@ -163,17 +166,18 @@ class SqliteTables:
 
         self._database.set_authorizer(may)
 
-    def _query(self, query: str) -> Iterator[tuple[Any, ...]]:
+    def _query(self, query: str, values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
         self._steps = 0
         try:
-            yield from self._database.execute(query)
+            yield from self._database.execute(query, values)
         except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:  # messages of SQLite may quote damaged text
             if self._interruption is not None:
                 raise self._interruption from None
             why = "it can't be understood" if isinstance(error, UnicodeDecodeError) else str(error)
             if self._steps > self._max_steps:
                 why = "its tables go on for longer than the file can"
-            raise McaptrackError(f"{self.path} is damaged: {why}") from None
+            saved = "; `sqlite3 FILE .recover` may save a part of it" if "malformed" in why else ""
+            raise McaptrackError(f"{self.path} is damaged: {why}{saved}") from None
 
 
 def _text(value: Any) -> str:

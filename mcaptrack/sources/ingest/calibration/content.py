@@ -24,7 +24,7 @@ from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
 from mcaptrack.sources.calibrations import calibration_of
-from mcaptrack.sources.ingest.bags.plain_yaml import Scalar, UnsupportedYamlError, XmlReader, load
+from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError, XmlReader, load
 
 #: Names of values in files of OpenCV, in small letters and without "_", "-" and blanks.
 _MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1")
@@ -164,7 +164,7 @@ class _Xml(XmlReader):
 
     def end(self, name: str) -> None:
         _, inner, text = self._open.pop()
-        value: Any = Scalar.of("".join(text).strip().strip('"'), is_plain=True)
+        value: Any = "".join(text).strip().strip('"')
         if inner and all(key == "_" for key, _ in inner):
             value = [item for _, item in inner]
         elif inner:
