@@ -9,6 +9,8 @@ from __future__ import annotations
 import re
 import struct
 from array import array
+from bisect import bisect_left, insort
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -43,7 +45,9 @@ from mcaptrack.sources.video.passthrough import check_stream, packets
 
 #: A fixed number of threads, so that damaged streams decode to the same pictures on every machine.
 _THREADS: Final = 4
+_PLACEHOLDER: Final = 1  # bytes of a packet that stands for no picture in AVI, as encoders with B-frames begin
 _ONE_EACH: Final = ("h264", "hevc")  # codecs with a picture in each packet, if it has no fields
+_MOST_DAMAGED: Final = 250  # packets at the beginning without a picture, after which a stream is given up
 _HDR: Final = {16: "PQ", 18: "HLG"}  # AVCOL_TRC_SMPTE2084, AVCOL_TRC_ARIB_STD_B67
 
 
@@ -74,6 +78,8 @@ class DecodedPicture(NamedTuple):
 
 _RIFF_HEAD, _CHUNK_HEAD, _IVF_FRAME_HEAD = 12, 8, 12
 _LISTS: Final = (b"movi", b"rec ")
+#: Packets by which the order of decoding is known, and the most pictures that are shown between two and decoded later.
+_SEEN_FOR_ORDER, _MOST_BETWEEN = 100, 16
 
 
 def count_slots(path: Path, stream: int) -> int | None:
@@ -109,6 +115,51 @@ def _ivf(file: FileIO, size: int, first: int) -> int:
         at += _IVF_FRAME_HEAD + int.from_bytes(file.read(4), "little")
         count += at <= size
     return count
+
+
+def in_slots(pictures: Iterator[DecodedPicture], delay: int, slot_s: Fraction) -> Iterator[DecodedPicture]:
+    """Give pictures, in the order in which they are shown, the times of the slots in which they are shown.
+
+    They come with the time of the slot that holds them, slots being in the order of decoding. Picture i is due when the
+    decoder gives it out, with the packet of picture i + ``delay``; the first stays from its own slot on. Slots without
+    a picture are passed over, wherever they are.
+    """
+    waiting: deque[DecodedPicture] = deque()
+    slots: list[Fraction] = []
+    is_first = True
+    for picture in pictures:
+        waiting.append(picture)
+        insort(slots, picture.seconds or Fraction())
+        if len(waiting) > (delay and delay + _MOST_BETWEEN):  # all slots up to that of the first are in the list
+            seconds = min(slots[delay], slots[0] + delay * slot_s) if is_first else slots[delay]
+            yield waiting.popleft()._replace(seconds=seconds)
+            del slots[0]
+            is_first = False
+    slots += [slots[-1] + number * slot_s for number in range(1, delay + 1)] if slots else []
+    for picture, seconds in zip(waiting, slots[delay:], strict=True):
+        yield picture._replace(seconds=min(seconds, slots[0] + delay * slot_s) if is_first else seconds)
+        is_first = False
+
+
+def _delay(path: Path) -> int:
+    """How many packets with pictures later a decoder gives a picture out, by the first of them; 0 if all are in order."""
+    import av
+
+    order, given_out = list[int](), list[int | None]()
+    with reading(path) as opened:
+        stream = videos(opened)[0]
+        for number, packet in zip(range(_SEEN_FOR_ORDER), opened.demux(stream), strict=False):
+            packet.pts = packet.dts = number
+            try:
+                frames = packet.decode()
+            except av.error.FFmpegError:
+                continue
+            order += [frame.pts for frame in frames]
+            given_out += [frame.dts for frame in frames]
+    in_order = sorted(order)
+    if order == in_order:
+        return 0
+    return max(bisect_left(in_order, number) - at for at, number in enumerate(given_out) if number is not None)
 
 
 # Times of pictures as messages: strictly increasing; and what is odd about those of the container.
@@ -336,7 +387,7 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
         if context is None:
             raise McaptrackError(f"{path} holds video in an unknown codec; convert it to H.264 first")
         check_size(context.width, context.height, path)
-        first = next(opened.decode(stream), None)
+        first = _first_picture(opened, stream)
         if first is None:
             hides = count_edited(path)
             why = f"without frames{f': its edit list hides all {hides} of them' if hides else ''}"
@@ -378,6 +429,24 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
         video.format = "h264" if check.why_not else check.format
     _make_even(video)
     return video
+
+
+def _first_picture(opened: Any, stream: Any) -> Any:
+    """The first picture that can be decoded, None if there is none. Raises FFmpegError if none of the first can be."""
+    import av
+
+    why = None
+    for tried, packet in enumerate(opened.demux(stream)):
+        try:
+            for picture in packet.decode():
+                return picture
+        except av.error.FFmpegError as error:
+            why = why or error
+            if tried >= _MOST_DAMAGED:
+                break
+    if why is not None:
+        raise why
+    return None
 
 
 def _make_even(video: Video) -> None:
@@ -516,7 +585,8 @@ def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
 def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
     """All decoded pictures; those that can't be read are added to ``lost``."""
     if video.images is None:
-        yield from _decoded(video)
+        slot_s = 1 / video.fps if video.has_slots and video.fps else None
+        yield from in_slots(_decoded(video), _delay(video.path), slot_s) if slot_s else _decoded(video)
         return
     for path, place in zip(video.images.paths, video.images.place, strict=True):
         image = read_image(path)
@@ -530,9 +600,8 @@ def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
 def _decoded(video: Video) -> Iterator[DecodedPicture]:
     import av
 
-    packets_given, read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, 0, None
+    packets_given, read, failed, damaged, hidden, cut_off, last_s = 0, 0, 0, 0, 0, 0, None
     why, has_fields = "", False
-    slots: list[int] = []
     with reading(video.path) as opened:
         stream = videos(opened)[0]
         stream.thread_type = "AUTO"
@@ -546,17 +615,19 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
                     break
                 hidden += packet.is_discard
                 cut_off += packet.is_corrupt
+                if video.has_slots and 0 < packet.size <= _PLACEHOLDER:
+                    continue
                 packets_given += packet.size > 0 and not packet.is_discard
-                if video.has_slots and packet.size:
-                    slots.append(len(slots) if packet.dts is None else packet.dts)
+                if video.has_slots:
+                    packet.pts = packet.dts  # comes back with its picture
                 frames = packet.decode()
             except av.error.FFmpegError as error:
                 why = why or f" ({error.strerror or error})"
                 failed += 1
                 continue
             for frame in frames:
-                ticks = slots[min(read + failed, len(slots) - 1)] if slots else frame.pts
-                seconds = None if ticks is None else ticks * base
+                seconds = None if frame.pts is None else frame.pts * base
+                last_s = seconds if last_s is None or seconds is None else max(last_s, seconds)
                 damaged += frame.is_corrupt
                 has_fields |= frame.interlaced_frame
                 yield DecodedPicture(read + failed, seconds, frame)
@@ -571,4 +642,4 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
         video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
     if damaged:
         video.lost.append(f"{video.path}: {damaged} of {read} frames are damaged; they are kept as far as they decode")
-    video.note_missing(read, hidden + failed, seconds)
+    video.note_missing(read, hidden + failed, last_s)
