@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import mmap
 import re
+from collections.abc import Sequence
 from fractions import Fraction
+from itertools import combinations
 from math import gcd
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -18,10 +20,18 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
 from mcaptrack.geometry.clocks import parse_fps
+from mcaptrack.notices import warn
 from mcaptrack.sources.video.limits import check_still, still_size
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-_NUMBERED: Final = re.compile(r"(.*?)([0-9]{1,18})(\D*)")
+#: Pictures of other kinds, which are not read; a folder that holds some is not all read.
+_OTHERS: Final = (".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm", ".pnm", ".jp2", ".exr", ".dng")
+_RUNS: Final = re.compile(r"([0-9]+)")
+#: What stands before the number of a camera, or of a video, in the name of a picture.
+_CAMERA: Final = re.compile(
+    r"(?:.*[^a-z])?(?:c|ch|channel|cam|camera|kamera|view|lens|sensor|stream|device|video|clip|seq|sequence|scene)[_-]?"
+)
+_CAMERA_DIGITS, _ONE_RUN = 3, 3  # digits of such a number; parts of a name that has a number only
 #: Numbers in names count as frame numbers if at least this share of them exists.
 _DENSE: Final = 0.5
 _SHOWN: Final = 3
@@ -31,36 +41,104 @@ class Images(NamedTuple):
     """The images of a folder in order: ``place`` (P,) is their position in the sequence, with gaps for missing ones.
 
     ``every`` is the step of the numbers in their names: 12 if every twelfth picture was kept with its number.
+    ``missing`` and ``notes`` say what is not there, and what was assumed or passed over.
     """
 
     paths: list[Path]
     place: list[int]
     every: int
     missing: str
+    notes: tuple[str, ...] = ()
+
+
+class _Name(NamedTuple):
+    """The name of an image: ``series`` is what all pictures of one camera share, ``numbers`` are the others in it."""
+
+    series: str
+    numbers: tuple[int, ...]
 
 
 def find_images(folder: Path) -> Images:
-    """The images of a folder. Raises McaptrackError if there are none."""
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_order)
+    """The images of a folder. Raises McaptrackError if there are none, or those of several cameras."""
+    files = sorted(folder.iterdir(), key=natural_order)
+    named = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    paths = [path for path in named if not path.name.startswith(".")]
     if not paths:
-        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)})")
-    in_order = Images(paths, list(range(len(paths))), 1, "")
-    named = [_NUMBERED.fullmatch(path.name) for path in paths]
-    if len({(name[1], name[3]) if name else None for name in named}) > 1 or None in named:
+        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}){_instead(files)}")
+    notes = []
+    if hidden := [path.name for path in named if path.name.startswith(".")]:
+        notes.append(f"{folder}: {len(hidden)} hidden files are passed over ({_some(hidden)})")
+    if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:
+        warn(f"{folder}: {len(others)} images of kinds that are not read are left out ({_some(others)})", "left-out")
+    names = [_name_of(path) for path in paths]
+    _refuse_several(folder, paths, names)
+    text = f"{folder}: the names of its images don't count pictures; they follow one another in the order of their names"
+    in_order = Images(paths, list(range(len(paths))), 1, "", (*notes, *([text] if len(paths) > 1 else [])))
+    if len({(name.series, name.numbers[:-1]) for name in names}) > 1 or not names[0].numbers:
         return in_order
-    numbers = [int(name[2]) for name in named if name]
+    numbers = [name.numbers[-1] for name in names]
     every = gcd(*(number - numbers[0] for number in numbers)) or 1
     place = [(number - numbers[0]) // every for number in numbers]
     if place != sorted(set(place)) or len(place) < _DENSE * (place[-1] + 1):
         return in_order
-    gone = sorted(set(range(place[-1] + 1)) - set(place))
-    text = ", ".join(str(numbers[0] + every * at) for at in gone[:_SHOWN]) + (", ..." if len(gone) > _SHOWN else "")
-    return Images(paths, place, every, f"{len(gone)} of {place[-1] + 1} numbered images ({text})" if gone else "")
+    gone = [str(numbers[0] + every * at) for at in sorted(set(range(place[-1] + 1)) - set(place))]
+    missing = f"{len(gone)} of {place[-1] + 1} numbered images ({_some(gone)})" if gone else ""
+    return Images(paths, place, every, missing, tuple(notes))
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+
+
+def _instead(files: Sequence[Path]) -> str:
+    """What could be given instead of a folder without images."""
+    if folders := [path.name for path in files if path.is_dir() and _has_images(path)]:
+        return f"; its folders do: give one, such as {folders[0]}"
+    if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:
+        return f"; convert those it holds, such as {others[0]}, to JPEG or PNG"
+    return ""
+
+
+def _has_images(folder: Path) -> bool:
+    try:
+        return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
+    except OSError:
+        return False
+
+
+def _name_of(path: Path) -> _Name:
+    texts = _RUNS.split(path.stem.lower())
+    series, numbers = texts[0], []
+    for before, digits, after in zip(texts[::2], texts[1::2], texts[2::2], strict=False):
+        is_camera = len(texts) > _ONE_RUN and len(digits) <= _CAMERA_DIGITS and _CAMERA.fullmatch(before)
+        series += (digits if is_camera else "*") + after
+        numbers += [] if is_camera else [int(digits)]
+    return _Name(series, tuple(numbers))
+
+
+def _refuse_several(folder: Path, paths: Sequence[Path], names: Sequence[_Name]) -> None:
+    """Raise McaptrackError if images of several cameras lie in one folder, or several images of one number."""
+    series: dict[str, dict[tuple[int, ...], Path]] = {}
+    for path, name in zip(paths, names, strict=True):
+        other = series.setdefault(name.series, {}).setdefault(name.numbers, path)
+        if other != path and name.numbers:
+            raise McaptrackError(f"{folder} holds two images of one number, {other.name} and {path.name}; keep one")
+    several = {text: numbers for text, numbers in series.items() if len(numbers) > 1}
+    for (text, numbers), (other_text, others) in combinations(several.items(), 2):
+        is_like = _RUNS.sub("*", text) == _RUNS.sub("*", other_text)  # only the number of the camera is another one
+        overlaps = max(min(numbers), min(others)) <= min(max(numbers), max(others))
+        shared = numbers.keys() & others.keys()
+        if (is_like and overlaps) or len(shared) >= _DENSE * min(len(numbers), len(others)):
+            raise McaptrackError(
+                f"{folder} holds {len(several)} series of images of the same numbers, such as {text} "
+                f"({len(numbers)} images) and {other_text} ({len(others)}), and a video is of one camera; give each a "
+                "folder of its own"
+            )
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key for natural order: 2.jpg comes before 10.jpg."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name) if part]
+    """Sort key for natural order: 2.jpg comes before 10.jpg, and b.JPG before C.jpg."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in _RUNS.split(path.name.lower()) if part]
 
 
 def read_image(path: Path) -> NDArray[np.uint8] | None:

@@ -6,7 +6,6 @@ and encoded again, and the reason is reported.
 
 from __future__ import annotations
 
-import re
 import struct
 from array import array
 from bisect import bisect_left, insort
@@ -30,12 +29,13 @@ from mcaptrack.sources.video.container import (
     count_edited,
     count_empty,
     count_indexed,
+    choose_stream,
+    ends_s,
     fraction,
     has_sizes,
     has_slots,
     has_times,
     reading,
-    videos,
 )
 from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
@@ -141,13 +141,13 @@ def in_slots(pictures: Iterator[DecodedPicture], delay: int, slot_s: Fraction) -
         is_first = False
 
 
-def _delay(path: Path) -> int:
+def _delay(video: Video) -> int:
     """How many packets with pictures later a decoder gives a picture out, by the first of them; 0 if all are in order."""
     import av
 
     order, given_out = list[int](), list[int | None]()
-    with reading(path) as opened:
-        stream = videos(opened)[0]
+    with reading(video.path) as opened:
+        stream = opened.streams[video.stream]
         for number, packet in zip(range(_SEEN_FOR_ORDER), opened.demux(stream), strict=False):
             packet.pts = packet.dts = number
             try:
@@ -169,6 +169,8 @@ def _delay(path: Path) -> int:
 #: of milliseconds. An interval is a gap if at least two pictures would fit between.
 _REGULAR, _ALIKE, _TICK_NS, _GAP = 0.9, 0.1, 1_500_000, 2.5
 _FEWEST: Final = 10
+#: A clock that goes back by more begins again; pictures are never so much out of order.
+_RESTART_NS: Final = NS_PER_S
 
 
 class Clock:
@@ -180,6 +182,9 @@ class Clock:
         self._first: Fraction | None = None
         self._times = array("q")
         self._moved, self._first_moved = 0, 0
+        #: What is added to the times of the container since its clock began again, and what was added before that.
+        self._shift_ns, self._before_ns = 0, 0
+        self._restarts: list[int] = []
 
     def time(self, index: int, seconds: Fraction | None) -> int:
         """The time of picture ``index``, which is ``seconds`` in the container."""
@@ -192,7 +197,7 @@ class Clock:
         else:
             self._first = seconds if self._first is None else self._first
             seconds -= self._first
-        t_ns = self._start_ns + round(seconds * NS_PER_S)
+        t_ns = self._continued(index, self._start_ns + round(seconds * NS_PER_S))
         if not 0 <= t_ns < LAST_NS:
             raise McaptrackError(
                 f"{self._where}: picture {index} is {float(seconds):g} s after the first; times reach to the year 2262"
@@ -204,8 +209,27 @@ class Clock:
         self._times.append(t_ns)
         return t_ns
 
+    def _continued(self, index: int, t_ns: int) -> int:
+        """The time of picture ``index`` that is ``t_ns`` by the clock of the container, which may have begun again."""
+        last = self._times[-1] if self._times else t_ns
+        if t_ns + self._shift_ns < last - _RESTART_NS:
+            steps = np.diff(np.frombuffer(self._times, np.int64)[-_SEEN_FOR_ORDER:])
+            self._before_ns = self._shift_ns
+            self._shift_ns = last + (int(np.median(steps)) if len(steps) else NS_PER_S) - t_ns
+            self._restarts.append(index)
+        elif 0 < t_ns + self._before_ns - last < _RESTART_NS < t_ns + self._shift_ns - last:
+            self._shift_ns = self._before_ns  # only some pictures had other times
+        return t_ns + self._shift_ns
+
     def warn(self) -> None:
         """Warn about times that had to be moved, and about gaps in regular ones."""
+        if self._restarts:
+            times = "once" if len(self._restarts) == 1 else f"{len(self._restarts)} times"
+            warn(
+                f"{self._where}: the clock goes back {times}, first before picture {self._restarts[0]}, as where files "
+                "were joined; what follows is put one interval after what came before (`fps=` spaces all evenly)",
+                "clock",
+            )
         if self._moved:
             warn(
                 f"{self._where}: {self._moved} of {len(self._times)} pictures are not later than the one before, "
@@ -333,7 +357,7 @@ class Video:
     lost: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     has_slots: bool = False
-    length_s: Fraction | None = None
+    ends_s: Fraction | None = None
     orientation: Orientation = Orientation()  # immutable
 
     @property
@@ -357,7 +381,7 @@ class Video:
         if self.has_slots and self.fps and last_s is not None:
             hidden += round(last_s * self.fps) + 1 - read  # empty slots
         if self.frames and read + hidden < self.frames:
-            edited = 0 if self.images else count_edited(self.path)
+            edited = 0 if self.images else count_edited(self.path, self.stream)
             if edited:
                 self.notes.append(f"{self.path}: an edit list hides {edited} of its {self.frames} frames")
             if read + hidden + edited >= self.frames:
@@ -366,30 +390,26 @@ class Video:
             if slots is not None and slots >= self.frames:
                 return  # the file is complete: the others are empty slots, or reported as lost
             self.lost.append(f"{self.path} claims {self.frames} frames; {read} could be read")
-        elif not self.frames and self.length_s and last_s is not None and self.fps:
-            gap = self.length_s - last_s
-            if gap > max(Fraction(1, 2), 3 / self.fps):
-                ends = f"its pictures end at {float(last_s):.2f} s"
-                self.lost.append(f"{self.path} says it is {float(self.length_s):.2f} s long; {ends}")
+        elif not self.frames and self.ends_s and last_s is not None and self.fps:
+            missing_s = self.ends_s - last_s
+            if missing_s > max(Fraction(1, 2), 3 / self.fps):
+                self.lost.append(f"{self.path} lacks the last {float(missing_s):.2f} s that it says it has")
 
 
 def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # noqa: B008  # frozen
     """Open a video file or image folder. Raises McaptrackError if it holds no pictures that can be decoded."""
     if path.is_dir():
         return _open_folder(path, options)
+    chosen = choose_stream(path, options.stream)
     with reading(path) as opened:
-        streams = videos(opened)
-        if not streams:
-            kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
-            raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
-        stream = streams[0]
+        stream = opened.streams[chosen.index]
         context = stream.codec_context
         if context is None:
             raise McaptrackError(f"{path} holds video in an unknown codec; convert it to H.264 first")
         check_size(context.width, context.height, path)
         first = _first_picture(opened, stream)
         if first is None:
-            hides = count_edited(path)
+            hides = count_edited(path, chosen.index)
             why = f"without frames{f': its edit list hides all {hides} of them' if hides else ''}"
             raise McaptrackError(f"{path} is a video {why}")
         if not (has_times(opened) or options.fps):
@@ -407,18 +427,20 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
             f"it is {orientation.description}" if orientation.description else "",
             stream=stream.index,
             has_slots=has_slots(opened),
-            length_s=_length_s(opened, stream),
+            ends_s=ends_s(opened, stream),
             orientation=orientation,
         )
-        if len(streams) > 1:
-            video.notes.append(f"{path} holds {len(streams)} videos; the first is taken")
+        if chosen.is_doubtful:
+            warn(chosen.text, "left-out")
+        elif chosen.text:
+            video.notes.append(chosen.text)
         video.notes += _remarks(path, stream, first, orientation)
         if first.interlaced_frame:
             video.why_transcode = video.why_transcode or "it is interlaced"
     if options.is_still:
         video.why_transcode = ""
     elif not video.why_transcode:
-        check = check_stream(path, options)
+        check = check_stream(path, chosen.index, options)
         video.why_transcode, video.sets = check.why_not, check.sets
         if check.missing:
             places = "1 place" if len(check.missing) == 1 else f"{len(check.missing)} places"
@@ -468,25 +490,18 @@ def _remarks(path: Path, stream: Any, first: Any, orientation: Orientation) -> I
         yield f"{path} is HDR ({_HDR[first.color_trc]}); its brightness stays as stored, which may not suit detectors"
 
 
-def _length_s(opened: Any, stream: Any) -> Fraction | None:
-    """The duration of the video stream that the container declares; None if it only declares that of all streams."""
-    declared = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
-    if declared:
-        return int(declared[1]) * 3600 + int(declared[2]) * 60 + Fraction(declared[3])
-    return Fraction(opened.duration, 1_000_000) if opened.duration and len(opened.streams) == 1 else None
-
-
 def _open_folder(path: Path, options: VideoOptions) -> Video:
     images = find_images(path)
-    first = read_image(images.paths[0])
+    first = next((image for path in images.paths if (image := read_image(path)) is not None), None)
     if first is None:
-        raise McaptrackError(f"{images.paths[0]} can't be read as an image")
+        raise McaptrackError(f"{images.paths[0]} can't be read as an image, nor can any other in {path}")
     height, width = first.shape[:2]
     name = options.image_format if options.is_still else "h264"
     why, info = "" if options.is_still else "it is a folder of images", find_seqinfo(path)
     video = Video(
-        path, options, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images
-    )
+        path, options, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images,
+        notes=list(images.notes),
+    )  # fmt: skip
     if images.missing:
         warn(f"{path}: {images.missing} are missing; their times stay empty", "clock")
     if info and info.frames and info.frames != images.place[-1] + 1:
@@ -513,7 +528,7 @@ def _remux(video: Video, clock: Clock) -> Iterator[PictureMessage]:
     index, seconds = 0, None
     group: list[EncodedPicture] = []  # since the last key picture, where only decoding shows whether the last is whole
     with reading(video.path) as opened:
-        for packet in packets(opened, video.format):
+        for packet in packets(opened, video.stream, video.format):
             if packet.is_damaged:  # only the last packet can be damaged
                 video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
                 continue
@@ -527,8 +542,8 @@ def _remux(video: Video, clock: Clock) -> Iterator[PictureMessage]:
             seconds = packet.seconds
             yield PictureMessage(clock.time(index, seconds), index, data)
             index += 1
-        video.frames = video.frames or count_indexed(opened)
-        hidden = count_empty(opened)
+        video.frames = video.frames or count_indexed(opened, video.stream)
+        hidden = count_empty(opened, video.stream)
     if _is_cut(group):
         video.lost.append(f"{video.path} is cut off or damaged in its last picture, which is kept as far as it decodes")
     video.note_missing(index, hidden, seconds)
@@ -586,7 +601,7 @@ def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
     """All decoded pictures; those that can't be read are added to ``lost``."""
     if video.images is None:
         slot_s = 1 / video.fps if video.has_slots and video.fps else None
-        yield from in_slots(_decoded(video), _delay(video.path), slot_s) if slot_s else _decoded(video)
+        yield from in_slots(_decoded(video), _delay(video), slot_s) if slot_s else _decoded(video)
         return
     for path, place in zip(video.images.paths, video.images.place, strict=True):
         image = read_image(path)
@@ -603,7 +618,7 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
     packets_given, read, failed, damaged, hidden, cut_off, last_s = 0, 0, 0, 0, 0, 0, None
     why, has_fields = "", False
     with reading(video.path) as opened:
-        stream = videos(opened)[0]
+        stream = opened.streams[video.stream]
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
         base = fraction(stream.time_base) or Fraction(1)
@@ -632,8 +647,8 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
                 has_fields |= frame.interlaced_frame
                 yield DecodedPicture(read + failed, seconds, frame)
                 read += 1
-        video.frames = video.frames or count_indexed(opened)
-        hidden += count_empty(opened)
+        video.frames = video.frames or count_indexed(opened, video.stream)
+        hidden += count_empty(opened, video.stream)
         if stream.codec_context.name in _ONE_EACH and not has_fields:
             failed = max(failed, packets_given - read)  # FFmpeg passes over some without an error
     if failed:
