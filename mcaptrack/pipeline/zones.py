@@ -106,7 +106,7 @@ def make_zones(
         return {}
     options = watch.options or before.options or ZoneOptions()
     zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
-    topics = watch.topics or _default_topics(state, before)
+    topics = [opened.find(topic, prefix) for topic in watch.topics] or _default_topics(state, before)
     if watch.zones and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
     out: dict[str, Made] = {}

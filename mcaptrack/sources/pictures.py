@@ -66,12 +66,11 @@ def find_pictures(opened: log.Log, topic: str) -> str:
     Raises McaptrackError if there is none, or several.
     """
     topics = [channel.topic for channel in opened.channels.values() if foreign.holds_pictures(channel)]
-    matching = [name for name in topics if topic in (name, name.removeprefix("/"))]
-    matching = matching or [name for name in topics if name.endswith("/" + topic.strip("/"))]
-    if len(matching) != 1:
+    name = opened.find(topic, among=topics)
+    if name not in topics:
         has = f"pictures in {', '.join(sorted(topics))}" if topics else "no pictures"
-        raise McaptrackError(f"{opened.path} has {len(matching) or 'no'} channels {topic} with pictures; it has {has}")
-    return matching[0]
+        raise McaptrackError(f"{opened.path} has no channel {topic} with pictures; it has {has}")
+    return name
 
 
 class Pictures:

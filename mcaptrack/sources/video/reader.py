@@ -26,10 +26,10 @@ from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import (
+    choose_stream,
     count_edited,
     count_empty,
     count_indexed,
-    choose_stream,
     ends_s,
     fraction,
     has_sizes,
@@ -142,7 +142,7 @@ def in_slots(pictures: Iterator[DecodedPicture], delay: int, slot_s: Fraction) -
 
 
 def _delay(video: Video) -> int:
-    """How many packets with pictures later a decoder gives a picture out, by the first of them; 0 if all are in order."""
+    """How many packets with pictures later a decoder gives a picture out; 0 if all are in order. By the first ones."""
     import av
 
     order, given_out = list[int](), list[int | None]()
@@ -224,9 +224,9 @@ class Clock:
     def warn(self) -> None:
         """Warn about times that had to be moved, and about gaps in regular ones."""
         if self._restarts:
-            times = "once" if len(self._restarts) == 1 else f"{len(self._restarts)} times"
+            often = "once" if len(self._restarts) == 1 else f"{len(self._restarts)} times"
             warn(
-                f"{self._where}: the clock goes back {times}, first before picture {self._restarts[0]}, as where files "
+                f"{self._where}: the clock goes back {often}, first before picture {self._restarts[0]}, as where files "
                 "were joined; what follows is put one interval after what came before (`fps=` spaces all evenly)",
                 "clock",
             )

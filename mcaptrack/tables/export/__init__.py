@@ -256,8 +256,7 @@ def export(
         If a channel does not exist or can't be read, and if the folder holds tables of another log with the same name.
     """
     contents = LogTables(opened, boxes)
-    for topic in topics:
-        opened.channel(topic)
+    topics = [opened.channel(opened.find(topic)).topic for topic in topics]
     job = _Job(contents, folder, form, force, Exported())
     if not force:
         refuse_tables_of_another(opened, opened.path, folder)
