@@ -139,5 +139,5 @@ def test_the_name_below_the_camera_is_taken_where_there_are_several(template, tm
         recording.write("/right/tracks", recording.array("tracks", "/camera/tracks")[:0])
         with pytest.raises(McaptrackError, match="has 2 channels tracks: /camera/tracks, /right/tracks"):
             recording.frames("tracks")
-        assert len(list(recording.frames("camera/tracks")))
+        assert list(recording.frames("camera/tracks"))
     assert np.isfinite(len(mcaptrack.events(path, topic="tracks", camera="camera", output=tmp_path / "b.mcap").events))

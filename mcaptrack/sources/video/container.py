@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
@@ -87,42 +87,49 @@ class ChosenStream(NamedTuple):
     is_doubtful: bool
 
 
-def choose_stream(path: Path, number: int | None) -> ChosenStream:
+def choose_stream(opened: Any, path: Path, number: int | None) -> ChosenStream:
     """Choose a video stream: that of a number, or the first of more than one picture, or else the first.
 
     Attached cover pictures are no video. Raises McaptrackError if there is no video, or none of that number.
     """
+    streams = [stream for stream in opened.streams.video if not stream.disposition.value & _COVER]
+    if not streams:
+        kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
+        raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
+    if number is not None and number >= len(streams):
+        numbers = f"0 to {len(streams) - 1}" if len(streams) > 1 else "0 alone"
+        raise McaptrackError(f"{path} has no video stream {number} (`stream=`); there is {numbers}")
+    if len(streams) == 1:
+        return ChosenStream(streams[0].index, "", False)
+    moving = _moving(path, [stream.index for stream in streams])
+    numbered = list(enumerate(streams))
+    kinds = ", ".join(
+        f"{at} ({_kind(stream)}{'' if stream.index in moving else ', a still picture'})" for at, stream in numbered
+    )
+    fitting = [at for at, stream in numbered if stream.index in moving]
+    chosen = number if number is not None else fitting[0] if fitting else 0
+    others = [at for at in fitting if at != chosen and number is None]
+    hint = f"; `stream={others[0]}` takes the other" if others else ""
+    text = f"{path} holds {len(streams)} videos, {kinds}; {chosen} is taken{hint}"
+    return ChosenStream(streams[chosen].index, text, bool(others))
+
+
+def _moving(path: Path, streams: Sequence[int]) -> set[int]:
+    """Those of these streams that have more than one picture, by the first packets of a file."""
     import av
 
     pictures: Counter[int] = Counter()
     with reading(path) as opened:
-        streams = [stream for stream in opened.streams.video if not stream.disposition.value & _COVER]
-        if not streams:
-            kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
-            raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
-        if number is not None and number >= len(streams):
-            numbers = f"0 to {len(streams) - 1}" if len(streams) > 1 else "0 alone"
-            raise McaptrackError(f"{path} has no video stream {number} (`stream=`); there is {numbers}")
-        if len(streams) == 1:
-            return ChosenStream(streams[0].index, "", False)
-        packets = opened.demux(streams)
+        packets = opened.demux([opened.streams[index] for index in streams])
         for _ in range(_MOST_PACKETS):
             try:
                 packet = next(packets, None)
             except av.error.FFmpegError:  # what can be read decides
                 break
-            if packet is None or min(pictures[stream.index] for stream in streams) > 1:
+            if packet is None or min(pictures[index] for index in streams) > 1:
                 break
             pictures[packet.stream_index] += packet.size > 0
-        moving = [at for at, stream in enumerate(streams) if pictures[stream.index] > 1]
-        chosen = number if number is not None else moving[0] if moving else 0
-        kinds = ", ".join(
-            f"{at} ({_kind(stream)}{'' if at in moving else ', a still picture'})" for at, stream in enumerate(streams)
-        )
-        others = [at for at in moving if at != chosen]
-        hint = f"; `stream={others[0]}` takes the other" if others and number is None else ""
-        text = f"{path} holds {len(streams)} videos, {kinds}; {chosen} is taken{hint}"
-        return ChosenStream(streams[chosen].index, text, bool(others) and number is None)
+    return {index for index in streams if pictures[index] > 1}
 
 
 def _kind(stream: Any) -> str:

@@ -72,9 +72,7 @@ def find_images(folder: Path) -> Images:
         warn(f"{folder}: {len(others)} images of kinds that are not read are left out ({_some(others)})", "left-out")
     names = [_name_of(path) for path in paths]
     _refuse_several(folder, paths, names)
-    text = (
-        f"{folder}: the names of its images don't count pictures; they follow one another in the order of names"
-    )
+    text = f"{folder}: the names of its images don't count pictures; they follow one another in the order of names"
     in_order = Images(paths, list(range(len(paths))), 1, "", (*notes, *([text] if len(paths) > 1 else [])))
     if len({(name.series, name.numbers[:-1]) for name in names}) > 1 or not names[0].numbers:
         return in_order

@@ -400,8 +400,8 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
     """Open a video file or image folder. Raises McaptrackError if it holds no pictures that can be decoded."""
     if path.is_dir():
         return _open_folder(path, options)
-    chosen = choose_stream(path, options.stream)
     with reading(path) as opened:
+        chosen = choose_stream(opened, path, options.stream)
         stream = opened.streams[chosen.index]
         context = stream.codec_context
         if context is None:
@@ -575,19 +575,25 @@ def _transcode(video: Video, clock: Clock) -> Iterator[PictureMessage]:
 
 def _fitted(video: Video, picture: Any) -> Any:
     fitted, is_scaled = fit(picture, video.orientation, video.width_px, video.height_px)
-    text = (
-        f"{video.path}: pictures change their size on the way; all are scaled to {video.width_px} x {video.height_px}"
-    )
-    if is_scaled and text not in video.notes:
-        video.notes.append(text)
+    if is_scaled:
+        _note_sizes(video, f"all are scaled to {video.width_px} x {video.height_px}")
     return fitted
+
+
+def _note_sizes(video: Video, what_is_done: str) -> None:
+    text = f"{video.path}: pictures change their size on the way; {what_is_done}"
+    if text not in video.notes:
+        video.notes.append(text)
 
 
 def _encode_stills(video: Video, clock: Clock) -> Iterator[PictureMessage]:
     name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
     for index, seconds, picture in _decoded_pictures(video):
-        data = encode_image(video.orientation.of(picture), name, video.options.jpeg_quality)
-        del picture
+        image = video.orientation.of(picture)
+        if image.shape[:2] != (video.height_px, video.width_px):
+            _note_sizes(video, "each is kept in its own, which trackers don't expect")
+        data = encode_image(image, name, video.options.jpeg_quality)
+        del picture, image
         yield PictureMessage(clock.time(index, seconds), index, data)
 
 
