@@ -186,7 +186,7 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
         if other != log.path:
             raise McaptrackError(
                 f"the results of {other} and {log.path} would both be {name}; process them one by one, each with "
-                "a name of its own (`output=`), or give the folder that holds both logs, which keeps folders below it apart"
+                "a name of its own (`output=`), or give the folder that holds both, which keeps those below it apart"
             )
     return list(names)
 
