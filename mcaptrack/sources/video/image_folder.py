@@ -12,13 +12,14 @@ from fractions import Fraction
 from itertools import combinations
 from math import gcd
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
+from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.clocks import parse_fps
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.limits import check_still, still_size
@@ -35,6 +36,10 @@ _CAMERA_DIGITS, _ONE_RUN = 3, 3  # digits of such a number; parts of a name that
 #: Numbers in names count as frame numbers if at least this share of them exists.
 _DENSE: Final = 0.5
 _SHOWN: Final = 3
+#: Images in which the range of values is measured, values of each, and the share of the darkest and brightest cut off.
+_MEASURED, _SAMPLES, _CUT_OFF = 24, 100_000, 0.0002
+#: The values that become black and white.
+Span = tuple[float, float]
 
 
 class Images(NamedTuple):
@@ -141,11 +146,42 @@ def natural_order(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in _RUNS.split(path.name.lower()) if part]
 
 
-def read_image(path: Path) -> NDArray[np.uint8] | None:
+def read_image(path: Path, span: Span | None = None) -> Image | None:
     """An image, BGR (height, width, 3), upright; None if it can't be decoded.
 
-    Raises McaptrackError if it is too large, or not a file.
+    Values of more than 8 bits are scaled by ``span``. Raises McaptrackError if it is too large, or not a file.
     """
+    values = _read_values(path)
+    if values is None or values.dtype == np.uint8:
+        return values
+    low, high = span or (0.0, 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max))
+    shares = (np.nan_to_num(values.astype(np.float32), nan=low) - low) * (255 / max(high - low, 1e-30))
+    return np.asarray(np.rint(np.clip(shares, 0, 255)), np.uint8)
+
+
+def measure_span(paths: Sequence[Path]) -> Span | None:
+    """The values that become black and white in images of more than 8 bits; None for others.
+
+    They are nearly the least and the greatest of images all over the folder. Values that stand for none don't count: 0,
+    the greatest whole number, and what is not finite.
+    """
+    pooled: list[Floats] = []
+    for at in np.unique(np.linspace(0, len(paths) - 1, min(_MEASURED, len(paths))).astype(int)).tolist():
+        values = _read_values(paths[at])
+        if values is None:
+            continue
+        if values.dtype == np.uint8:
+            return None
+        most = np.inf if values.dtype.kind == "f" else np.iinfo(values.dtype).max
+        some = values.reshape(-1)[:: max(1, values.size // _SAMPLES)].astype(np.float64)
+        pooled.append(some[np.isfinite(some) & (some != 0) & (some != most)])
+    known = np.concatenate([*pooled, np.empty(0)])
+    low, high = np.quantile(known, [_CUT_OFF, 1 - _CUT_OFF]).tolist() if len(known) else (0.0, 0.0)
+    return (low, high) if high > low else None
+
+
+def _read_values(path: Path) -> NDArray[Any] | None:
+    """An image as it is stored, in three channels."""
     import cv2
 
     refuse_special(path)
@@ -156,8 +192,12 @@ def read_image(path: Path) -> NDArray[np.uint8] | None:
     if size is None:
         return None
     check_still(size, path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    return None if image is None else np.asarray(image, np.uint8)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image is None:  # floats in one channel
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is not None and image.ndim == 2:
+        image = cv2.merge([image] * 3)
+    return image
 
 
 # The seqinfo.ini of a MOTChallenge sequence: its frame rate, and how many frames it has.

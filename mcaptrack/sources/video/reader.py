@@ -39,7 +39,7 @@ from mcaptrack.sources.video.container import (
 )
 from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
-from mcaptrack.sources.video.image_folder import Images, find_images, find_seqinfo, read_image
+from mcaptrack.sources.video.image_folder import Images, Span, find_images, find_seqinfo, measure_span, read_image
 from mcaptrack.sources.video.limits import check_h264, check_size
 from mcaptrack.sources.video.passthrough import check_stream, packets
 
@@ -337,9 +337,10 @@ class Video:
 
     ``format`` is the format of its messages ("h264", "vp9", "jpeg" and so on), ``width_px`` and ``height_px`` their
     size. ``frames`` is the number of frames that the container declares, 0 if it doesn't. ``start_ns`` is the recording
-    time, if the container has it. ``images`` are those of a folder; ``every`` is the step of the numbers in their
-    names. ``why_transcode`` is empty for streams that are passed through, and for stills. While pictures are read,
-    ``lost`` collects what could not be read, and ``notes`` what else is worth reporting.
+    time, if the container has it, and ``ends_s`` when it says that its pictures end. ``images`` are those of a folder;
+    ``every`` is the step of the numbers in their names, and ``span`` has their values that become black and white, if
+    these have more than 8 bits. ``why_transcode`` is empty for streams that are passed through, and for stills. While
+    pictures are read, ``lost`` collects what could not be read, and ``notes`` what else is worth reporting.
     """
 
     path: Path
@@ -359,6 +360,7 @@ class Video:
     has_slots: bool = False
     ends_s: Fraction | None = None
     orientation: Orientation = Orientation()  # immutable
+    span: Span | None = None
 
     @property
     def every(self) -> int:
@@ -492,7 +494,8 @@ def _remarks(path: Path, stream: Any, first: Any, orientation: Orientation) -> I
 
 def _open_folder(path: Path, options: VideoOptions) -> Video:
     images = find_images(path)
-    first = next((image for path in images.paths if (image := read_image(path)) is not None), None)
+    span = measure_span(images.paths)
+    first = next((image for path in images.paths if (image := read_image(path, span)) is not None), None)
     if first is None:
         raise McaptrackError(f"{images.paths[0]} can't be read as an image, nor can any other in {path}")
     height, width = first.shape[:2]
@@ -500,8 +503,11 @@ def _open_folder(path: Path, options: VideoOptions) -> Video:
     why, info = "" if options.is_still else "it is a folder of images", find_seqinfo(path)
     video = Video(
         path, options, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images,
-        notes=list(images.notes),
+        notes=list(images.notes), span=span,
     )  # fmt: skip
+    if span:
+        low, high = (f"{value:.4g}" for value in span)
+        video.notes.append(f"{path}: values from {low} to {high}, as measured in it, are shown as black to white")
     if images.missing:
         warn(f"{path}: {images.missing} are missing; their times stay empty", "clock")
     if info and info.frames and info.frames != images.place[-1] + 1:
@@ -610,7 +616,7 @@ def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
         yield from in_slots(_decoded(video), _delay(video), slot_s) if slot_s else _decoded(video)
         return
     for path, place in zip(video.images.paths, video.images.place, strict=True):
-        image = read_image(path)
+        image = read_image(path, video.span)
         if image is None:
             video.lost.append(f"{path} can't be read as an image; it is left out")
         else:
