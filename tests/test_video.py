@@ -120,7 +120,7 @@ def _renamed_codec(path):
 
 BAD = {
     "no video": (lambda p: p.write_text("I am text"), "can't be read as a video"),
-    "nothing": (lambda p: p.write_bytes(b""), "can't be read as a video"),
+    "nothing": (lambda p: p.write_bytes(b""), "is empty, and no video"),
     "cut off": (
         lambda p: (write_clip(p, options=NO_B), p.write_bytes(p.read_bytes()[: p.stat().st_size // 2])),
         "can't be read as a video",

@@ -454,7 +454,7 @@ def _check_options(function: Callable[..., Any], options: Mapping[str, Any], nam
     takes_all = inspect.Parameter.VAR_KEYWORD in kinds.values()
     for key in options:
         if key in (log, *own):
-            raise McaptrackError(f"{name}: each log gets a {key} of its own; leave it out of the options")
+            raise McaptrackError(f"{name}: each log has its own {key}; leave it out of the options")
         if key not in named and not (takes_all and isinstance(key, str)):
             close = did_you_mean(str(key), named)
             raise McaptrackError(f"{name} has no option {key!r:.60}; {close}it has {list_names(named)}")
