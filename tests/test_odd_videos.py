@@ -16,8 +16,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.sources.video import VideoOptions, open_video
 from mcaptrack.sources.video.passthrough import Holes, transport_faults
-from mcaptrack.sources.video.reader import Clock, images, orientation_of
-from tests.worlds import write_clip
+from mcaptrack.sources.video.reader import Clock, orientation_of
+from tests.worlds import upright, write_clip
 
 NO_B = {"bf": "0", "g": "10"}
 ONE = 0x10000
@@ -305,7 +305,7 @@ def numbers(path: Path, **options) -> list[tuple[int, float]]:
     """The number of each picture of a video, and its time in a log in seconds after the first."""
     video = open_video(path, VideoOptions(**options))
     times = [picture.t_ns for picture in video.pictures()]
-    shown = [round((float(image.mean()) - 8.6) / 6) for _, image in images(video)]
+    shown = [round((float(image.mean()) - 8.6) / 6) for image in upright(path)]
     return [(number, round((t_ns - times[0]) / 1e9, 3)) for number, t_ns in zip(shown, times, strict=True)]
 
 

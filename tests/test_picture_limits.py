@@ -29,10 +29,9 @@ from mcaptrack.sources.video import EncodedPicture, PixelLayout, VideoOptions, d
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.image_folder import find_images
 from mcaptrack.sources.video.limits import ENVIRONMENT, still_size
-from mcaptrack.sources.video.reader import images as upright_images
 from tests.commands import start
 from tests.tiers import one_in
-from tests.worlds import ids, ns, write_clip
+from tests.worlds import ids, ns, upright, write_clip
 
 SUFFIXES = ("png", "jpg", "bmp", "webp", "tif", "avif")
 
@@ -298,7 +297,7 @@ def test_images_of_more_than_8_bits_are_shown_by_the_range_measured_in_their_fol
         cv2.imwrite(str(tmp_path / f"{number}{end}"), cv2.merge([(shares * most * gain).astype(kind)] * 3))
     video = open_video(tmp_path, VideoOptions(fps=Fraction(10)))
     low, high = 0.1 * most, most
-    for gain, (_, image) in zip((1, 0.5), upright_images(video), strict=True):
+    for gain, image in zip((1, 0.5), upright(tmp_path, fps=Fraction(10)), strict=True):
         wanted = (shares * most * gain - low) * 255 / (high - low)
         assert np.abs(image[..., 0] - wanted).max() < 2
     assert video.notes == [

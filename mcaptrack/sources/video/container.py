@@ -79,7 +79,7 @@ def _url(path: Path) -> str:
 
 class ChosenStream(NamedTuple):
     """The video stream that is read of a file: its index among all streams, and what is said of the choice, ""
-    where there is none. ``is_doubtful``: another stream moves, too, and nobody chose.
+    where there is none. ``is_doubtful``: another stream moves, too, and no number was given.
     """
 
     index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here

@@ -96,7 +96,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _instead(files: Sequence[Path]) -> str:
-    """What could be given instead of a folder without images."""
+    """A hint for a folder without images: what to give instead."""
     if folders := [path.name for path in files if path.is_dir() and _has_images(path)]:
         return f"; its folders do: give one, such as {folders[0]}"
     if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:

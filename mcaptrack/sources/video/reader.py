@@ -142,7 +142,7 @@ def in_slots(pictures: Iterator[DecodedPicture], delay: int, slot_s: Fraction) -
 
 
 def _delay(video: Video) -> int:
-    """How many packets with pictures later a decoder gives a picture out; 0 if all are in order. By the first ones."""
+    """The number of packets after which a decoder gives a picture out, by its first pictures; 0 if all are in order."""
     import av
 
     order, given_out = list[int](), list[int | None]()
@@ -601,12 +601,6 @@ def _encode_stills(video: Video, clock: Clock) -> Iterator[PictureMessage]:
         data = encode_image(image, name, video.options.jpeg_quality)
         del picture, image
         yield PictureMessage(clock.time(index, seconds), index, data)
-
-
-def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
-    """Decoded pictures, BGR (height, width, 3), upright, each after its time in seconds."""
-    for _, seconds, picture in _decoded_pictures(video):
-        yield seconds, video.orientation.of(picture)
 
 
 def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
