@@ -255,6 +255,15 @@ def test_images_of_several_cameras_are_no_video(tmp_path, names):
         find_images(images(tmp_path / "images", *names))
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux")
+def test_names_of_images_need_not_be_text(tmp_path):
+    folder = images(tmp_path / "images", "1.png", "2.png")
+    folder = folder.rename(tmp_path / "\udcff")
+    (folder / "1.png").rename(folder / "1\udcff.png")
+    (folder / "2.png").rename(folder / "2\udcff.png")
+    assert len(upright(folder, fps=Fraction(10))) == 2
+
+
 def test_two_images_of_one_number_are_refused(tmp_path):
     with pytest.raises(McaptrackError, match=r"holds two images of one number, 1\.jpg and 1\.png; keep one"):
         find_images(images(tmp_path / "images", "0.png", "1.png", "1.jpg"))

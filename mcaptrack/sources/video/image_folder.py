@@ -32,6 +32,7 @@ _RUNS: Final = re.compile(r"([0-9]+)")
 _CAMERA: Final = re.compile(
     r"(?:.*[^a-z])?(?:c|ch|channel|cam|camera|kamera|view|lens|sensor|stream|device|video|clip|seq|sequence|scene)[_-]?"
 )
+_MOST_CAMERAS: Final = 64
 _CAMERA_DIGITS, _ONE_RUN = 3, 3  # digits of such a number; parts of a name that has a number only
 #: Numbers in names count as frame numbers if at least this share of them exists.
 _DENSE: Final = 0.5
@@ -129,6 +130,8 @@ def _refuse_several(folder: Path, paths: Sequence[Path], names: Sequence[_Name])
         if other != path and name.numbers:
             raise McaptrackError(f"{folder} holds two images of one number, {other.name} and {path.name}; keep one")
     several = {text: numbers for text, numbers in series.items() if len(numbers) > 1}
+    if len(several) > _MOST_CAMERAS:
+        return  # names without a system, such as digests
     for (text, numbers), (other_text, others) in combinations(several.items(), 2):
         is_like = _RUNS.sub("*", text) == _RUNS.sub("*", other_text)  # only the number of the camera is another one
         overlaps = max(min(numbers), min(others)) <= min(max(numbers), max(others))
@@ -192,9 +195,10 @@ def _read_values(path: Path) -> NDArray[Any] | None:
     if size is None:
         return None
     check_still(size, path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    content = np.fromfile(path, np.uint8)  # OpenCV ends the process for names that are not UTF-8
+    image = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image is None:  # floats in one channel
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     if image is not None and image.ndim == 2:
         image = cv2.merge([image] * 3)
     return image
