@@ -30,6 +30,7 @@ from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
+from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.own_rows import nanoseconds_of, times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures
@@ -276,14 +277,14 @@ class LogReader:
 
     @checked
     def frames(
-        self, topic: str = "video", times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
+        self, topic: str | None = None, times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:
         """Decode the pictures of a channel, or read its rows, in the order of time.
 
         Parameters
         ----------
-        topic : str, default "video"
-            The channel, or the end of its topic: "video" for /camera/video.
+        topic : str, optional
+            The channel, or the end of its topic: "video" for /camera/video; by default the pictures of the only camera.
         times : sequence of int or array of datetime64, optional
             Times in whole nanoseconds: decode the picture that is shown at each, the last one that is not later. By
             default all pictures.
@@ -312,6 +313,7 @@ class LogReader:
 
         """
         with self._now() as opened:
+            topic = _only_pictures(opened) if topic is None else topic
             if (of_rows := _topic_of_rows(opened, topic)) is not None:
                 if times is not None:
                     text = f"`times=` chooses pictures, and {of_rows[0]} holds rows; choose rows by their t_ns"
@@ -547,6 +549,12 @@ def _topics(opened: Log, names: Any) -> set[str]:
             raise McaptrackError(f"`topics=` is a topic, or several, not {name!r:.40}")
         chosen.add(opened.channel(opened.find(name)).topic)
     return chosen
+
+
+def _only_pictures(opened: Log) -> str:
+    """Return the pictures of the only camera, or "video", of which there may be none or several."""
+    pictures = {camera.pictures for camera in cameras(opened) if camera.pictures}
+    return pictures.pop() if len(pictures) == 1 else "video"
 
 
 def _topic_of_rows(opened: Log, topic: str) -> tuple[str, Schema] | None:

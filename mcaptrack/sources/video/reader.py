@@ -148,6 +148,8 @@ def _delay(video: Video) -> int:
     order, given_out = list[int](), list[int | None]()
     with reading(video.path) as opened:
         stream = opened.streams[video.stream]
+        if not stream.codec_context.has_b_frames:
+            return 0
         for number, packet in zip(range(_SEEN_FOR_ORDER), opened.demux(stream), strict=False):
             packet.pts = packet.dts = number
             try:
