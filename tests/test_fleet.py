@@ -90,6 +90,20 @@ class TestWhichLogs:
             fleet.run(fleet_tasks.touch, [folder / "x/same.mcap", folder / "y/same.mcap"], output_dir=folder / "o")
 
     @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"ad": "+"}, "touch has no option 'ad'; did you mean add\\? it has .*add"),
+            ({"log": "x"}, "touch: each log has its own log"),
+            ({"output": "x"}, "touch: each log has its own output"),
+            ({1: 2}, "touch has no option 1; it has"),
+        ],
+    )
+    def test_an_option_that_the_function_does_not_take_is_refused_before_it_begins(self, folder, options, words):
+        with pytest.raises(McaptrackError, match=words):
+            fleet.run(fleet_tasks.touch, folder, options, output_dir=folder / "out")
+        assert not (folder / "out").exists()
+
+    @pytest.mark.parametrize(
         ("argument", "words"),
         [("empty", "has no log"), ("*.none", "no file matches"), ("ftp://b/a.mcap", "is a URL")],
     )

@@ -131,6 +131,23 @@ def test_a_plug_in_that_cant_be_imported_is_a_warning(tmp_path, monkeypatch):
     assert [warning["message"] for warning in said["warnings"]] == [why]
 
 
+def test_packages_that_bring_the_same_module_are_named(tmp_path, monkeypatch):
+    """As opencv-python does beside opencv-python-headless, whatever of them was installed last."""
+    info = tmp_path / "opencv_python-9.8.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: opencv-python\nVersion: 9.8\n")
+    (info / "RECORD").write_text("cv2/data/__init__.py,,\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert mcaptrack.doctor().faults == ()
+    (info / "RECORD").write_text("cv2/__init__.py,,\n")
+    own = metadata.version("opencv-python-headless")
+    assert fault() == (
+        f"cv2 is of opencv-python 9.8 and opencv-python-headless {own}, of which the one installed last has "
+        "overwritten the other; `pip uninstall -y opencv-python opencv-python-headless`, then "
+        "`pip install opencv-python-headless`"
+    )
+
+
 def test_limits_are_those_of_the_control_group_and_of_those_above_it(tmp_path):
     inner = tmp_path / "a" / "b"
     inner.mkdir(parents=True)

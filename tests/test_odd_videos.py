@@ -17,7 +17,7 @@ from mcaptrack.notices import collected
 from mcaptrack.sources.video import VideoOptions, open_video
 from mcaptrack.sources.video.passthrough import Holes, transport_faults
 from mcaptrack.sources.video.reader import Clock, orientation_of
-from tests.worlds import write_clip
+from tests.worlds import upright, write_clip
 
 NO_B = {"bf": "0", "g": "10"}
 ONE = 0x10000
@@ -291,3 +291,161 @@ def test_gaps_between_regular_pictures_are_said():
 def test_times_that_do_not_increase_are_said():
     (one,) = said_of([0, 40, 40, 80, 120, 110, 160])
     assert one.startswith("a.mp4: 2 of 7 pictures are not later than the one before, number 2 first; ")
+
+
+# Which picture is shown when
+
+
+def grey(number: int) -> av.VideoFrame:
+    """A picture with its number as its brightness: 6 for each."""
+    return av.VideoFrame.from_ndarray(np.full((48, 64, 3), 6 * number + 10, np.uint8), format="bgr24")
+
+
+def numbers(path: Path, **options) -> list[tuple[int, float]]:
+    """The number of each picture of a video, and its time in a log in seconds after the first."""
+    video = open_video(path, VideoOptions(**options))
+    times = [picture.t_ns for picture in video.pictures()]
+    shown = [round((float(image.mean()) - 8.6) / 6) for image in upright(path)]
+    return [(number, round((t_ns - times[0]) / 1e9, 3)) for number, t_ns in zip(shown, times, strict=True)]
+
+
+def encoded(codec: str, count: int = 40, pixels: str = "yuv420p", **options: str) -> list[bytes]:
+    """Pictures at 25 frames a second as packets."""
+    stream = av.CodecContext.create(codec, "w")
+    stream.width, stream.height, stream.pix_fmt, stream.time_base = 64, 48, pixels, Fraction(1, 25)
+    stream.framerate, stream.options = Fraction(25), options
+    packets = []
+    for number in range(count):
+        frame = grey(number)
+        frame.pts = number
+        packets += stream.encode(frame)
+    return [bytes(packet) for packet in [*packets, *stream.encode(None)]]
+
+
+def avi(path: Path, fourcc: bytes, chunks: list[bytes]) -> Path:
+    """An AVI with these chunks, in one slot of 40 ms each."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return name + struct.pack("<I", len(data)) + data + bytes(len(data) % 2)
+
+    count = len(chunks)
+    head = chunk(b"avih", struct.pack("<14I", 40_000, 0, 0, 16, count, 0, 1, 0, 64, 48, 0, 0, 0, 0))
+    stream = struct.pack("<IHHIIIIIIII4h", 0, 0, 0, 0, 1, 25, 0, count, 0, 2**32 - 1, 0, 0, 0, 64, 48)
+    pixels = struct.pack("<IiiHH4sIiiII", 40, 64, 48, 1, 24, fourcc, 64 * 48 * 3, 0, 0, 0, 0)
+    lists = chunk(b"LIST", b"strl" + chunk(b"strh", b"vids" + fourcc + stream) + chunk(b"strf", pixels))
+    movie = b"".join(chunk(b"00dc", data) for data in chunks)
+    starts = np.cumsum([4, *(8 + len(data) + len(data) % 2 for data in chunks)]).tolist()
+    index = b"".join(b"00dc" + struct.pack("<III", 16, at, len(data)) for at, data in zip(starts, chunks, strict=False))
+    body = chunk(b"LIST", b"hdrl" + head + lists) + chunk(b"LIST", b"movi" + movie) + chunk(b"idx1", index)
+    path.write_bytes(chunk(b"RIFF", b"AVI " + body))
+    return path
+
+
+EMPTY, ONE_BYTE = b"", b"\x7f"
+NOT_CODED = b"\x00\x00\x01\xb6\x50\x4f"  # a picture of MPEG-4 that repeats the one before
+AVIS = {
+    "mjpeg": ("mjpeg", b"MJPG", {"pixels": "yuvj420p"}, (EMPTY, ONE_BYTE)),
+    "H.264": ("libx264", b"H264", {"bf": "0", "g": "10"}, (EMPTY,)),
+    "MPEG-4": ("mpeg4", b"XVID", {"bf": "0", "qmin": "1", "qmax": "2"}, (EMPTY, ONE_BYTE, NOT_CODED)),
+}
+
+
+@pytest.mark.parametrize(("codec", "fourcc", "options", "placeholders"), AVIS.values(), ids=AVIS)
+def test_a_slot_without_a_picture_is_time_without_a_picture(tmp_path, codec, fourcc, options, placeholders):
+    """AVI has numbered slots; the time of a picture is that of its slot, whatever stands in those before."""
+    packets = encoded(codec, **options)
+    for placeholder, before in product(placeholders, (1, 20)):
+        chunks = [*packets[:before], placeholder, placeholder, *packets[before:]]
+        slots = [at for at, data in enumerate(chunks) if data is not placeholder]
+        path = avi(tmp_path / "a.avi", fourcc, chunks)
+        assert numbers(path) == [(number, slot / 25) for number, slot in enumerate(slots)], (placeholder, before)
+        assert open_video(path).lost == []
+        assert numbers(path, image_format="png") == numbers(path)
+
+
+@pytest.mark.parametrize("codec", ["libx264", "mpeg4"])
+@pytest.mark.parametrize("between", [0, 1, 2, 3])
+def test_a_gap_in_an_avi_is_before_the_picture_that_came_after_it(tmp_path, codec, between):
+    """Packets stand in the order of decoding; the gap is among them one or two later than it was among pictures."""
+    path = tmp_path / "a.avi"
+    shown_at = [number if number < 24 else number + 50 for number in range(40)]
+    with av.open(str(path), "w") as container:
+        fixed = {"x264-params": "scenecut=0:b-adapt=0"} if codec == "libx264" else {"qmin": "1", "qmax": "2"}
+        stream = container.add_stream(codec, rate=25, options={"bf": str(between), "g": "250", **fixed})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for number, slot in enumerate(shown_at):
+            frame = grey(number)
+            frame.pts, frame.time_base = slot, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    assert numbers(path) == [(number, slot / 25) for number, slot in enumerate(shown_at)]
+
+
+def test_a_clock_that_wraps_goes_on(folder, tmp_path):
+    """The clock of a transport stream has 33 bits, which last for 26.5 hours."""
+    whole, path = (folder / "a.ts").read_bytes(), tmp_path / "a.ts"
+    data = bytearray(whole)
+    later = 2**33 - round((1.4 + 1.5) * 90_000)  # FFmpeg begins 1.4 s after 0
+
+    def moved(at: int) -> None:
+        parts = data[at] >> 1 & 7, data[at + 1], data[at + 2] >> 1, data[at + 3], data[at + 4] >> 1
+        ticks = parts[0] << 30 | parts[1] << 22 | parts[2] << 15 | parts[3] << 7 | parts[4]
+        ticks = (ticks + later) % 2**33
+        data[at] = data[at] & 0xF1 | ticks >> 30 << 1
+        data[at + 1 : at + 5] = bytes(
+            (ticks >> 22 & 0xFF, (ticks >> 15 & 0x7F) << 1 | 1, ticks >> 7 & 0xFF, (ticks & 0x7F) << 1 | 1)
+        )
+
+    for at in range(0, len(data), 188):
+        start = at + 4 + (data[at + 4] + 1 if data[at + 3] & 0x20 else 0)
+        if data[at + 1] & 0x40 and data[start : start + 4] == b"\0\0\1\xe0":
+            stamps = data[start + 7] >> 6
+            moved(start + 9)
+            if stamps == 3:
+                moved(start + 14)
+    path.write_bytes(data)
+    with collected() as warnings:
+        pictures, video = read(path)
+    assert [p.t_ns for p in pictures] == [p.t_ns for p in read(folder / "a.ts")[0]]
+    assert (video.lost, list(warnings)) == ([], [])
+
+
+def test_a_stream_that_ends_before_its_file_says_so_whenever_it_began(folder, tmp_path):
+    """Only the last second of 3 s is missing: by the clock of the file it began after 1.4 s."""
+    path = tmp_path / "a.mkv"
+    with av.open(str(folder / "a.mp4")) as source, av.open(str(path), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.size:
+                packet.stream, packet.pts, packet.dts = stream, packet.pts + 50_000, packet.dts + 50_000
+                target.mux(packet)
+    _, video = read(path)
+    assert video.lost == []
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    _, video = read(path)
+    assert any("lacks the last" in text or "cut off" in text for text in video.lost)
+
+
+def test_a_clock_that_goes_back_begins_again_one_interval_later():
+    def times(*times_ms: int) -> list[int]:
+        with collected():
+            clock = Clock(Path("a.ts"), 0, None)
+            return [clock.time(index, Fraction(ms, 1000)) // 1_000_000 for index, ms in enumerate(times_ms)]
+
+    part = range(0, 4000, 40)
+    assert times(*part, *part) == list(range(0, 8000, 40))
+    assert times(*part, *part, *range(9000, 10_000, 40))[200:] == list(range(4000 + 9000, 4000 + 10_000, 40))
+    assert times(*part, 0, *range(4040, 5000, 40)) == list(range(0, 5000, 40))  # one wrong stamp
+    (text,) = said_of([*part, *part])
+    assert text.startswith("a.mp4: the clock goes back once, first before picture 100, as where files were joined; ")
+    (text,) = said_of([*part, *part, *part])
+    assert "goes back 2 times" in text
+
+
+def test_pictures_that_cant_be_decoded_at_the_beginning_are_left_out(tmp_path):
+    packets = encoded("mjpeg", 8, pixels="yuvj420p")
+    path = avi(tmp_path / "a.avi", b"MJPG", [b"broken" * 40, *packets[1:]])
+    assert numbers(path) == [(number, (number - 1) / 25) for number in range(1, 8)]
+    avi(path, b"MJPG", [b"broken" * 40] * 8)
+    with pytest.raises(McaptrackError, match="can't be read as a video"):
+        open_video(path)

@@ -60,3 +60,15 @@ def test_a_camera_that_is_recorded_twice_is_run_once(tmp_path, topics):
 
 def test_the_only_pictures_are_run_whatever_their_names(tmp_path):
     assert "/cam/color/image_raw/detections" in mcaptrack.run(written(tmp_path / "a.mcap", COMPRESSED)).channels
+
+
+def test_the_pictures_of_the_only_camera_need_no_name(tmp_path):
+    with mcaptrack.open(written(tmp_path / "a.mcap", RAW)) as opened:
+        assert len(list(opened.frames())) == len(list(opened.frames("image_raw"))) == 30
+    with (
+        mcaptrack.open(written(tmp_path / "b.mcap", RAW, "/other/image")) as opened,
+        pytest.raises(
+            mcaptrack.McaptrackError, match=f"no channel video with pictures; it has pictures in {RAW}, /other/image"
+        ),
+    ):
+        opened.frames()

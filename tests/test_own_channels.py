@@ -172,9 +172,9 @@ class TestRoundTrip:
             opened.write("/b/height", cars())
             assert len(list(opened.frames("height"))) == 2
             for topic, options, words in (
-                ("speed", {}, "several channels speed: /a/speed, /b/speed; name one"),
+                ("speed", {}, "has 2 channels speed: /a/speed, /b/speed; name one"),
                 ("height", {"times": [0]}, "`times=` chooses pictures, and /b/height holds rows"),
-                ("width", {}, "no channels width with pictures"),
+                ("width", {}, "no channel width with pictures"),
             ):
                 with pytest.raises(McaptrackError, match=words):
                     next(opened.frames(topic, **options))

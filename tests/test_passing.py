@@ -11,6 +11,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 from av.bitstream import BitStreamFilterContext
@@ -20,6 +21,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import collected
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.video import VideoOptions, open_video
 from mcaptrack.sources.video.codecs import CODECS
@@ -375,14 +377,14 @@ def test_colours_stay_what_they_are_whatever_the_numbers_mean(tmp_path, matrix, 
         assert np.abs(seen[48, at].astype(int) - colour).max() <= 6
 
 
-def several(path, cover=False):
-    """A file with two videos of 12 and 9 pictures, or with a cover picture before one of 9."""
-    counts = (1, 9) if cover else (12, 9)
+def several(path, *counts, cover=False):
+    """A file with videos of these numbers of pictures; ``cover``: the first is an attached cover picture."""
     with av.open(str(path), "w") as container:
         streams = []
-        for is_cover in (cover, False):
-            stream = container.add_stream("mjpeg" if is_cover else "libx264", rate=10, options={} if is_cover else X264)
-            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p" if is_cover else "yuv420p"
+        for count in counts:
+            is_still = count == 1
+            stream = container.add_stream("mjpeg" if is_still else "libx264", rate=10, options={} if is_still else X264)
+            stream.width, stream.height, stream.pix_fmt = 64, 48, "yuvj420p" if is_still else "yuv420p"
             streams.append(stream)
         if cover:
             streams[0].disposition = av.stream.Disposition.attached_pic.value  # PyAV 17 takes nothing but a number
@@ -394,13 +396,42 @@ def several(path, cover=False):
     return path
 
 
-def test_of_several_videos_the_first_is_taken_and_that_is_said(tmp_path):
-    report = ingest(several(tmp_path / "a.mkv"), tmp_path / "a.mcap", IngestOptions())
-    assert (report.messages, "holds 2 videos; the first is taken" in report.remarks[0]) == ({"/camera/video": 12}, True)
+H264, STILL = "(h264, 64x48)", "(mjpeg, 64x48, a still picture)"
+#: Numbers of pictures, the stream that is asked for, the pictures that are read, and what is said of the choice.
+STREAMS = {
+    "both move": ((12, 9), None, 12, f"0 {H264}, 1 {H264}; 0 is taken; `stream=1` takes the other"),
+    "the second is wanted": ((12, 9), 1, 9, f"0 {H264}, 1 {H264}; 1 is taken"),
+    "the first is a still": ((1, 9), None, 9, f"0 {STILL}, 1 {H264}; 1 is taken"),
+    "the last is a still": ((9, 1), None, 9, f"0 {H264}, 1 {STILL}; 0 is taken"),
+    "a still is wanted": ((1, 9), 0, 1, f"0 {STILL}, 1 {H264}; 0 is taken"),
+    "only stills": ((1, 1), None, 1, f"0 {STILL}, 1 {STILL}; 0 is taken"),
+}
+
+
+@pytest.mark.parametrize("end", [".mkv", ".mp4"])
+@pytest.mark.parametrize(("counts", "stream", "pictures", "choice"), STREAMS.values(), ids=STREAMS)
+def test_of_several_videos_the_first_that_moves_is_taken(tmp_path, end, counts, stream, pictures, choice):
+    path = several(tmp_path / f"a{end}", *counts)
+    report = ingest(path, tmp_path / "a.mcap", IngestOptions(stream=stream))
+    assert report.messages == {"/camera/video": pictures}
+    text = f"{path} holds 2 videos, {choice}"
+    warned = [text] if "takes the other" in choice else []  # something that moves is left out, and nobody chose
+    assert [notice.message for notice in report.warnings] == warned
+    assert warned or text in report.remarks
+
+
+def test_a_stream_that_is_not_there_is_refused_and_of_a_folder_changes_nothing(tmp_path):
+    with pytest.raises(McaptrackError, match=r"has no video stream 2 \(`stream=`\); there is 0 to 1"):
+        ingest(several(tmp_path / "a.mkv", 12, 9), tmp_path / "a.mcap", IngestOptions(stream=2))
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images/1.png"), np.zeros((48, 64, 3), np.uint8))
+    with collected() as warnings:
+        ingest(tmp_path / "images", tmp_path / "b.mcap", IngestOptions(stream=0, fps=Fraction(10)))
+    assert [notice.code for notice in warnings] == ["option-not-used"]
 
 
 def test_a_cover_picture_is_no_video(tmp_path):
-    report = ingest(several(tmp_path / "a.mp4", cover=True), tmp_path / "a.mcap", IngestOptions())
+    report = ingest(several(tmp_path / "a.mp4", 1, 9, cover=True), tmp_path / "a.mcap", IngestOptions())
     assert (report.messages, report.remarks) == ({"/camera/video": 9}, [])
 
 

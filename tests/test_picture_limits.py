@@ -21,15 +21,17 @@ from hypothesis import strategies as st
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
+from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.foreign import PICTURES_READ, is_compressed
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.video import EncodedPicture, PixelLayout, VideoOptions, decode_bgr, decode_gray, open_video
 from mcaptrack.sources.video.codecs import CODECS
+from mcaptrack.sources.video.image_folder import find_images
 from mcaptrack.sources.video.limits import ENVIRONMENT, still_size
 from tests.commands import start
 from tests.tiers import one_in
-from tests.worlds import ids, ns, write_clip
+from tests.worlds import ids, ns, upright, write_clip
 
 SUFFIXES = ("png", "jpg", "bmp", "webp", "tif", "avif")
 
@@ -212,7 +214,15 @@ NUMBERED = {
     "times rather than counts": (["1.png", "90.png", "91.png"], [0, 1, 2], ""),
     "without numbers": (["a.png", "b.png"], [0, 1], ""),
     "of two series": (["a1.png", "a3.png", "b4.png"], [0, 1, 2], ""),
-    "of two kinds": (["1.png", "3.jpg", "4.png"], [0, 1, 2], ""),
+    "of two kinds": (["1.PNG", "3.jpg", "4.png"], [0, 2, 3], "1 of 4 numbered images (2) are missing"),
+    "of one series after another": (["cam1_1.png", "cam1_2.png", "cam2_3.png", "cam2_4.png"], [0, 1, 2, 3], ""),
+    "with a number of the camera": (
+        ["cam1_1.png", "cam1_2.png", "cam1_4.png"],
+        [0, 1, 3],
+        "1 of 4 numbered images (3)",
+    ),
+    "numbered as cameras": ([f"cam{n}.png" for n in (8, 9, 11)], [0, 1, 3], "1 of 4 numbered images (10) are missing"),
+    "times of day": ([f"12-0{n // 2}-{30 * (n % 2):02}.png" for n in range(4)], [0, 1, 2, 3], ""),
 }
 
 
@@ -225,6 +235,91 @@ def test_images_that_are_missing_leave_their_time_empty(tmp_path, names, places,
     assert there == [(ns(place / 10), place) for place in places]
     assert [words in notice.message for notice in report.warnings] == ([True] if words else [])
     assert report.lost == []
+    are_counted = places != list(range(len(places))) or names[0] == "8.png"
+    assert any("don't count pictures; they follow one another" in text for text in report.remarks) != are_counted
+
+
+SERIES = {
+    "by number": [f"cam{c}_{n:06}.jpg" for c in (0, 1) for n in range(4)],
+    "by number at the end": [f"{n:06}_c{c}.jpg" for c in (1, 2, 3) for n in range(4)],
+    "by name": [f"{side}{n}.png" for side in ("left", "right") for n in range(4)],
+    "at other times": [f"camera-{c}_16239430{n}{c}.jpg" for c in (0, 1) for n in range(4)],
+    "masks": [f"{n}{end}.png" for end in ("", "_mask") for n in range(4)],
+    "upper and lower case": [f"{name}_{n}.jpg" for name in ("CAM1", "cam2") for n in range(4)],
+}
+
+
+@pytest.mark.parametrize("names", SERIES.values(), ids=SERIES)
+def test_images_of_several_cameras_are_no_video(tmp_path, names):
+    with pytest.raises(McaptrackError, match=r"series of images of the same numbers, such as .* a folder of its own"):
+        find_images(images(tmp_path / "images", *names))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux")
+def test_names_of_images_need_not_be_text(tmp_path):
+    folder = images(tmp_path / "images", "1.png", "2.png")
+    folder = folder.rename(tmp_path / "\udcff")
+    (folder / "1.png").rename(folder / "1\udcff.png")
+    (folder / "2.png").rename(folder / "2\udcff.png")
+    assert len(upright(folder, fps=Fraction(10))) == 2
+
+
+def test_two_images_of_one_number_are_refused(tmp_path):
+    with pytest.raises(McaptrackError, match=r"holds two images of one number, 1\.jpg and 1\.png; keep one"):
+        find_images(images(tmp_path / "images", "0.png", "1.png", "1.jpg"))
+
+
+def test_what_is_no_picture_in_a_folder_is_passed_over_and_said(tmp_path):
+    folder = images(tmp_path / "images", "1.png", "2.JPG", "3.png")
+    for name in ("._1.png", "._2.JPG", ".DS_Store", "Thumbs.db", "desktop.ini"):
+        (folder / name).write_bytes(b"\0\5\x16\7")
+    with collected() as warnings:
+        chosen = find_images(folder)
+        assert [path.name for path in chosen.paths] == ["1.png", "2.JPG", "3.png"]
+        assert chosen.notes == (f"{folder}: 2 hidden files are passed over (._1.png, ._2.JPG)",)
+        assert list(warnings) == []
+        (folder / "4.heic").write_bytes(b"x")
+        find_images(folder)
+    (warning,) = warnings
+    assert warning == (f"{folder}: 1 images of kinds that are not read are left out (4.heic)", "left-out", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("cam0/1.png", "; its folders do: give one, such as cam0"),
+        ("1.heic", "; convert those it holds, such as 1.heic"),
+    ],
+)
+def test_a_folder_without_images_says_what_it_has(tmp_path, name, hint):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(McaptrackError, match=f"holds no images .*{hint}"):
+        find_images(tmp_path)
+
+
+@pytest.mark.parametrize(("kind", "end", "most"), [(np.uint16, ".png", 3000), (np.float32, ".tif", 0.5)])
+def test_images_of_more_than_8_bits_are_shown_by_the_range_measured_in_their_folder(tmp_path, kind, end, most):
+    """Of 12 bits in 16, and of floats: the darkest is black, the brightest white, in all pictures alike."""
+    shares = np.linspace(0.2, 1, 64)[None].repeat(48, axis=0)
+    for number, gain in enumerate((1, 0.5)):
+        cv2.imwrite(str(tmp_path / f"{number}{end}"), cv2.merge([(shares * most * gain).astype(kind)] * 3))
+    video = open_video(tmp_path, VideoOptions(fps=Fraction(10)))
+    low, high = 0.1 * most, most
+    for gain, image in zip((1, 0.5), upright(tmp_path, fps=Fraction(10)), strict=True):
+        wanted = (shares * most * gain - low) * 255 / (high - low)
+        assert np.abs(image[..., 0] - wanted).max() < 2
+    assert video.notes == [
+        f"{tmp_path}: values from {low:g} to {high:g}, as measured in it, are shown as black to white"
+    ]
+
+
+def test_a_first_image_that_is_broken_is_left_out_as_another_would_be(tmp_path):
+    folder = images(tmp_path / "images", "1.png", "2.png", "3.png")
+    (folder / "1.png").write_bytes(b"no image")
+    report = ingest(folder, tmp_path / "a.mcap", IngestOptions(fps=Fraction(10)))
+    assert report.messages == {"/camera/video": 2}
+    assert report.lost == [f"{folder}/1.png can't be read as an image; it is left out"]
 
 
 def labelled(path: Path, *frames: int) -> Path:

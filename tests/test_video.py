@@ -24,9 +24,8 @@ from mcaptrack.sources.video import (
     open_video,
     write_mp4,
 )
-from mcaptrack.sources.video.reader import images as upright_images
 from tests.tiers import thorough
-from tests.worlds import write_clip
+from tests.worlds import upright, write_clip
 
 NO_B = {"bf": "0", "g": "10"}
 
@@ -84,7 +83,7 @@ def test_a_turned_video_is_put_upright_as_opencv_does(tmp_path, quarter_turns):
     capture = cv2.VideoCapture(str(path))
     _, wanted = capture.read()
     video = open_video(path)
-    _, ours = next(iter(upright_images(video)))
+    ours = upright(path)[0]
     assert "turned by" in video.why_transcode
     assert (video.height_px, video.width_px) == ours.shape[:2] == wanted.shape[:2]
     np.testing.assert_array_equal(ours, wanted)
@@ -98,9 +97,9 @@ def test_a_folder_of_images_is_a_video_in_the_order_of_its_numbers(tmp_path):
     (folder.parent / "seqinfo.ini").write_text("[Sequence]\nframeRate=14\n")
     video = open_video(folder)
     assert (video.frames, video.fps, video.why_transcode) == (11, 14, "it is a folder of images")
-    assert [int(image[0, 0, 0]) for _, image in upright_images(video)] == [10 * n for n in range(1, 12)]
+    assert [int(image[0, 0, 0]) for image in upright(folder)] == [10 * n for n in range(1, 12)]
     (folder / "5.png").write_bytes(b"no image")
-    list(upright_images(video))
+    list(video.pictures())
     assert "5.png can't be read as an image; it is left out" in video.lost[0]
 
 
@@ -120,7 +119,7 @@ def _renamed_codec(path):
 
 BAD = {
     "no video": (lambda p: p.write_text("I am text"), "can't be read as a video"),
-    "nothing": (lambda p: p.write_bytes(b""), "can't be read as a video"),
+    "nothing": (lambda p: p.write_bytes(b""), "is empty, and no video"),
     "cut off": (
         lambda p: (write_clip(p, options=NO_B), p.write_bytes(p.read_bytes()[: p.stat().st_size // 2])),
         "can't be read as a video",

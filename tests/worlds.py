@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 
 import mcaptrack
@@ -20,6 +21,7 @@ from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.demo import Block, Pedestrian, SyntheticScene
+from mcaptrack.sources.video import VideoOptions, open_video
 
 Positions = Mapping[int, tuple[float, float]]
 
@@ -136,6 +138,12 @@ def write_clip(
         for packet in stream.encode(None):
             container.mux(packet)
     return images
+
+
+def upright(path: Path, **options: Any) -> list[np.ndarray]:
+    """The pictures of a video or folder as they come into a log, without losses."""
+    pictures = open_video(path, VideoOptions(image_format="png", **options)).pictures()
+    return [cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR) for picture in pictures]
 
 
 def tracked(rng: np.random.Generator, names: np.ndarray, seen: np.ndarray):

@@ -7,7 +7,7 @@ import platform
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -235,6 +235,7 @@ def doctor(
     url = None if store is None else url_of_store(store)
     with collected() as warnings:
         packages, extras, faults = _packages()
+        faults += list(_overwritten(packages))
         broken = broken_packages()
         faults += [
             f"{name}: {problem}; install {name} again"
@@ -304,6 +305,24 @@ def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:
         elif extra[1] not in _NOT_SHOWN:
             lacking.setdefault(extra[1], []).extend([] if is_enough else [name])
     return packages, {name: tuple(names) for name, names in lacking.items()}, faults
+
+
+def _overwritten(packages: Collection[str]) -> Iterator[str]:
+    """Yield a fault for each module of these packages that another installed package brings, too, in the same files."""
+    try:
+        owners = metadata.packages_distributions()
+    except Exception:  # metadata of another package that can't be read
+        return
+    for module, names in owners.items():
+        file = f"{module}/__init__.py"
+        several = sorted({name for name in names if any(str(path) == file for path in metadata.files(name) or ())})
+        needed = [name for name in several if name in packages]
+        if len(several) > 1 and needed:
+            those = " and ".join(f"{name} {_version_of(name)}" for name in several)
+            yield (
+                f"{module} is of {those}, of which the one installed last has overwritten the other; "
+                f"`pip uninstall -y {' '.join(several)}`, then `pip install {needed[0]}`"
+            )
 
 
 def _requirements() -> list[str]:

@@ -121,6 +121,7 @@ def ingest(
     image_format: Annotated[ImageFormat, Option(_PICTURES, tuning=True)] = "auto",
     quality: Annotated[int | None, Option(_PICTURES, 1, 100, tuning=True)] = None,
     keyframe_interval_s: Annotated[float | None, Option(_PICTURES, 0.01, 60, tuning=True)] = None,
+    stream: Annotated[int | None, Option(_PICTURES, 0, 1000)] = None,
     ground_plane: GroundPlane = None,
     calibration: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, metavar="FILE", shown=False)] = None,
     calibration_name: Annotated[str | None, Option(LABELS, metavar="NAME")] = None,
@@ -176,6 +177,8 @@ def ingest(
     keyframe_interval_s : float, optional
         Longest time between keyframes, in seconds; streams with longer gaps are re-encoded; by default 2 if copied, 1
         if encoded.
+    stream : int, optional
+        Which video of a file that holds several, from 0; by default the first of more than one picture.
     calibration : path or sequence of path, optional
         File with the calibration of the camera, of OpenCV, ROS (camera_info) or Kalibr; two if intrinsics and the pose
         in the world are two files. The ground plane (z = 0) follows from both.
@@ -271,6 +274,7 @@ def ingest(
         image_format=image_format,
         quality=quality,
         keyframe_interval_s=keyframe_interval_s,
+        stream=stream,
         ground_plane=optional_path(ground_plane),
         calibration=tuple(paths_of(calibration)),
         calibration_name=calibration_name,

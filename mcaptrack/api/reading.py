@@ -25,11 +25,12 @@ from mcaptrack.api.messages import DecodedMessage, checked_factories, decoded_me
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.rows import supervision_of
-from mcaptrack.errors import McaptrackError, call, list_names
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
+from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.own_rows import nanoseconds_of, times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures
@@ -227,17 +228,16 @@ class LogReader:
 
         """
         with self._now() as opened:
-            channels = opened.channels
             if str(name) in tables.TABLES:
                 whole = self._contents.table(name)
-            elif str(name) in channels:
-                whole = self._contents.messages(name)[0]
+            elif (channel := opened.find(str(name))) in opened.channels:
+                whole = self._contents.messages(channel)[0]
             else:
                 raise McaptrackError(
                     f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"
                 )
             if topic is not None:
-                opened.channel(topic)
+                topic = opened.channel(opened.find(topic)).topic
                 if "topic" not in whole.schema.names:
                     raise McaptrackError(f"the rows of the table {name} are not by channel; leave `topic=` out")
                 whole = tables.rows_of_topic(whole, topic)
@@ -277,14 +277,14 @@ class LogReader:
 
     @checked
     def frames(
-        self, topic: str = "video", times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
+        self, topic: str | None = None, times: Sequence[int] | NDArray[Any] | None = None, colour: Colour = "bgr"
     ) -> Iterator[Frame]:
         """Decode the pictures of a channel, or read its rows, in the order of time.
 
         Parameters
         ----------
-        topic : str, default "video"
-            The channel, or the end of its topic: "video" for /camera/video, or for the pictures of the only camera.
+        topic : str, optional
+            The channel, or the end of its topic: "video" for /camera/video; by default the pictures of the only camera.
         times : sequence of int or array of datetime64, optional
             Times in whole nanoseconds: decode the picture that is shown at each, the last one that is not later. By
             default all pictures.
@@ -313,6 +313,7 @@ class LogReader:
 
         """
         with self._now() as opened:
+            topic = _only_pictures(opened) if topic is None else topic
             if (of_rows := _topic_of_rows(opened, topic)) is not None:
                 if times is not None:
                     text = f"`times=` chooses pictures, and {of_rows[0]} holds rows; choose rows by their t_ns"
@@ -456,13 +457,11 @@ class LogReader:
         with self._now() as opened:
             schemas = {c.topic: SCHEMAS.get(c.schema_name) for c in opened.channels.values()}
             boxes = {name: schema for name, schema in schemas.items() if schema in (DETECTIONS, TRACKS)}
-            topics = _named(topic, boxes)
-            if len(topics) != 1:
-                has = ", ".join(sorted(boxes))
-                raise McaptrackError(f"{self.path} has {len(topics) or 'no'} channels {topic} of boxes; it has {has}")
-            schema = boxes[topics[0]]
-            names = class_names(opened.channel(topics[0]).metadata)
-            return supervision_of(opened.frames(topics[0], schema or TRACKS), names)
+            channel = opened.find(topic, among=boxes)
+            if channel not in boxes:
+                raise McaptrackError(f"{self.path} has no channels {topic} of boxes; it has {', '.join(sorted(boxes))}")
+            names = class_names(opened.channel(channel).metadata)
+            return supervision_of(opened.frames(channel, boxes[channel] or TRACKS), names)
 
     @checked
     def messages(
@@ -541,12 +540,6 @@ class _InTurn(Iterator[T]):
             return next(self._items)
 
 
-def _named(name: str, topics: Iterable[str]) -> list[str]:
-    """Return the topic of this name, or else all that end with it."""
-    topics = list(topics)
-    return [name] if name in topics else [topic for topic in topics if topic.endswith("/" + name.strip("/"))]
-
-
 def _topics(opened: Log, names: Any) -> set[str]:
     """Return the topics of these names. Raises McaptrackError if there is none, or several, of a name."""
     given = [names] if isinstance(names, str) or not isinstance(names, Iterable) else list(names)
@@ -554,11 +547,14 @@ def _topics(opened: Log, names: Any) -> set[str]:
     for name in given:
         if not isinstance(name, str):
             raise McaptrackError(f"`topics=` is a topic, or several, not {name!r:.40}")
-        found = _named(name, opened.channels)
-        if len(found) > 1:
-            raise McaptrackError(f"{opened.path} has {len(found)} channels {name}: {list_names(sorted(found))}")
-        chosen.add(opened.channel(found[0] if found else name).topic)
+        chosen.add(opened.channel(opened.find(name)).topic)
     return chosen
+
+
+def _only_pictures(opened: Log) -> str:
+    """Return the pictures of the only camera, or "video", of which there may be none or several."""
+    pictures = {camera.pictures for camera in cameras(opened) if camera.pictures}
+    return pictures.pop() if len(pictures) == 1 else "video"
 
 
 def _topic_of_rows(opened: Log, topic: str) -> tuple[str, Schema] | None:
@@ -566,14 +562,13 @@ def _topic_of_rows(opened: Log, topic: str) -> tuple[str, Schema] | None:
 
     None if there is none, or if pictures have such a topic.
     """
-    fitting = [opened.channels[name] for name in _named(topic, opened.channels)]
-    of_rows = [(channel.topic, channel.schema) for channel in fitting if channel.schema is not None]
-    if not of_rows or any(map(holds_pictures, fitting)):
+    pictures = [name for name, channel in opened.channels.items() if holds_pictures(channel)]
+    if opened.find(topic, among=pictures) in pictures and topic not in opened.channels:
         return None
-    if len(of_rows) > 1:
-        names = ", ".join(sorted(name for name, _ in of_rows))
-        raise McaptrackError(f"{opened.path} has several channels {topic}: {names}; name one")
-    return of_rows[0]
+    of_rows = {name: channel.schema for name, channel in opened.channels.items() if channel.schema is not None}
+    name = opened.find(topic, among=of_rows)
+    schema = of_rows.get(name)
+    return None if schema is None else (name, schema)
 
 
 def _decoded(opened: Log, topic: str, wanted: Mapping[int, int] | None, colour: Colour) -> Iterator[Frame]:

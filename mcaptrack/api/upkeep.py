@@ -289,7 +289,7 @@ def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
     """Return the topics that fit any of the patterns. Raises McaptrackError for a pattern that fits none."""
     chosen: set[str] = set()
     for pattern in patterns:
-        fitting = {pattern} & opened.channels.keys()
+        fitting = {opened.find(pattern)} & opened.channels.keys()
         if not {*"*?["}.isdisjoint(pattern):  # most are names, and there may be thousands
             fitting |= {topic for topic in opened.channels if fnmatchcase(topic, pattern)}
         if not fitting:

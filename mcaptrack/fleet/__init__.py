@@ -6,10 +6,11 @@ what is missing, and several calls can share a folder of logs.
 
 from __future__ import annotations
 
+import inspect
 import os
 import pickle
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from mcaptrack import __version__
 from mcaptrack.api.declared import checked
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, did_you_mean, list_names
 from mcaptrack.files import place_of
 from mcaptrack.fleet import ledger
 from mcaptrack.fleet.child import Child, StoppedError, WorkerLimits, memory_in_bytes
@@ -340,6 +341,7 @@ def run(
     if not named_logs:
         raise McaptrackError("there are no logs to process")
     keywords, command = dict(options or {}), name or _name_of(function)
+    _check_options(function, keywords, command, {"progress", *(["output"] if output_dir is not None else [])})
     folder = None if output_dir is None else Path(output_dir)
     settings = digest_of_settings(function, keywords, str(folder.absolute()) if folder else None)
     entries = None if ledger is None else Ledger(Path(ledger), command, settings)
@@ -439,6 +441,23 @@ def _named(logs: Any) -> list[NamedLog]:
         return find_logs([logs])
     several = list(logs)
     return several if all(isinstance(log, NamedLog) for log in several) else find_logs(several)
+
+
+def _check_options(function: Callable[..., Any], options: Mapping[str, Any], name: str, own: Collection[str]) -> None:
+    """Raise McaptrackError for options that a function doesn't take, and for those that each log has of its ``own``."""
+    try:
+        parameters = inspect.signature(function).parameters
+    except (TypeError, ValueError):  # a function that doesn't say what it takes
+        return
+    kinds = {name: parameter.kind for name, parameter in parameters.items()}
+    log, *named = [name for name, kind in kinds.items() if kind is not inspect.Parameter.VAR_KEYWORD] or [""]
+    takes_all = inspect.Parameter.VAR_KEYWORD in kinds.values()
+    for key in options:
+        if key in (log, *own):
+            raise McaptrackError(f"{name}: each log has its own {key}; leave it out of the options")
+        if key not in named and not (takes_all and isinstance(key, str)):
+            close = did_you_mean(str(key), named)
+            raise McaptrackError(f"{name} has no option {key!r:.60}; {close}it has {list_names(named)}")
 
 
 def _name_of(function: Any) -> str:

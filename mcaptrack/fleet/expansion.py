@@ -185,8 +185,8 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
         other = names.setdefault(name, log.path)
         if other != log.path:
             raise McaptrackError(
-                f"the results of {other} and {log.path} would both be {name}; give the folder that holds both logs, "
-                "which keeps the folders below it apart, or process them one by one"
+                f"the results of {other} and {log.path} would both be {name}; process them one by one, each with "
+                "a name of its own (`output=`), or give the folder that holds both, which keeps those below it apart"
             )
     return list(names)
 

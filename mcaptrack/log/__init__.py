@@ -21,7 +21,7 @@ from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.chunks import message_head, open_chunk
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
 from mcaptrack.log.messages import Message
-from mcaptrack.log.reader import Channel, Log
+from mcaptrack.log.reader import Channel, Log, find_topic
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, refuse_non_mcap, results_path, split_files_in
 from mcaptrack.log.records import MAGIC, Bytes, Record, walk
 from mcaptrack.log.recover import recover

@@ -262,6 +262,23 @@ def _is_unchanged(path: Location, file: ReadFile, signature: Signature) -> bool:
         return False
 
 
+def find_topic(name: str, topics: Collection[str], where: Location, prefix: str = "") -> str:
+    """The topic that a name means: itself, that below the camera ``prefix``, or the only one that ends with it.
+
+    "tracks" is /camera/tracks. A name that is none of the topics is that below the camera, or comes back as it is.
+    Raises McaptrackError, with the topics, if there are several.
+    """
+    below = f"{prefix}/{name}"
+    if name in topics or (prefix and below in topics):
+        return name if name in topics else below
+    fitting = sorted(topic for topic in topics if name.strip("/") and topic.endswith("/" + name.strip("/")))
+    if len(fitting) > 1:
+        raise McaptrackError(f"{where} has {len(fitting)} channels {name}: {list_names(fitting)}; name one whole")
+    if fitting:
+        return fitting[0]
+    return below if prefix and "/" not in name else name
+
+
 class Log:
     """An MCAP file, open for reading. A context manager.
 
@@ -386,6 +403,10 @@ class Log:
     def end_ns(self) -> int:
         """The time of the last message in nanoseconds."""
         return max(part.index.end_ns for part in self.parts)
+
+    def find(self, name: str, prefix: str = "", among: Collection[str] | None = None) -> str:
+        """The topic that a name means; see ``find_topic``. ``among`` are those that may be meant, by default all."""
+        return find_topic(name, self.channels if among is None else among, self.path, prefix)
 
     def channel(self, topic: str) -> Channel:
         """The channel of a topic. Raises McaptrackError, with the topics that exist, if there is none."""

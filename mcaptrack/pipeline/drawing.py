@@ -87,7 +87,7 @@ def _given(opened: log.Log, prefix: str, topics: Sequence[str], pictures: str | 
         suffix = next((views.SUFFIX + topic for topic in _calibrated(opened, prefix)), views.SCENE_SUFFIX)
     else:
         suffix = views.SUFFIX
-    view_topics = [opened.channel(_view_of(opened, topic, suffix)).topic for topic in topics]
+    view_topics = [opened.channel(_view_of(opened, opened.find(topic, prefix), suffix)).topic for topic in topics]
     places = {_place_of(topic, pictures) for topic in view_topics}
     if len(places) > 1:
         text = ", ".join(sorted(place or "scenes" for place in places))

@@ -73,7 +73,7 @@ def make_events(state: RunState, watch: Watch) -> dict[str, Made]:
     """
     opened, prefix, *_ = state
     out: dict[str, Made] = {}
-    topics = watch.topics or _default_topics(state)
+    topics = [opened.find(topic, prefix) for topic in watch.topics] or _default_topics(state)
     if watch.again and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
 

@@ -58,7 +58,7 @@ def plan_stage(
     """
     planner = _Planner(opened, prefix, defaults=defaults, frame_id=frame_id)
     usual = f"{prefix}/{STAGES[stage].output_topic}"
-    source = source or planner.source_of(stage)
+    source = opened.find(source, prefix) if source else planner.source_of(stage)
     planner.ensure(source)
     if transform is None:
         suited = planner.suited_tracker(stage, source)
@@ -93,6 +93,7 @@ def plan_all(
     ``changed`` are topics that were made again already, and are not written yet. Raises McaptrackError as
     ``plan_stage`` does, and if the class that made a channel is not installed.
     """
+    source = opened.find(source, prefix) if source else None
     sources = {first_stage(opened, source): source} if source else {}
     changes = dict.fromkeys(changed, True)
     planner = _Planner(opened, prefix, sources, defaults, force, chosen, shared, plane, frame_id, renewed, changes)

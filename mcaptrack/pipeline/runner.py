@@ -482,7 +482,7 @@ def input_of(
 
     Raises McaptrackError if the log has no such input.
     """
-    topic = source or f"{prefix}/{STAGES[stage].input_topic}"
+    topic = opened.find(source, prefix) if source else f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
     frames, names, _ = read_named_frames(opened, topic, transform.reads)

@@ -106,7 +106,7 @@ def make_zones(
         return {}
     options = watch.options or before.options or ZoneOptions()
     zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
-    topics = watch.topics or _default_topics(state, before)
+    topics = _topics(state, watch, before)
     if watch.zones and not topics:
         raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
     out: dict[str, Made] = {}
@@ -264,8 +264,11 @@ def _of_camera(opened: log.Log, prefix: str, zones: tuple[Zone, ...], is_given: 
     return kept
 
 
-def _default_topics(state: RunState, before: _Before) -> tuple[str, ...]:
+def _topics(state: RunState, watch: ZoneWatch, before: _Before) -> tuple[str, ...]:
+    """Return the channels of tracks to count: those that were named, or the usual ones and those counted before."""
     prefix = state.prefix
+    if watch.topics:
+        return tuple(state.opened.find(topic, prefix) for topic in watch.topics)
     full = f"{prefix}/retracks{FULL}"
     retracked = full if state.holds(full, TRACKS) else f"{prefix}/retracks"
     usual = (f"{prefix}/tracks", retracked, camera_at(state.opened, prefix).truth)

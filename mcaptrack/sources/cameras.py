@@ -73,6 +73,7 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     than the named one.
     """
     if topic:
+        topic = opened.find(topic, "/" + name.strip("/") if name else "")
         prefix = _prefix_of_topic(opened, topic)
         if name and "/" + name.strip("/") not in (prefix, *camera_at(opened, prefix).names):
             raise McaptrackError(

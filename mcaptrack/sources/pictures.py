@@ -67,15 +67,15 @@ def find_pictures(opened: log.Log, topic: str) -> str:
     Raises McaptrackError if there is none, or several.
     """
     topics = [channel.topic for channel in opened.channels.values() if foreign.holds_pictures(channel)]
-    matching = [name for name in topics if topic in (name, name.removeprefix("/"))]
-    matching = matching or [name for name in topics if name.endswith("/" + topic.strip("/"))]
-    if topic == VIDEO and not matching:  # the name of pictures that were ingested stands for those of the only camera
-        forms = [name for name in topics if not foreign.better_form(opened, name)]
-        matching = [name for name in forms if not foreign.depth_of(opened, name)] or forms
-    if len(matching) != 1:
+    name = opened.find(topic, among=topics)
+    if name not in topics and topic == VIDEO:  # the name of ingested pictures stands for those of the only camera
+        forms = [form for form in topics if not foreign.better_form(opened, form)]
+        seen = [form for form in forms if not foreign.depth_of(opened, form)] or forms
+        name = seen[0] if len(seen) == 1 else name
+    if name not in topics:
         has = f"pictures in {', '.join(sorted(topics))}" if topics else "no pictures"
-        raise McaptrackError(f"{opened.path} has {len(matching) or 'no'} channels {topic} with pictures; it has {has}")
-    return matching[0]
+        raise McaptrackError(f"{opened.path} has no channel {topic} with pictures; it has {has}")
+    return name
 
 
 class Pictures:

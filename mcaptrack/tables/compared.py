@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack import tables
+from mcaptrack import log, tables
 from mcaptrack.choices import Point, Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Bools, Floats
@@ -213,7 +213,8 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     columns = ("topic", "frame", "track_id", "x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
     table = tables.read_columns(path, columns)
     file_topics = sorted(set(table["topic"].tolist()))
-    wanted = [topic for topic in topics if topic in file_topics] or [
+    named = [log.find_topic(topic, file_topics, path) for topic in topics]
+    wanted = [topic for topic in named if topic in file_topics] or [
         t for t in file_topics if t.endswith("/truth") == (role == "truth")
     ]
     if role == "truth" and not wanted and len(file_topics) == 1:

@@ -105,7 +105,7 @@ def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scen
 def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
     with log.read(path) as opened:
         prefix = pipeline.find_camera(opened, None, options.topic)
-        topics = [options.topic] if options.topic else [f"{prefix}/{name}" for name in _BEST]
+        topics = [opened.find(options.topic, prefix)] if options.topic else [f"{prefix}/{name}" for name in _BEST]
         filled = [topic for topic in topics if topic in opened.channels and opened.channels[topic].messages]
         if not filled:
             raise McaptrackError(f"{path} has none of {', '.join(topics)}; {call('run', path)} makes tracks")
@@ -118,7 +118,8 @@ def _from_log(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
 def _from_parquet(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
     channels = tables.read_tracks(path)
     if options.topic:
-        channels = {topic: frames for topic, frames in channels.items() if topic == options.topic}
+        named = log.find_topic(options.topic, channels, path)
+        channels = {topic: frames for topic, frames in channels.items() if topic == named}
         if not channels:
             raise McaptrackError(f"{path} has no rows of {options.topic}")
     else:

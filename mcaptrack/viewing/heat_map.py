@@ -106,7 +106,7 @@ def _channel(opened: log.Log, prefix: str, topics: Sequence[str]) -> str:
     if len(topics) > 1:
         raise McaptrackError(f"a heat map is of one channel of tracks, not of {', '.join(topics)}")
     if topics:
-        channel = opened.channel(topics[0])
+        channel = opened.channel(opened.find(topics[0], prefix))
         if not channel.holds(TRACKS):
             raise McaptrackError(f"{opened.path}: {topics[0]} holds {channel.schema_name}, not tracks to count")
         return channel.topic

@@ -57,6 +57,7 @@ CASES: dict[str, dict[str, Case]] = {
         image_format="--image-format jpeg",
         quality="--quality 40",
         keyframe_interval_s="--keyframe-interval-s 0.5",
+        stream="--stream 0",
         ground_plane="--ground-plane plane.txt",
         calibration="--calibration pose.yml",
         calibration_name=("ingest clip.mp4 --camera cam0 --calibration camchain.yaml", "--calibration-name cam1"),

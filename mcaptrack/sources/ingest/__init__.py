@@ -64,7 +64,7 @@ __all__ = ["Format", "IngestOptions", "IngestReport", "ingest", "label_frames"]
 
 VIDEO_SUFFIXES: Final = (
     ".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".ts", ".h264", ".264", ".mpg", ".mpeg", ".h265", ".265", ".hevc",
-    ".ivf", ".obu",
+    ".ivf", ".obu", ".y4m", ".mjpeg", ".mjpg",
 )  # fmt: skip
 #: Files with these endings hold text, whatever their first bytes are.
 _TEXT_SUFFIXES: Final = (".csv", ".tsv", ".txt", ".json", ".xml")
@@ -117,6 +117,8 @@ class VideoJob(IngestJob):
             if own and abs(options.fps - own) > _SAME_FPS * own:
                 rates = f"{float(own):g} frames a second; its pictures are written at {float(options.fps):g}"
                 warn(f"{video.path} has {rates} by `fps=`", "clock")
+        if options.stream is not None:
+            parameters["stream"] = options.stream
         if video.every > 1:
             parameters["every"] = video.every
         if video.why_transcode:
@@ -250,6 +252,7 @@ def _warn_unused(job: IngestJob, options: IngestOptions) -> None:
         ),
         "there are no tracks and no ground truth": (job.roles - {"detections"}, "classes"),
         "there are no 3D boxes": (isinstance(job, Boxes3DJob), "frame_id"),
+        "the input is a folder of images": (not isinstance(job, VideoJob) or not job.video.images, "stream"),
         "there are no tables of nuScenes": (isinstance(job, Boxes3DJob), "scene"),
         "there is no ground plane": (options.ground_plane or is_calibrated, "point"),
         "there is no calibration": (is_calibrated, "calibration_name", "calibration_unit"),

@@ -65,7 +65,7 @@ MOTION: Final = "motion"
 
 
 #: Options that apply only to videos, and options that are written otherwise than they are named here.
-FOR_VIDEOS: Final = ("image_format", "quality", "keyframe_interval_s")
+FOR_VIDEOS: Final = ("image_format", "quality", "keyframe_interval_s", "stream")
 _WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "frame"}
 
 
@@ -82,6 +82,7 @@ class IngestOptions:
     image_format: ImageFormat = "auto"
     quality: int | None = None
     keyframe_interval_s: float | None = None
+    stream: int | None = None
     ground_plane: Path | None = None
     calibration: tuple[Path, ...] = ()
     calibration_name: str | None = None
@@ -107,6 +108,7 @@ class IngestOptions:
             quality=self.quality,
             keyframe_interval_s=self.keyframe_interval_s,
             fps=self.fps,
+            stream=self.stream,
         )
 
     def given(self, *names: str) -> str:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.video.limits import max_pixels, too_large
@@ -16,6 +18,7 @@ _COVER: Final = 0x400  # AV_DISPOSITION_ATTACHED_PIC
 _NO_TIMESTAMPS: Final = 0x80  # AVFMT_NOTIMESTAMPS
 _LAST_WITH_METADATA_ERRORS: Final = 18
 _MOST_BOXES: Final = 10_000
+_MOST_PACKETS: Final = 1000  # in which a stream of more than one picture has its second
 
 
 @contextmanager
@@ -32,6 +35,8 @@ def reading(path: Path, **demuxer: str) -> Iterator[Any]:
     options: dict[str, Any] = {"options": limits | demuxer}
     if major <= _LAST_WITH_METADATA_ERRORS:
         options["metadata_errors"] = "surrogateescape"
+    if path.stat().st_size == 0:
+        raise McaptrackError(f"{path} is empty, and no video")
     try:
         with av.open(_url(path), **options) as opened:
             if not opened.streams and _lacks_index(path):
@@ -72,9 +77,65 @@ def _url(path: Path) -> str:
     return f"file:{path}"
 
 
-def videos(opened: Any) -> list[Any]:
-    """The video streams of a container, without attached cover pictures."""
-    return [stream for stream in opened.streams.video if not stream.disposition.value & _COVER]
+class ChosenStream(NamedTuple):
+    """The video stream that is read of a file: its index among all streams, and what is said of the choice, ""
+    where there is none. ``is_doubtful``: another stream moves, too, and no number was given.
+    """
+
+    index: int  # type: ignore[assignment]  # hides tuple.index, which is not needed here
+    text: str
+    is_doubtful: bool
+
+
+def choose_stream(opened: Any, path: Path, number: int | None) -> ChosenStream:
+    """Choose a video stream: that of a number, or the first of more than one picture, or else the first.
+
+    Attached cover pictures are no video. Raises McaptrackError if there is no video, or none of that number.
+    """
+    streams = [stream for stream in opened.streams.video if not stream.disposition.value & _COVER]
+    if not streams:
+        kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
+        raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
+    if number is not None and number >= len(streams):
+        numbers = f"0 to {len(streams) - 1}" if len(streams) > 1 else "0 alone"
+        raise McaptrackError(f"{path} has no video stream {number} (`stream=`); there is {numbers}")
+    if len(streams) == 1:
+        return ChosenStream(streams[0].index, "", False)
+    moving = _moving(path, [stream.index for stream in streams])
+    numbered = list(enumerate(streams))
+    kinds = ", ".join(
+        f"{at} ({_kind(stream)}{'' if stream.index in moving else ', a still picture'})" for at, stream in numbered
+    )
+    fitting = [at for at, stream in numbered if stream.index in moving]
+    chosen = number if number is not None else fitting[0] if fitting else 0
+    others = [at for at in fitting if at != chosen and number is None]
+    hint = f"; `stream={others[0]}` takes the other" if others else ""
+    text = f"{path} holds {len(streams)} videos, {kinds}; {chosen} is taken{hint}"
+    return ChosenStream(streams[chosen].index, text, bool(others))
+
+
+def _moving(path: Path, streams: Sequence[int]) -> set[int]:
+    """Those of these streams that have more than one picture, by the first packets of a file."""
+    import av
+
+    pictures: Counter[int] = Counter()
+    with reading(path) as opened:
+        packets = opened.demux([opened.streams[index] for index in streams])
+        for _ in range(_MOST_PACKETS):
+            try:
+                packet = next(packets, None)
+            except av.error.FFmpegError:  # what can be read decides
+                break
+            if packet is None or min(pictures[index] for index in streams) > 1:
+                break
+            pictures[packet.stream_index] += packet.size > 0
+    return {index for index in streams if pictures[index] > 1}
+
+
+def _kind(stream: Any) -> str:
+    """Codec and size of a video stream."""
+    context = stream.codec_context
+    return f"{context.name}, {context.width}x{context.height}" if context else "an unknown codec"
 
 
 def fraction(ratio: Any) -> Fraction | None:
@@ -104,20 +165,33 @@ def has_times(opened: Any) -> bool:
     return not opened.format.flags & _NO_TIMESTAMPS
 
 
-def count_indexed(opened: Any) -> int:
+def count_indexed(opened: Any, index: int) -> int:
     """The number of pictures in the fragments of a fragmented MP4 that were read so far; 0 for other files."""
-    return len(_mp4_entries(opened))
+    return len(_mp4_entries(opened, index))
 
 
-def count_empty(opened: Any) -> int:
+def count_empty(opened: Any, index: int) -> int:
     """The number of MP4 samples without data: nothing was recorded there."""
-    return sum(entry.size == 0 for entry in _mp4_entries(opened))
+    return sum(entry.size == 0 for entry in _mp4_entries(opened, index))
 
 
-def count_edited(path: Path) -> int:
+def count_edited(path: Path, index: int) -> int:
     """The number of samples that the edit list of an MP4 leaves out."""
     with reading(path) as edited, reading(path, ignore_editlist="1") as whole:
-        return max(0, len(_mp4_entries(whole)) - len(_mp4_entries(edited)))
+        return max(0, len(_mp4_entries(whole, index)) - len(_mp4_entries(edited, index)))
+
+
+def ends_s(opened: Any, stream: Any) -> Fraction | None:
+    """When a video stream ends on the clock of its pictures, as the container declares; None if it only declares the
+    duration of all streams.
+    """
+    declared = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
+    if declared:
+        return int(declared[1]) * 3600 + int(declared[2]) * 60 + Fraction(declared[3])
+    if not opened.duration or len(opened.streams) > 1:
+        return None
+    counts_from_0 = "matroska" in opened.format.name
+    return Fraction(opened.duration + (0 if counts_from_0 else opened.start_time or 0), 1_000_000)
 
 
 def _no_index(path: Path) -> McaptrackError:
@@ -144,7 +218,7 @@ def _lacks_index(path: Path) -> bool:
     return {b"ftyp", b"mdat"} <= kinds and not {b"moov", b"moof"} & kinds
 
 
-def _mp4_entries(opened: Any) -> Any:
-    """The sample index of an MP4; empty for other formats."""
-    stream = videos(opened)[0]
+def _mp4_entries(opened: Any, index: int) -> Any:
+    """The samples of a stream of an MP4; empty for other formats."""
+    stream = opened.streams[index]
     return stream.index_entries if "mp4" in opened.format.name.split(",") else ()

@@ -60,6 +60,8 @@ class VideoOptions:
         Maximum time between key pictures: of streams that are passed through (default 2) and transcoded (default 1).
     fps : Fraction, optional
         Frame rate that replaces the timestamps of the container.
+    stream : int, optional
+        Number of the video stream in a file with several, from 0; by default the first of more than one picture.
 
     Raises
     ------
@@ -71,6 +73,7 @@ class VideoOptions:
     quality: int | None = None
     keyframe_interval_s: float | None = None
     fps: Fraction | None = None
+    stream: int | None = None
 
     def __post_init__(self) -> None:
         name = self.image_format

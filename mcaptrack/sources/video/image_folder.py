@@ -7,67 +7,184 @@ from __future__ import annotations
 
 import mmap
 import re
+from collections.abc import Sequence
 from fractions import Fraction
+from itertools import combinations
 from math import gcd
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
+from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.clocks import parse_fps
+from mcaptrack.notices import warn
 from mcaptrack.sources.video.limits import check_still, still_size
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
-_NUMBERED: Final = re.compile(r"(.*?)([0-9]{1,18})(\D*)")
+#: Pictures of other kinds, which are not read; a folder that holds some is not all read.
+_OTHERS: Final = (".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm", ".pnm", ".jp2", ".exr", ".dng")
+_RUNS: Final = re.compile(r"([0-9]+)")
+#: What stands before the number of a camera, or of a video, in the name of a picture.
+_CAMERA: Final = re.compile(
+    r"(?:.*[^a-z])?(?:c|ch|channel|cam|camera|kamera|view|lens|sensor|stream|device|video|clip|seq|sequence|scene)[_-]?"
+)
+_MOST_CAMERAS: Final = 64
+_CAMERA_DIGITS, _ONE_RUN = 3, 3  # digits of such a number; parts of a name that has a number only
 #: Numbers in names count as frame numbers if at least this share of them exists.
 _DENSE: Final = 0.5
 _SHOWN: Final = 3
+#: Images in which the range of values is measured, values of each, and the share of the darkest and brightest cut off.
+_MEASURED, _SAMPLES, _CUT_OFF = 24, 100_000, 0.0002
+#: The values that become black and white.
+Span = tuple[float, float]
 
 
 class Images(NamedTuple):
     """The images of a folder in order: ``place`` (P,) is their position in the sequence, with gaps for missing ones.
 
     ``every`` is the step of the numbers in their names: 12 if every twelfth picture was kept with its number.
+    ``missing`` and ``notes`` say what is not there, and what was assumed or passed over.
     """
 
     paths: list[Path]
     place: list[int]
     every: int
     missing: str
+    notes: tuple[str, ...] = ()
+
+
+class _Name(NamedTuple):
+    """The name of an image: ``series`` is what all pictures of one camera share, ``numbers`` are the others in it."""
+
+    series: str
+    numbers: tuple[int, ...]
 
 
 def find_images(folder: Path) -> Images:
-    """The images of a folder. Raises McaptrackError if there are none."""
-    paths = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_order)
+    """The images of a folder. Raises McaptrackError if there are none, or those of several cameras."""
+    files = sorted(folder.iterdir(), key=natural_order)
+    named = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
+    paths = [path for path in named if not path.name.startswith(".")]
     if not paths:
-        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)})")
-    in_order = Images(paths, list(range(len(paths))), 1, "")
-    named = [_NUMBERED.fullmatch(path.name) for path in paths]
-    if len({(name[1], name[3]) if name else None for name in named}) > 1 or None in named:
+        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}){_instead(files)}")
+    notes = []
+    if hidden := [path.name for path in named if path.name.startswith(".")]:
+        notes.append(f"{folder}: {len(hidden)} hidden files are passed over ({_some(hidden)})")
+    if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:
+        warn(f"{folder}: {len(others)} images of kinds that are not read are left out ({_some(others)})", "left-out")
+    names = [_name_of(path) for path in paths]
+    _refuse_several(folder, paths, names)
+    text = f"{folder}: the names of its images don't count pictures; they follow one another in the order of names"
+    in_order = Images(paths, list(range(len(paths))), 1, "", (*notes, *([text] if len(paths) > 1 else [])))
+    if len({(name.series, name.numbers[:-1]) for name in names}) > 1 or not names[0].numbers:
         return in_order
-    numbers = [int(name[2]) for name in named if name]
+    numbers = [name.numbers[-1] for name in names]
     every = gcd(*(number - numbers[0] for number in numbers)) or 1
     place = [(number - numbers[0]) // every for number in numbers]
     if place != sorted(set(place)) or len(place) < _DENSE * (place[-1] + 1):
         return in_order
-    gone = sorted(set(range(place[-1] + 1)) - set(place))
-    text = ", ".join(str(numbers[0] + every * at) for at in gone[:_SHOWN]) + (", ..." if len(gone) > _SHOWN else "")
-    return Images(paths, place, every, f"{len(gone)} of {place[-1] + 1} numbered images ({text})" if gone else "")
+    gone = [str(numbers[0] + every * at) for at in sorted(set(range(place[-1] + 1)) - set(place))]
+    missing = f"{len(gone)} of {place[-1] + 1} numbered images ({_some(gone)})" if gone else ""
+    return Images(paths, place, every, missing, tuple(notes))
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+
+
+def _instead(files: Sequence[Path]) -> str:
+    """A hint for a folder without images: what to give instead."""
+    if folders := [path.name for path in files if path.is_dir() and _has_images(path)]:
+        return f"; its folders do: give one, such as {folders[0]}"
+    if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:
+        return f"; convert those it holds, such as {others[0]}, to JPEG or PNG"
+    return ""
+
+
+def _has_images(folder: Path) -> bool:
+    try:
+        return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
+    except OSError:
+        return False
+
+
+def _name_of(path: Path) -> _Name:
+    texts = _RUNS.split(path.stem.lower())
+    series, numbers = texts[0], []
+    for before, digits, after in zip(texts[::2], texts[1::2], texts[2::2], strict=False):
+        is_camera = len(texts) > _ONE_RUN and len(digits) <= _CAMERA_DIGITS and _CAMERA.fullmatch(before)
+        series += (digits if is_camera else "*") + after
+        numbers += [] if is_camera else [int(digits)]
+    return _Name(series, tuple(numbers))
+
+
+def _refuse_several(folder: Path, paths: Sequence[Path], names: Sequence[_Name]) -> None:
+    """Raise McaptrackError if images of several cameras lie in one folder, or several images of one number."""
+    series: dict[str, dict[tuple[int, ...], Path]] = {}
+    for path, name in zip(paths, names, strict=True):
+        other = series.setdefault(name.series, {}).setdefault(name.numbers, path)
+        if other != path and name.numbers:
+            raise McaptrackError(f"{folder} holds two images of one number, {other.name} and {path.name}; keep one")
+    several = {text: numbers for text, numbers in series.items() if len(numbers) > 1}
+    if len(several) > _MOST_CAMERAS:
+        return  # names without a system, such as digests
+    for (text, numbers), (other_text, others) in combinations(several.items(), 2):
+        is_like = _RUNS.sub("*", text) == _RUNS.sub("*", other_text)  # only the number of the camera is another one
+        overlaps = max(min(numbers), min(others)) <= min(max(numbers), max(others))
+        shared = numbers.keys() & others.keys()
+        if (is_like and overlaps) or len(shared) >= _DENSE * min(len(numbers), len(others)):
+            raise McaptrackError(
+                f"{folder} holds {len(several)} series of images of the same numbers, such as {text} "
+                f"({len(numbers)} images) and {other_text} ({len(others)}), and a video is of one camera; give each a "
+                "folder of its own"
+            )
 
 
 def natural_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key for natural order: 2.jpg comes before 10.jpg."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"([0-9]+)", path.name) if part]
+    """Sort key for natural order: 2.jpg comes before 10.jpg, and b.JPG before C.jpg."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in _RUNS.split(path.name.lower()) if part]
 
 
-def read_image(path: Path) -> NDArray[np.uint8] | None:
+def read_image(path: Path, span: Span | None = None) -> Image | None:
     """An image, BGR (height, width, 3), upright; None if it can't be decoded.
 
-    Raises McaptrackError if it is too large, or not a file.
+    Values of more than 8 bits are scaled by ``span``. Raises McaptrackError if it is too large, or not a file.
     """
+    values = _read_values(path)
+    if values is None or values.dtype == np.uint8:
+        return values
+    low, high = span or (0.0, 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max))
+    shares = (np.nan_to_num(values.astype(np.float32), nan=low) - low) * (255 / max(high - low, 1e-30))
+    return np.asarray(np.rint(np.clip(shares, 0, 255)), np.uint8)
+
+
+def measure_span(paths: Sequence[Path]) -> Span | None:
+    """The values that become black and white in images of more than 8 bits; None for others.
+
+    They are nearly the least and the greatest of images all over the folder. Values that stand for none don't count: 0,
+    the greatest whole number, and what is not finite.
+    """
+    pooled: list[Floats] = []
+    for at in np.unique(np.linspace(0, len(paths) - 1, min(_MEASURED, len(paths))).astype(int)).tolist():
+        values = _read_values(paths[at])
+        if values is None:
+            continue
+        if values.dtype == np.uint8:
+            return None
+        most = np.inf if values.dtype.kind == "f" else np.iinfo(values.dtype).max
+        some = values.reshape(-1)[:: max(1, values.size // _SAMPLES)].astype(np.float64)
+        pooled.append(some[np.isfinite(some) & (some != 0) & (some != most)])
+    known = np.concatenate([*pooled, np.empty(0)])
+    low, high = np.quantile(known, [_CUT_OFF, 1 - _CUT_OFF]).tolist() if len(known) else (0.0, 0.0)
+    return (low, high) if high > low else None
+
+
+def _read_values(path: Path) -> NDArray[Any] | None:
+    """An image as it is stored, in three channels."""
     import cv2
 
     refuse_special(path)
@@ -78,8 +195,13 @@ def read_image(path: Path) -> NDArray[np.uint8] | None:
     if size is None:
         return None
     check_still(size, path)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    return None if image is None else np.asarray(image, np.uint8)
+    content = np.fromfile(path, np.uint8)  # OpenCV ends the process for names that are not UTF-8
+    image = cv2.imdecode(content, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image is None:  # floats in one channel
+        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    if image is not None and image.ndim == 2:
+        image = cv2.merge([image] * 3)
+    return image
 
 
 # The seqinfo.ini of a MOTChallenge sequence: its frame rate, and how many frames it has.

@@ -16,7 +16,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.sources.video.codecs import CODECS, FrameNumber, FrameNumbers, is_interlaced, sequence_headers
-from mcaptrack.sources.video.container import fraction, has_slots, is_transport, reading, videos
+from mcaptrack.sources.video.container import fraction, has_slots, is_transport, reading
 from mcaptrack.sources.video.encode import VideoOptions
 from mcaptrack.sources.video.recognise import WORDS
 
@@ -51,12 +51,12 @@ class StreamCheck:
     missing: tuple[int, ...] = ()
 
 
-def packets(opened: Any, image_format: str) -> Iterator[StreamPacket]:
-    """The packets of the first video stream as messages, up to the first one that can't be read."""
+def packets(opened: Any, index: int, image_format: str) -> Iterator[StreamPacket]:
+    """The packets of a stream as messages, up to the first one that can't be read."""
     import av
     from av.bitstream import BitStreamFilterContext
 
-    stream = videos(opened)[0]
+    stream = opened.streams[index]
     name = CODECS[image_format].annex_b
     to_annex_b = BitStreamFilterContext(name, stream) if name else None
     base = fraction(stream.time_base) or Fraction(1)
@@ -219,10 +219,10 @@ def _in_step(data: np.ndarray, size: int) -> int | None:
     return int(starts[0]) if len(starts) else None
 
 
-def check_stream(path: Path, options: VideoOptions) -> StreamCheck:
-    """Check in one pass over its packets whether the first video stream of a file can be passed through."""
+def check_stream(path: Path, index: int, options: VideoOptions) -> StreamCheck:
+    """Check in one pass over its packets whether a video stream of a file can be passed through."""
     with reading(path) as opened:
-        stream = videos(opened)[0]
+        stream = opened.streams[index]
         context = stream.codec_context
         name = context.codec.canonical_name
         image_format = next((key for key, codec in CODECS.items() if codec.name == name), "")
@@ -233,7 +233,7 @@ def check_stream(path: Path, options: VideoOptions) -> StreamCheck:
         sets = sequence_headers(bytes(context.extradata or b"")) if image_format == "av1" else ()
         stream_check = StreamCheck(image_format, "", sets)
         stream_check.why_not = _check_packets(
-            packets(opened, image_format), stream_check, options.fps, Fraction(options.key_within_s)
+            packets(opened, index, image_format), stream_check, options.fps, Fraction(options.key_within_s)
         )
         if not stream_check.why_not and is_transport(opened) and transport_faults(path, stream.id):
             stream_check.why_not = _DAMAGED

@@ -6,9 +6,10 @@ and encoded again, and the reason is reported.
 
 from __future__ import annotations
 
-import re
 import struct
 from array import array
+from bisect import bisect_left, insort
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -25,25 +26,28 @@ from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.sources.video.container import (
+    choose_stream,
     count_edited,
     count_empty,
     count_indexed,
+    ends_s,
     fraction,
     has_sizes,
     has_slots,
     has_times,
     reading,
-    videos,
 )
 from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
-from mcaptrack.sources.video.image_folder import Images, find_images, find_seqinfo, read_image
+from mcaptrack.sources.video.image_folder import Images, Span, find_images, find_seqinfo, measure_span, read_image
 from mcaptrack.sources.video.limits import check_h264, check_size
 from mcaptrack.sources.video.passthrough import check_stream, packets
 
 #: A fixed number of threads, so that damaged streams decode to the same pictures on every machine.
 _THREADS: Final = 4
+_PLACEHOLDER: Final = 1  # bytes of a packet that stands for no picture in AVI, as encoders with B-frames begin
 _ONE_EACH: Final = ("h264", "hevc")  # codecs with a picture in each packet, if it has no fields
+_MOST_DAMAGED: Final = 250  # packets at the beginning without a picture, after which a stream is given up
 _HDR: Final = {16: "PQ", 18: "HLG"}  # AVCOL_TRC_SMPTE2084, AVCOL_TRC_ARIB_STD_B67
 
 
@@ -74,6 +78,8 @@ class DecodedPicture(NamedTuple):
 
 _RIFF_HEAD, _CHUNK_HEAD, _IVF_FRAME_HEAD = 12, 8, 12
 _LISTS: Final = (b"movi", b"rec ")
+#: Packets by which the order of decoding is known, and the most pictures that are shown between two and decoded later.
+_SEEN_FOR_ORDER, _MOST_BETWEEN = 100, 16
 
 
 def count_slots(path: Path, stream: int) -> int | None:
@@ -111,6 +117,53 @@ def _ivf(file: FileIO, size: int, first: int) -> int:
     return count
 
 
+def in_slots(pictures: Iterator[DecodedPicture], delay: int, slot_s: Fraction) -> Iterator[DecodedPicture]:
+    """Give pictures, in the order in which they are shown, the times of the slots in which they are shown.
+
+    They come with the time of the slot that holds them, slots being in the order of decoding. Picture i is due when the
+    decoder gives it out, with the packet of picture i + ``delay``; the first stays from its own slot on. Slots without
+    a picture are passed over, wherever they are.
+    """
+    waiting: deque[DecodedPicture] = deque()
+    slots: list[Fraction] = []
+    is_first = True
+    for picture in pictures:
+        waiting.append(picture)
+        insort(slots, picture.seconds or Fraction())
+        if len(waiting) > (delay and delay + _MOST_BETWEEN):  # all slots up to that of the first are in the list
+            seconds = min(slots[delay], slots[0] + delay * slot_s) if is_first else slots[delay]
+            yield waiting.popleft()._replace(seconds=seconds)
+            del slots[0]
+            is_first = False
+    slots += [slots[-1] + number * slot_s for number in range(1, delay + 1)] if slots else []
+    for picture, seconds in zip(waiting, slots[delay:], strict=True):
+        yield picture._replace(seconds=min(seconds, slots[0] + delay * slot_s) if is_first else seconds)
+        is_first = False
+
+
+def _delay(video: Video) -> int:
+    """The number of packets after which a decoder gives a picture out, by its first pictures; 0 if all are in order."""
+    import av
+
+    order, given_out = list[int](), list[int | None]()
+    with reading(video.path) as opened:
+        stream = opened.streams[video.stream]
+        if not stream.codec_context.has_b_frames:
+            return 0
+        for number, packet in zip(range(_SEEN_FOR_ORDER), opened.demux(stream), strict=False):
+            packet.pts = packet.dts = number
+            try:
+                frames = packet.decode()
+            except av.error.FFmpegError:
+                continue
+            order += [frame.pts for frame in frames]
+            given_out += [frame.dts for frame in frames]
+    in_order = sorted(order)
+    if order == in_order:
+        return 0
+    return max(bisect_left(in_order, number) - at for at, number in enumerate(given_out) if number is not None)
+
+
 # Times of pictures as messages: strictly increasing; and what is odd about those of the container.
 
 
@@ -118,6 +171,8 @@ def _ivf(file: FileIO, size: int, first: int) -> int:
 #: of milliseconds. An interval is a gap if at least two pictures would fit between.
 _REGULAR, _ALIKE, _TICK_NS, _GAP = 0.9, 0.1, 1_500_000, 2.5
 _FEWEST: Final = 10
+#: A clock that goes back by more begins again; pictures are never so much out of order.
+_RESTART_NS: Final = NS_PER_S
 
 
 class Clock:
@@ -129,6 +184,9 @@ class Clock:
         self._first: Fraction | None = None
         self._times = array("q")
         self._moved, self._first_moved = 0, 0
+        #: What is added to the times of the container since its clock began again, and what was added before that.
+        self._shift_ns, self._before_ns = 0, 0
+        self._restarts: list[int] = []
 
     def time(self, index: int, seconds: Fraction | None) -> int:
         """The time of picture ``index``, which is ``seconds`` in the container."""
@@ -141,7 +199,7 @@ class Clock:
         else:
             self._first = seconds if self._first is None else self._first
             seconds -= self._first
-        t_ns = self._start_ns + round(seconds * NS_PER_S)
+        t_ns = self._continued(index, self._start_ns + round(seconds * NS_PER_S))
         if not 0 <= t_ns < LAST_NS:
             raise McaptrackError(
                 f"{self._where}: picture {index} is {float(seconds):g} s after the first; times reach to the year 2262"
@@ -153,8 +211,27 @@ class Clock:
         self._times.append(t_ns)
         return t_ns
 
+    def _continued(self, index: int, t_ns: int) -> int:
+        """The time of picture ``index`` that is ``t_ns`` by the clock of the container, which may have begun again."""
+        last = self._times[-1] if self._times else t_ns
+        if t_ns + self._shift_ns < last - _RESTART_NS:
+            steps = np.diff(np.frombuffer(self._times, np.int64)[-_SEEN_FOR_ORDER:])
+            self._before_ns = self._shift_ns
+            self._shift_ns = last + (int(np.median(steps)) if len(steps) else NS_PER_S) - t_ns
+            self._restarts.append(index)
+        elif 0 < t_ns + self._before_ns - last < _RESTART_NS < t_ns + self._shift_ns - last:
+            self._shift_ns = self._before_ns  # only some pictures had other times
+        return t_ns + self._shift_ns
+
     def warn(self) -> None:
         """Warn about times that had to be moved, and about gaps in regular ones."""
+        if self._restarts:
+            often = "once" if len(self._restarts) == 1 else f"{len(self._restarts)} times"
+            warn(
+                f"{self._where}: the clock goes back {often}, first before picture {self._restarts[0]}, as where files "
+                "were joined; what follows is put one interval after what came before (`fps=` spaces all evenly)",
+                "clock",
+            )
         if self._moved:
             warn(
                 f"{self._where}: {self._moved} of {len(self._times)} pictures are not later than the one before, "
@@ -262,9 +339,10 @@ class Video:
 
     ``format`` is the format of its messages ("h264", "vp9", "jpeg" and so on), ``width_px`` and ``height_px`` their
     size. ``frames`` is the number of frames that the container declares, 0 if it doesn't. ``start_ns`` is the recording
-    time, if the container has it. ``images`` are those of a folder; ``every`` is the step of the numbers in their
-    names. ``why_transcode`` is empty for streams that are passed through, and for stills. While pictures are read,
-    ``lost`` collects what could not be read, and ``notes`` what else is worth reporting.
+    time, if the container has it, and ``ends_s`` when it says that its pictures end. ``images`` are those of a folder;
+    ``every`` is the step of the numbers in their names, and ``span`` has their values that become black and white, if
+    these have more than 8 bits. ``why_transcode`` is empty for streams that are passed through, and for stills. While
+    pictures are read, ``lost`` collects what could not be read, and ``notes`` what else is worth reporting.
     """
 
     path: Path
@@ -282,8 +360,9 @@ class Video:
     lost: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     has_slots: bool = False
-    length_s: Fraction | None = None
+    ends_s: Fraction | None = None
     orientation: Orientation = Orientation()  # immutable
+    span: Span | None = None
 
     @property
     def every(self) -> int:
@@ -306,7 +385,7 @@ class Video:
         if self.has_slots and self.fps and last_s is not None:
             hidden += round(last_s * self.fps) + 1 - read  # empty slots
         if self.frames and read + hidden < self.frames:
-            edited = 0 if self.images else count_edited(self.path)
+            edited = 0 if self.images else count_edited(self.path, self.stream)
             if edited:
                 self.notes.append(f"{self.path}: an edit list hides {edited} of its {self.frames} frames")
             if read + hidden + edited >= self.frames:
@@ -315,11 +394,10 @@ class Video:
             if slots is not None and slots >= self.frames:
                 return  # the file is complete: the others are empty slots, or reported as lost
             self.lost.append(f"{self.path} claims {self.frames} frames; {read} could be read")
-        elif not self.frames and self.length_s and last_s is not None and self.fps:
-            gap = self.length_s - last_s
-            if gap > max(Fraction(1, 2), 3 / self.fps):
-                ends = f"its pictures end at {float(last_s):.2f} s"
-                self.lost.append(f"{self.path} says it is {float(self.length_s):.2f} s long; {ends}")
+        elif not self.frames and self.ends_s and last_s is not None and self.fps:
+            missing_s = self.ends_s - last_s
+            if missing_s > max(Fraction(1, 2), 3 / self.fps):
+                self.lost.append(f"{self.path} lacks the last {float(missing_s):.2f} s that it says it has")
 
 
 def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # noqa: B008  # frozen
@@ -327,18 +405,15 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
     if path.is_dir():
         return _open_folder(path, options)
     with reading(path) as opened:
-        streams = videos(opened)
-        if not streams:
-            kinds = ", ".join(sorted({stream.type for stream in opened.streams if stream.type != "video"}))
-            raise McaptrackError(f"{path} holds no video, {f'only {kinds}' if kinds else 'and nothing else'}")
-        stream = streams[0]
+        chosen = choose_stream(opened, path, options.stream)
+        stream = opened.streams[chosen.index]
         context = stream.codec_context
         if context is None:
             raise McaptrackError(f"{path} holds video in an unknown codec; convert it to H.264 first")
         check_size(context.width, context.height, path)
-        first = next(opened.decode(stream), None)
+        first = _first_picture(opened, stream)
         if first is None:
-            hides = count_edited(path)
+            hides = count_edited(path, chosen.index)
             why = f"without frames{f': its edit list hides all {hides} of them' if hides else ''}"
             raise McaptrackError(f"{path} is a video {why}")
         if not (has_times(opened) or options.fps):
@@ -356,18 +431,20 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
             f"it is {orientation.description}" if orientation.description else "",
             stream=stream.index,
             has_slots=has_slots(opened),
-            length_s=_length_s(opened, stream),
+            ends_s=ends_s(opened, stream),
             orientation=orientation,
         )
-        if len(streams) > 1:
-            video.notes.append(f"{path} holds {len(streams)} videos; the first is taken")
+        if chosen.is_doubtful:
+            warn(chosen.text, "left-out")
+        elif chosen.text:
+            video.notes.append(chosen.text)
         video.notes += _remarks(path, stream, first, orientation)
         if first.interlaced_frame:
             video.why_transcode = video.why_transcode or "it is interlaced"
     if options.is_still:
         video.why_transcode = ""
     elif not video.why_transcode:
-        check = check_stream(path, options)
+        check = check_stream(path, chosen.index, options)
         video.why_transcode, video.sets = check.why_not, check.sets
         if check.missing:
             places = "1 place" if len(check.missing) == 1 else f"{len(check.missing)} places"
@@ -378,6 +455,24 @@ def open_video(path: Path, options: VideoOptions = VideoOptions()) -> Video:  # 
         video.format = "h264" if check.why_not else check.format
     _make_even(video)
     return video
+
+
+def _first_picture(opened: Any, stream: Any) -> Any:
+    """The first picture that can be decoded, None if there is none. Raises FFmpegError if none of the first can be."""
+    import av
+
+    why = None
+    for tried, packet in enumerate(opened.demux(stream)):
+        try:
+            for picture in packet.decode():
+                return picture
+        except av.error.FFmpegError as error:
+            why = why or error
+            if tried >= _MOST_DAMAGED:
+                break
+    if why is not None:
+        raise why
+    return None
 
 
 def _make_even(video: Video) -> None:
@@ -399,25 +494,22 @@ def _remarks(path: Path, stream: Any, first: Any, orientation: Orientation) -> I
         yield f"{path} is HDR ({_HDR[first.color_trc]}); its brightness stays as stored, which may not suit detectors"
 
 
-def _length_s(opened: Any, stream: Any) -> Fraction | None:
-    """The duration of the video stream that the container declares; None if it only declares that of all streams."""
-    declared = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
-    if declared:
-        return int(declared[1]) * 3600 + int(declared[2]) * 60 + Fraction(declared[3])
-    return Fraction(opened.duration, 1_000_000) if opened.duration and len(opened.streams) == 1 else None
-
-
 def _open_folder(path: Path, options: VideoOptions) -> Video:
     images = find_images(path)
-    first = read_image(images.paths[0])
+    span = measure_span(images.paths)
+    first = next((image for path in images.paths if (image := read_image(path, span)) is not None), None)
     if first is None:
-        raise McaptrackError(f"{images.paths[0]} can't be read as an image")
+        raise McaptrackError(f"{images.paths[0]} can't be read as an image, nor can any other in {path}")
     height, width = first.shape[:2]
     name = options.image_format if options.is_still else "h264"
     why, info = "" if options.is_still else "it is a folder of images", find_seqinfo(path)
     video = Video(
-        path, options, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images
-    )
+        path, options, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images,
+        notes=list(images.notes), span=span,
+    )  # fmt: skip
+    if span:
+        low, high = (f"{value:.4g}" for value in span)
+        video.notes.append(f"{path}: values from {low} to {high}, as measured in it, are shown as black to white")
     if images.missing:
         warn(f"{path}: {images.missing} are missing; their times stay empty", "clock")
     if info and info.frames and info.frames != images.place[-1] + 1:
@@ -444,7 +536,7 @@ def _remux(video: Video, clock: Clock) -> Iterator[PictureMessage]:
     index, seconds = 0, None
     group: list[EncodedPicture] = []  # since the last key picture, where only decoding shows whether the last is whole
     with reading(video.path) as opened:
-        for packet in packets(opened, video.format):
+        for packet in packets(opened, video.stream, video.format):
             if packet.is_damaged:  # only the last packet can be damaged
                 video.lost.append(f"{video.path} is cut off or damaged after {index} frames; the rest is left out")
                 continue
@@ -458,8 +550,8 @@ def _remux(video: Video, clock: Clock) -> Iterator[PictureMessage]:
             seconds = packet.seconds
             yield PictureMessage(clock.time(index, seconds), index, data)
             index += 1
-        video.frames = video.frames or count_indexed(opened)
-        hidden = count_empty(opened)
+        video.frames = video.frames or count_indexed(opened, video.stream)
+        hidden = count_empty(opened, video.stream)
     if _is_cut(group):
         video.lost.append(f"{video.path} is cut off or damaged in its last picture, which is kept as far as it decodes")
     video.note_missing(index, hidden, seconds)
@@ -491,35 +583,36 @@ def _transcode(video: Video, clock: Clock) -> Iterator[PictureMessage]:
 
 def _fitted(video: Video, picture: Any) -> Any:
     fitted, is_scaled = fit(picture, video.orientation, video.width_px, video.height_px)
-    text = (
-        f"{video.path}: pictures change their size on the way; all are scaled to {video.width_px} x {video.height_px}"
-    )
-    if is_scaled and text not in video.notes:
-        video.notes.append(text)
+    if is_scaled:
+        _note_sizes(video, f"all are scaled to {video.width_px} x {video.height_px}")
     return fitted
+
+
+def _note_sizes(video: Video, what_is_done: str) -> None:
+    text = f"{video.path}: pictures change their size on the way; {what_is_done}"
+    if text not in video.notes:
+        video.notes.append(text)
 
 
 def _encode_stills(video: Video, clock: Clock) -> Iterator[PictureMessage]:
     name: StillFormat = "jpeg" if video.format == "jpeg" else "png"
     for index, seconds, picture in _decoded_pictures(video):
-        data = encode_image(video.orientation.of(picture), name, video.options.jpeg_quality)
-        del picture
+        image = video.orientation.of(picture)
+        if image.shape[:2] != (video.height_px, video.width_px):
+            _note_sizes(video, "each is kept in its own, which trackers don't expect")
+        data = encode_image(image, name, video.options.jpeg_quality)
+        del picture, image
         yield PictureMessage(clock.time(index, seconds), index, data)
-
-
-def images(video: Video) -> Iterator[tuple[Fraction | None, Image]]:
-    """Decoded pictures, BGR (height, width, 3), upright, each after its time in seconds."""
-    for _, seconds, picture in _decoded_pictures(video):
-        yield seconds, video.orientation.of(picture)
 
 
 def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
     """All decoded pictures; those that can't be read are added to ``lost``."""
     if video.images is None:
-        yield from _decoded(video)
+        slot_s = 1 / video.fps if video.has_slots and video.fps else None
+        yield from in_slots(_decoded(video), _delay(video), slot_s) if slot_s else _decoded(video)
         return
     for path, place in zip(video.images.paths, video.images.place, strict=True):
-        image = read_image(path)
+        image = read_image(path, video.span)
         if image is None:
             video.lost.append(f"{path} can't be read as an image; it is left out")
         else:
@@ -530,11 +623,10 @@ def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
 def _decoded(video: Video) -> Iterator[DecodedPicture]:
     import av
 
-    packets_given, read, failed, damaged, hidden, cut_off, seconds = 0, 0, 0, 0, 0, 0, None
+    packets_given, read, failed, damaged, hidden, cut_off, last_s = 0, 0, 0, 0, 0, 0, None
     why, has_fields = "", False
-    slots: list[int] = []
     with reading(video.path) as opened:
-        stream = videos(opened)[0]
+        stream = opened.streams[video.stream]
         stream.thread_type = "AUTO"
         stream.codec_context.thread_count = _THREADS
         base = fraction(stream.time_base) or Fraction(1)
@@ -546,23 +638,25 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
                     break
                 hidden += packet.is_discard
                 cut_off += packet.is_corrupt
+                if video.has_slots and 0 < packet.size <= _PLACEHOLDER:
+                    continue
                 packets_given += packet.size > 0 and not packet.is_discard
-                if video.has_slots and packet.size:
-                    slots.append(len(slots) if packet.dts is None else packet.dts)
+                if video.has_slots:
+                    packet.pts = packet.dts  # comes back with its picture
                 frames = packet.decode()
             except av.error.FFmpegError as error:
                 why = why or f" ({error.strerror or error})"
                 failed += 1
                 continue
             for frame in frames:
-                ticks = slots[min(read + failed, len(slots) - 1)] if slots else frame.pts
-                seconds = None if ticks is None else ticks * base
+                seconds = None if frame.pts is None else frame.pts * base
+                last_s = seconds if last_s is None or seconds is None else max(last_s, seconds)
                 damaged += frame.is_corrupt
                 has_fields |= frame.interlaced_frame
                 yield DecodedPicture(read + failed, seconds, frame)
                 read += 1
-        video.frames = video.frames or count_indexed(opened)
-        hidden += count_empty(opened)
+        video.frames = video.frames or count_indexed(opened, video.stream)
+        hidden += count_empty(opened, video.stream)
         if stream.codec_context.name in _ONE_EACH and not has_fields:
             failed = max(failed, packets_given - read)  # FFmpeg passes over some without an error
     if failed:
@@ -571,4 +665,4 @@ def _decoded(video: Video) -> Iterator[DecodedPicture]:
         video.lost.append(f"{video.path}: {cut_off} packets are cut off or damaged")
     if damaged:
         video.lost.append(f"{video.path}: {damaged} of {read} frames are damaged; they are kept as far as they decode")
-    video.note_missing(read, hidden + failed, seconds)
+    video.note_missing(read, hidden + failed, last_s)

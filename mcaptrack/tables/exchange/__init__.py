@@ -82,6 +82,7 @@ def boxes_topic(opened: log.Log, topic: str | None = None) -> str:
         if channel.messages and any(channel.holds(schema) for schema in (DETECTIONS, TRACKS))
     )
     if topic is not None:
+        topic = opened.find(topic)
         if topic in with_boxes:
             return topic
         opened.channel(topic)  # says what there is

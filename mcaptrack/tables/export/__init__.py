@@ -259,8 +259,8 @@ def export(
         If a channel does not exist or can't be read, and if the folder holds tables of another log with the same name.
     """
     contents = LogTables(opened, boxes)
-    if are_all := topics is None:
-        topics = contents.other_topics()
+    are_all = topics is None
+    topics = [opened.find(topic) for topic in (contents.other_topics() if topics is None else topics)]
     for topic in topics:
         opened.channel(topic)
     job = _Job(contents, folder, form, force, Exported())

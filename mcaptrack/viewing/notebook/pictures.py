@@ -196,7 +196,7 @@ def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow
     with a warning. Raises McaptrackError if there is nothing to see, if a given channel can't be drawn, or if the views
     of given ones don't fit together.
     """
-    full_topics = [_full(opened, prefix, topic) for topic in topics]
+    full_topics = [opened.find(topic, prefix) for topic in topics]
     if len(full_topics) == 1 and full_topics[0] in opened.channels and holds_pictures(opened.channels[full_topics[0]]):
         return ToShow([], full_topics[0], opened.times(full_topics[0]))
     without = [topic for topic in full_topics if not _has_view(opened, topic)]
@@ -216,12 +216,6 @@ def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow
         return _drawn_now(opened, prefix, usable)
     t_ns = opened.times(shown.pictures or shown.views[0])
     return ToShow([_recorded(opened, topic) for topic in shown.views], shown.pictures, t_ns)
-
-
-def _full(opened: log.Log, prefix: str, topic: str) -> str:
-    """Return the topic of a channel that is given by its topic, or by its name below the camera."""
-    below = f"{prefix}/{topic.strip('/')}"
-    return below if topic not in opened.channels and below in opened.channels else topic
 
 
 def _has_view(opened: log.Log, topic: str) -> bool:

@@ -1,0 +1,143 @@
+"""A topic may be given by its end: "tracks" for /camera/tracks, in all that takes a topic."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mcaptrack
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.log import find_topic
+from mcaptrack.training.sources import SourceOptions, read_scenes
+
+
+def _results(path: Path) -> dict[str, tuple[int, ...]]:
+    """The times of the messages of every channel of a log."""
+    with log.read(path) as opened:
+        return {name: tuple(opened.times(name).tolist()) for name in opened.channels}
+
+
+def _of_copy(work: Callable[[Path, str, Path], object]) -> Callable[[Path, str, Path], Any]:
+    """What a log holds after work on a copy."""
+
+    def done(path: Path, topic: str, folder: Path) -> Any:
+        work(path, topic, folder / "copy.mcap")
+        return _results(folder / "copy.mcap")
+
+    return done
+
+
+def _reads(read: Callable[[mcaptrack.Recording, str], Any]) -> Callable[[Path, str, Path], Any]:
+    def done(path: Path, topic: str, _: Path) -> Any:
+        with mcaptrack.open(path) as recording:
+            return read(recording, topic)
+
+    return done
+
+
+def _times(frames: Iterator[Any]) -> list[int]:
+    return [frame[0] for frame in frames]
+
+
+#: What takes a topic, the topic to try, and what comes of it, which is the same for the topic and its end.
+FUNCTIONS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
+    "detect": ("video", _of_copy(lambda p, t, o: mcaptrack.detect(p, topic=t, output=o))),
+    "motion": ("video", _of_copy(lambda p, t, o: mcaptrack.motion(p, topic=t, output=o))),
+    "track": ("detections", _of_copy(lambda p, t, o: mcaptrack.track(p, topic=t, output=o))),
+    "sample": ("tracks", _of_copy(lambda p, t, o: mcaptrack.sample(p, topic=t, output=o))),
+    "predict": ("samples", _of_copy(lambda p, t, o: mcaptrack.predict(p, topic=t, output=o))),
+    "retrack": ("samples", _of_copy(lambda p, t, o: mcaptrack.retrack(p, topic=t, output=o))),
+    "stage": ("detections", _of_copy(lambda p, t, o: mcaptrack.stage("track", p, topic=t, output=o))),
+    "run": ("detections", _of_copy(lambda p, t, o: mcaptrack.run(p, topic=t, output=o, force=True))),
+    "events": ("tracks", _of_copy(lambda p, t, o: mcaptrack.events(p, topic=t, output=o))),
+    "zones": (
+        "tracks",
+        _of_copy(lambda p, t, o: mcaptrack.zones(p, zones=_zone(o.parent), topic=t, output=o)),
+    ),
+    "drop": ("decisions", _of_copy(lambda p, t, o: mcaptrack.drop(p, t, output=o))),
+    "export": ("tracks", lambda p, t, f: dict(mcaptrack.export(p, f / "a.xml", form="cvat", topic=t).rows)),
+    "render": ("tracks", lambda p, t, f: mcaptrack.render(p, f / "a.mp4", topic=t, end_s=0.3).views),
+    "evaluate": ("tracks", lambda p, t, _: repr(mcaptrack.evaluate(p, topic=t).rows)),
+    "tune": (
+        "detections",
+        lambda p, t, f: mcaptrack.tune(p, stage="track", topic=t, trials=1, study=f / "a.jsonl").scores,
+    ),
+    "train": ("tracks", lambda p, t, _: [s.xy_m.tobytes() for s in read_scenes([p], SourceOptions(topic=t), 0.4)]),
+}
+METHODS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
+    "table": ("tracks", _reads(lambda r, t: r.table("tracks", t).num_rows)),
+    "array": ("tracks", _reads(lambda r, t: len(r.array("tracks", t)))),
+    "frames": ("tracks", _reads(lambda r, t: _times(r.frames(t)))),
+    "messages": ("tracks", _reads(lambda r, t: [m.log_time for _, _, m, _ in r.messages(t)])),
+    "show": ("tracks", _reads(lambda r, t: r.show(0.2, topic=t).views)),
+    "supervision": ("tracks", _reads(lambda r, t: _times(r.supervision(t)))),
+}
+#: A topic that these make, and that need not be there.
+MAKES = {"write"}
+
+
+def _zone(folder: Path) -> Path:
+    ring = [[-50, -50], [50, -50], [50, 50], [-50, 50], [-50, -50]]
+    square = {"type": "Feature", "properties": {"name": "a"}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    path = folder / "zones.json"
+    path.write_text(json.dumps({"type": "FeatureCollection", "units": "metres", "features": [square]}))
+    return path
+
+
+def _taking(where: object) -> set[str]:
+    public = {name: thing for name, thing in inspect.getmembers(where) if not name.startswith("_")}
+    functions = {name: thing for name, thing in public.items() if inspect.isfunction(thing)}
+    return {name for name, thing in functions.items() if {"topic", "topics"} & set(inspect.signature(thing).parameters)}
+
+
+def test_all_that_takes_a_topic_is_tried():
+    assert _taking(mcaptrack) == set(FUNCTIONS)
+    assert _taking(mcaptrack.Recording) == set(METHODS) | MAKES
+
+
+@pytest.mark.parametrize(("end", "work"), [*FUNCTIONS.values(), *METHODS.values()], ids=[*FUNCTIONS, *METHODS])
+def test_the_end_of_a_topic_is_the_topic(template, tmp_path, end, work):
+    if work is METHODS["supervision"][1]:
+        pytest.importorskip("supervision")
+    with log.read(template) as opened:
+        (whole,) = [name for name in opened.channels if name.endswith(f"/{end}")]
+    out = []
+    for topic in (whole, end, whole[1:]):
+        folder = tmp_path / str(len(out))
+        folder.mkdir()
+        path = Path(shutil.copy(template, folder / "log.mcap"))
+        out.append(work(path, topic, folder))
+    assert out[0] == out[1] == out[2]
+    assert out[0]
+
+
+def test_a_name_that_several_channels_end_with_is_refused_with_them():
+    topics = ["/left/tracks", "/right/tracks", "/right/video", "odd"]
+    assert find_topic("/left/tracks", topics, Path("a")) == find_topic("left/tracks", topics, Path("a"))
+    assert find_topic("video", topics, Path("a")) == "/right/video"
+    assert find_topic("odd", topics, Path("a")) == "odd"
+    assert find_topic("tracks", topics, Path("a"), "/right") == "/right/tracks"
+    assert find_topic("racks", topics, Path("a")) == "racks"
+    assert find_topic("samples", topics, Path("a"), "/right") == "/right/samples"
+    for nothing in ("", "/"):
+        assert find_topic(nothing, topics, Path("a")) == nothing
+    with pytest.raises(McaptrackError, match="a has 2 channels tracks: /left/tracks, /right/tracks; name one whole"):
+        find_topic("tracks", topics, Path("a"))
+
+
+def test_the_name_below_the_camera_is_taken_where_there_are_several(template, tmp_path):
+    path = Path(shutil.copy(template, tmp_path / "log.mcap"))
+    with mcaptrack.open(path) as recording:
+        recording.write("/right/tracks", recording.array("tracks", "/camera/tracks")[:0])
+        with pytest.raises(McaptrackError, match="has 2 channels tracks: /camera/tracks, /right/tracks"):
+            recording.frames("tracks")
+        assert list(recording.frames("camera/tracks"))
+    assert np.isfinite(len(mcaptrack.events(path, topic="tracks", camera="camera", output=tmp_path / "b.mcap").events))
