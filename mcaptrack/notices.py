@@ -36,6 +36,7 @@ Code = Literal[
     "heights",
     "held-back",
     "journal",
+    "labelled",
     "left-out",
     "lost",
     "memory",

@@ -8,8 +8,7 @@ Letters: N boxes of the ground truth, K boxes of the tracks in one frame.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from fractions import Fraction
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,8 +30,9 @@ from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
-from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses
+from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
+from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts
 from mcaptrack.sources.ingest.labels.reading import in_order, is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import label_rows
 
@@ -97,42 +97,40 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def compare_files(
-    tracks: Path,
-    ground_truth: Path,
-    fps: Fraction | None = None,
-    ground_plane: Path | None = None,
-    point: Point = "foot",
-    topics: Sequence[str] = (),
-    classes: str | None = None,
+    tracks: Path, ground_truth: Path, options: IngestOptions = IngestOptions(), topics: Sequence[str] = ()
 ) -> AlignedFiles:
-    """Tracks and ground truth as frames.
+    """Tracks and ground truth as frames, read as ``options`` say.
 
-    ``classes`` are those to compare, see ``WantedClasses``: by default people, and of 3D boxes all. Tables have no
-    classes, and are compared as a whole. Raises McaptrackError if the files can't be read or compared.
+    Classes are those of ``options``, by default people, and of 3D boxes all. Tables have no classes, and are compared
+    as a whole. Raises McaptrackError if the files can't be read or compared.
     """
-    have_3d = [is_3d(path) for path in (tracks, ground_truth)]
+    have_3d = [is_3d(path, options.label_format, options.columns) for path in (tracks, ground_truth)]
     if all(have_3d):
-        return _boxes_3d(tracks, ground_truth, fps, ground_plane, classes)
+        return _boxes_3d(tracks, ground_truth, options)
     if any(have_3d):
         text = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
         raise McaptrackError(f"{text} does not; they can't be compared")
     both: dict[Role, Labels] = {
-        "truth": _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text)),
-        "tracks": _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True)),
+        "truth": _read(ground_truth, "truth", topics, options),
+        "tracks": _read(tracks, "tracks", topics, options),
     }
     formats = [labels.format for labels in both.values()]
     if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
         if "parquet" in formats:
             raise McaptrackError(f"{tracks} and {ground_truth} share no clock: one counts frames, the other does not")
-        wanted = WantedClasses(classes, may_lack=True) if classes else None
-        frames = ingest.label_frames(
-            {"tracks": tracks, "truth": ground_truth}, fps, ground_plane, point, classes=wanted
-        )
+        frames = ingest.label_frames({"tracks": tracks, "truth": ground_truth}, _may_lack(options))
         return AlignedFiles(frames["truth"], frames["tracks"], classes=_names_of(both))
+    share_numbers(both)
+    warn_of_firsts(labels for labels in both.values() if len(labels.frame))
     notes = [f"{labels.path} also holds {labels.left_out}" for labels in both.values() if labels.left_out]
-    if fps is not None:
+    if options.fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
-    return _by_number(both, ground_plane, point, notes)
+    return _by_number(both, options, notes)
+
+
+def _may_lack(options: IngestOptions) -> IngestOptions:
+    """Options by which files may lack some of the classes that are wanted."""
+    return replace(options, classes=options.classes and replace(options.classes, may_lack=True))
 
 
 def _names_of(both: Mapping[Role, Labels]) -> tuple[Mapping[int, str], Mapping[int, str]]:
@@ -140,13 +138,10 @@ def _names_of(both: Mapping[Role, Labels]) -> tuple[Mapping[int, str], Mapping[i
     return both["truth"].classes, both["tracks"].classes
 
 
-def _boxes_3d(
-    tracks: Path, ground_truth: Path, fps: Fraction | None, ground_plane: Path | None, wanted: str | None
-) -> AlignedFiles:
+def _boxes_3d(tracks: Path, ground_truth: Path, options: IngestOptions) -> AlignedFiles:
     """3D boxes of two files, taken as being in one frame of reference."""
-    classes_3d = WantedClasses(wanted, may_lack=True) if wanted else None
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, frame_id=FRAME, classes=classes_3d)
-    with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], options) as job:
+    together = replace(_may_lack(options), frame_id=FRAME)
+    with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], together) as job:
         job.report_assumptions()
         classes = (job.boxes["truth"].classes, job.boxes["tracks"].classes)
         return AlignedFiles(job.all_frames("truth"), job.all_frames("tracks"), job.report.remarks, classes)
@@ -161,14 +156,11 @@ class AlignedDetections:
     planes: tuple[tuple[int, GroundPlane], ...]
 
 
-def detections_and_ground_truth(
-    detections: Path, ground_truth: Path, fps: Fraction | None, ground_plane: Path | None, point: Point
-) -> AlignedDetections:
+def detections_and_ground_truth(detections: Path, ground_truth: Path, options: IngestOptions) -> AlignedDetections:
     """A file of detections and one of ground truth as frames, at the times that the frame rate gives.
 
     Raises McaptrackError if they can't be read, or if the frame rate is not known.
     """
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
     with _PairJob([("detections", detections), ("truth", ground_truth)], options) as job:
         if not all(labels.has_boxes for labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
@@ -180,15 +172,16 @@ class _PairJob(LabelJob):
     """Labels of detections and of ground truth, which may be a table."""
 
     def read(self, path: Path, role: Role) -> Labels:
-        return _read(path, role, (), ONLY_PEOPLE) if role == "truth" else super().read(path, role)
+        return _read(path, role, (), self.options) if role == "truth" else super().read(path, role)
 
 
-def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) -> Labels:
+def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions) -> Labels:
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks(path)
-    labels = read_labels(path, role=role, wanted=wanted)
+    wanted = replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks")
+    labels = read_labels(path, options.label_format, role, options.first_of(role), options.columns, wanted)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
         raise McaptrackError(f"{path} has {what}; make a log of it with {call('ingest', path)}, and compare that")
@@ -234,25 +227,23 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     return in_order(labels, has_ids=True)
 
 
-def _by_number(both: dict[Role, Labels], ground_plane: Path | None, point: Point, notes: list[str]) -> AlignedFiles:
-    """The frames with rows in either file, by their numbers, both counted from 0."""
+def _by_number(both: dict[Role, Labels], options: IngestOptions, notes: list[str]) -> AlignedFiles:
+    """The frames with rows in either file that the ground truth describes, by their numbers, both counted from 0."""
     ground_truth, tracks = both["truth"], both["tracks"]
-    plane = _plane(ground_plane, point, ground_truth, tracks)
+    plane = _plane(options.ground_plane, options.point, ground_truth, tracks)
     numbers_of = {role: labels.frame - labels.first_frame for role, labels in both.items()}
-    if ground_truth.first_frame != tracks.first_frame and len(tracks.frame):
-        first = {role: f"{labels.path} counts frames from {labels.first_frame}" for role, labels in both.items()}
-        notes.append(f"{first['tracks']}, {first['truth']}: their first frames are taken as the same")
     if len(tracks.frame):
         spans = {role: (int(numbers.min()), int(numbers.max())) for role, numbers in numbers_of.items()}
         (a, b), (c, d) = spans["truth"], spans["tracks"]
         if b < c or d < a:
             spans_as_text = [f"{both[role].path} ({low} to {high})" for role, (low, high) in spans.items()]
             raise McaptrackError(f"the frames of {' and '.join(spans_as_text)} never overlap, counted from 0")
-    step = max(ground_truth.step, tracks.step) if len(tracks.frame) else ground_truth.step
-    sparse = ground_truth if ground_truth.step >= tracks.step or not len(tracks.frame) else tracks
-    start = int(sparse.labelled[0] - sparse.first_frame) % step
     numbers = np.unique(np.concatenate([*numbers_of.values()]))  # frames without rows do not change any score
-    numbers = numbers[numbers % step == start]
+    if len(tracks.frame) and tracks.step > ground_truth.step:
+        numbers = numbers[(numbers - numbers_of["tracks"][0]) % tracks.step == 0]
+    own, at = numbers + ground_truth.first_frame, ground_truth.labelled
+    shown = described(ground_truth, "truth", own, at, options.frame_ranges, f"the tracks of {tracks.path}")
+    numbers = numbers[shown.pictures]
     frames = {role: _frames(labels, numbers, numbers_of[role], plane, role) for role, labels in both.items()}
     if ground_truth.ignored is not None and ground_truth.boxes_px is not None:
         frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], ground_truth)

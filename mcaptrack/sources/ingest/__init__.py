@@ -244,7 +244,7 @@ def _warn_unused(job: IngestJob, options: IngestOptions) -> None:
     is_calibrated = bool(options.calibration) or any(topic.endswith(f"/{CALIBRATION}") for topic in job.report.messages)
     is_sized = bool(job.options.calibration) and not job.pictures
     uses: dict[str, tuple[object, *tuple[str, ...]]] = {
-        "there is no label file": (job.has_labels, "label_format", "columns"),
+        "there is no label file": (job.has_labels, "label_format", "columns", "frame_ranges"),
         "no label file is of a detector's format": (
             is_sized or not all(labels.is_of_data_set for labels in job.labels.values()), "size",
         ),

@@ -34,9 +34,9 @@ from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, tran
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
+from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, share_numbers
 from mcaptrack.sources.ingest.labels.reading import chosen_format, read_boxes_3d
 from mcaptrack.sources.ingest.labels.timeline import (
-    MAX_FRAMES,
     ExistingLabels,
     Placed,
     Timeline,
@@ -122,6 +122,7 @@ class LabelJob(IngestJob):
         default_fps: Fraction | None = None,
     ) -> None:
         super().__init__(inputs[0][1], options, into)
+        beside: list[Numbered] = []
         for role, path in reversed(inputs):
             self._add(role, path)
         self.check_labels()
@@ -137,6 +138,13 @@ class LabelJob(IngestJob):
         self._start_ns = options.start_ns or 0
         if into is not None:
             self.prefix, self.pictures = camera_of(into, options.camera)
+            existing = labels_of(into, self.prefix).items()
+            beside = [
+                Numbered(f"{topic} of {into.path}", "mot", 0, has_first=True, last=labels.frames - 1)
+                for topic, labels in existing
+                if labels.counts_from_0
+            ]
+        share_numbers(self.labels, beside)
         if into is not None and "corrections" in self.labels:
             self.labels["corrections"] = with_new_ids(into, self.prefix, self.labels["corrections"])
             self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
@@ -285,7 +293,10 @@ class LabelJob(IngestJob):
         if frame_counts:
             return max(frame_counts), frame_counts[max(frame_counts)]
         counts = [count_frames(labels) for labels in self.labels.values()]
-        return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
+        last = max(*counts, *(label.frames for label in existing.values()), 1)
+        ends = [end for _, end in self.options.frame_ranges.ranges if end] if self.options.frame_ranges else []
+        stated = min(max(ends, default=0) - next(iter(self.labels.values())).first_frame, MAX_FRAMES)
+        return (stated, "`frames=`") if stated > last else (last, "the last label")
 
     def _check_overlap(self, into: log.Log, timeline: Timeline) -> None:
         """Check that labels without pictures overlap in time with the log."""
@@ -311,8 +322,7 @@ class LabelJob(IngestJob):
             writer.add_metadata(CLOCK, {"start_ns": str(self._start_ns)})
         self.write_plane(writer, self.ground, int(self.timeline.t_ns[0]))
         if self.into is not None and "corrections" in self.labels:
-            labels = self.labels["corrections"]
-            placed = self.timeline.place(labels, []).between(int(labels.labelled[0]), int(labels.labelled[-1]))
+            placed = self.timeline.place(self.labels["corrections"], "corrections", [])
             warn_uncovered(self.into, f"{self.prefix}/{CORRECTED}", placed)
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
@@ -323,7 +333,8 @@ class LabelJob(IngestJob):
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The labels of a role as frames, including empty frames."""
-        return list(self.frames(role, self.ground, self.timeline.place(self.labels[role], self.report.lost))())
+        placed = self.timeline.place(self.labels[role], role, self.report.lost, self.ranges_of(role))
+        return list(self.frames(role, self.ground, placed)())
 
 
 def _seconds(t_ns: int) -> str:
@@ -340,19 +351,12 @@ def _known(labels: Labels) -> _Known:
     return _Known(info.fps, info.frames, SEQINFO) if info else _Known(None, None, "")
 
 
-def label_frames(
-    files: Mapping[Role, Path],
-    fps: Fraction | None,
-    ground_plane: Path | None,
-    point: Point,
-    classes: WantedClasses | None = None,
-) -> dict[Role, list[Frame]]:
+def label_frames(files: Mapping[Role, Path], options: IngestOptions) -> dict[Role, list[Frame]]:
     """Read label files with a common clock as frames, without writing a log.
 
     Raises McaptrackError as ``ingest`` does. For comparisons only the order and intervals of times matter, so files
-    without a frame rate get one frame per second unless ``fps`` is given.
+    without a frame rate get one frame per second unless the options give one.
     """
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, classes=classes)
     job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
     job.report_assumptions()
     return {role: job.all_frames(role) for role in files}

@@ -198,7 +198,7 @@ class BoxTable(CheckedRows):
     of its track or ``NO_ID``, ``boxes`` (N, ...) its box, ``score`` (N,) NaN where there is none, ``class_id`` (N,) the
     class as the file has it (``NO_CLASS``: none), and as the schema of detections has it once the rows are settled.
     ``classes`` are then names by class id. ``labelled`` (F,) are the frames that the file describes, with or without
-    boxes. ``left_out`` describes the rows that were left out. ``remarks`` and ``doubts`` (warnings and their codes) say
+    boxes; ``labelled_by`` says how the file states them, "" if they are those that have boxes. ``left_out`` describes the rows that were left out. ``remarks`` and ``doubts`` (warnings and their codes) say
     how the file was understood. ``plugin`` is the format, if it is of another package.
     """
 
@@ -213,6 +213,7 @@ class BoxTable(CheckedRows):
     classes: Mapping[int, str] = field(default_factory=dict)
     left_out: str = ""
     labelled: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    labelled_by: str = ""
     remarks: list[str] = field(default_factory=list)
     doubts: list[tuple[str, Code]] = field(default_factory=list)
     plugin: Plugin | None = None
@@ -301,7 +302,8 @@ class IgnoredBoxes:
 class Labels(BoxTable):
     """Labels of pictures, as ``BoxTable``: boxes (N, 4) of left, top, width, height in pixels, or positions.
 
-    ``first_frame`` is the number of the first picture. ``xy_m`` (N, 2) are positions, None if the format has none.
+    ``first_frame`` is the number of the first picture; ``is_first_assumed``: the file doesn't tell. ``xy_m`` (N, 2) are
+    positions, None if the format has none.
     ``crowd`` (N,) marks regions of people without boxes of their own; boxes of ground truth that don't count are in
     ``ignored``. ``is_normalised``: boxes are in shares of the picture's size. ``times_s`` (F,): the times of frames by
     the file itself; its frames are then numbered from 0. ``observed`` (N,): which boxes were seen, and not filled in or
@@ -309,6 +311,7 @@ class Labels(BoxTable):
     """
 
     first_frame: int = 0
+    is_first_assumed: bool = False
     xy_m: Floats | None = None
     crowd: Bools | None = None
     ignored: IgnoredBoxes | None = None
@@ -327,8 +330,12 @@ class Labels(BoxTable):
     @property
     def step(self) -> int:
         """The step of labelled frames: 12 if every twelfth frame is labelled."""
+        return self.step_of(self.labelled)
+
+    def step_of(self, frames: Ints) -> int:
+        """The step of the numbers (F,) of labelled frames, which rise."""
         least = 2 if self.format in _POSITIONS else _SPARSE_FRAMES
-        return int(np.gcd.reduce(np.diff(self.labelled))) if len(self.labelled) >= least else 1
+        return int(np.gcd.reduce(np.diff(frames))) if len(frames) >= least else 1
 
     @property
     def has_boxes(self) -> bool:
@@ -383,6 +390,7 @@ class Labels(BoxTable):
         self.labelled = np.union1d(self.labelled, self.frame)
         if self.first_frame == UNKNOWN_FIRST:
             self.first_frame = self.assume_first(int(self.labelled[0]))
+            self.is_first_assumed = self.first_frame > 0
         crowd = self.crowd
         if role == "truth" and crowd is not None and crowd.any():
             self.ignored = IgnoredBoxes(self.frame[crowd], boxes[crowd], ~crowd[crowd], crowd[crowd])

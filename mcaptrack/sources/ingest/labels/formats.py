@@ -167,7 +167,8 @@ def read_mot(path: Path, lines: Lines, role: Role, wanted: WantedClasses) -> Lab
     score = np.full(len(frame), np.nan) if role == "truth" else score
     out = Labels(path, "mot", table.at, frame, track_id, boxes, score, class_id, classes, others, np.unique(frame))
     out.ignored = ignored if (kind > 0).any() else None
-    out.first_frame = 0 if (frame == 0).any() else 1  # some programs number frames from 0 in this format, too
+    out.is_first_assumed = not (frame == 0).any()  # some programs number frames from 0 in this format, too
+    out.first_frame = int(out.is_first_assumed)
     return out.keep(kept)
 
 

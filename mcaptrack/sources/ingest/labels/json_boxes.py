@@ -222,15 +222,17 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> Labels:
     for number, entry in enumerate(entries):
         rows.add(number, entry, frame_of)
     out = rows.done()
-    out.labelled = np.unique(np.array(frames, np.int64))
-    out.first_frame = int(out.labelled[0]) if len(frames) else 0
+    is_labelled = np.array([image.get("is_labeled") is not False for image in images], bool)  # PoseTrack
+    numbers = np.array(frames, np.int64)
+    out.labelled, out.labelled_by = np.unique(numbers[is_labelled]), "its images"
+    out.first_frame = int(numbers.min()) if len(numbers) else 0
+    out.is_first_assumed = out.first_frame > 0
     out.remark(f": {len(images)} images, in order of {order}")
+    if not is_labelled.all():
+        out.remark(f": {int((~is_labelled).sum())} images are not labelled (is_labeled)")
     if order == _BY_LIST and len(images) > 1:
         text = ": its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
         out.doubt(f"{text} is taken as that of the pictures", "clock")
-    if out.first_frame > 1:
-        text = f": its first image has the number {out.first_frame}, and is assumed to be the first picture"
-        out.doubt(f"{text}; `first_frame=` sets the number", "clock")
     if not out.is_normalised:
         _doubt_outside(out, images, frames)
     return out

@@ -123,7 +123,7 @@ def read_labels(
             labels.refuse_repeated_ids()
         labels = in_order(labels, labels.has_ids)
     if first_frame is not None:
-        labels.first_frame = first_frame
+        labels.first_frame, labels.is_first_assumed = first_frame, False
         labels.doubts = [doubt for doubt in labels.doubts if doubt[1] != "clock"]
     return labels
 

@@ -1,0 +1,232 @@
+"""Which frames a label file is about: from which number it counts them, and which of them were labelled.
+
+Only what a file states is known. Where it states neither, its numbers follow those of the files beside it, and frames
+before its first and after its last label are taken as not labelled if they are more than a tenth of all; both is said.
+
+Letters: P pictures, F frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+
+from mcaptrack.choices import Role
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Bools, Ints
+from mcaptrack.notices import warn
+from mcaptrack.sources.ingest.labels.content import MAX_FRAME, Labels, is_count
+from mcaptrack.sources.video import find_seqinfo
+
+#: Labels cover all frames if they cover this share of them.
+_COVERED: Final = 0.9
+#: Formats in which some programs count frames from 0 and others from 1.
+_EITHER: Final = ("mot", "csv")
+#: The number of frames of a log, at most: more than three days at 30 frames a second. Numbers have so many digits.
+MAX_FRAMES: Final = 10_000_000
+_DIGITS: Final = 10
+
+
+@dataclass(frozen=True)
+class FrameRanges:
+    """Frames by their numbers: from the first of each range up to its end, which isn't in it; None is open."""
+
+    ranges: tuple[tuple[int | None, int | None], ...]
+
+    @classmethod
+    def span(cls, first: int, last: int) -> Self:
+        """The frames from ``first`` to ``last``, with both."""
+        return cls(((first, last + 1),))
+
+    def hold(self, number: Ints) -> Bools:
+        """Mask the numbers (P,) that are in one of the ranges."""
+        out = np.zeros(len(number), bool)
+        for first, end in self.ranges:
+            out |= (number >= (0 if first is None else first)) & (number < (MAX_FRAME + 1 if end is None else end))
+        return out
+
+    def __str__(self) -> str:
+        """The ranges as ``--frames`` takes them."""
+        return ",".join(":".join("" if end is None else str(end) for end in ends) for ends in self.ranges)
+
+
+class Frames(NamedTuple):
+    """What ``--frames`` says: how many frames there are, or which of them were labelled; None: it doesn't."""
+
+    count: int | None = None
+    ranges: FrameRanges | None = None
+
+    @classmethod
+    def parse(cls, value: int | str | None) -> Self:
+        """Read a number of frames, or ranges: 100:110, 100:, :50 or 0:10,50:60. Raises McaptrackError."""
+        text = "" if value is None else str(value).replace(" ", "")
+        if value is None:
+            return cls()
+        if is_count(text, _DIGITS) and 0 < int(text) <= MAX_FRAMES:
+            return cls(count=int(text))
+        parts = [part.split(":") for part in text.split(",")]
+        if all(len(ends) == 2 and all(not end or is_count(end, _DIGITS) for end in ends) for ends in parts):
+            ranges = [(int(first) if first else None, int(end) if end else None) for first, end in parts]
+            if all(end is None or (first or 0) < end for first, end in ranges):
+                return cls(ranges=FrameRanges(tuple(ranges)))
+        raise McaptrackError(
+            f"`frames=` is a number of frames from 1 to {MAX_FRAMES}, or ranges like 100:110 (frames 100 to 109), 100: "
+            f"or 0:10,50:60, not {value!r:.40}"
+        )
+
+
+def parse_first_frames(value: int | str | Mapping[str, int] | None, most: int = 10**12) -> int | dict[str, int] | None:
+    """Read the number of the first picture: of all files, or by their roles as in "tracks=0,truth=1".
+
+    Raises McaptrackError.
+    """
+    if value is None:
+        return None
+    entries = value if isinstance(value, Mapping) else dict(part.partition("=")[::2] for part in str(value).split(","))
+    entries = {name.strip(): str(number).strip() for name, number in entries.items()}
+    if [*entries.values()] == [""]:  # a number alone
+        entries = {"": next(iter(entries))}
+    roles = ("", "detections", "tracks", "truth", "corrections")
+    if all(name in roles and is_count(number, 13) and int(number) <= most for name, number in entries.items()):
+        numbers = {name: int(number) for name, number in entries.items()}
+        return numbers[""] if "" in numbers else numbers
+    raise McaptrackError(
+        f"`first_frame=` is a whole number from 0 to {most}, or one for each kind of file as in tracks=0,truth=1, not "
+        f"{value!r:.40}"
+    )
+
+
+class Numbered(NamedTuple):
+    """Labels with numbers of frames: what they are called in messages, their format, the number of the first picture,
+    whether there are labels of it, and the number of the last labelled one.
+    """
+
+    name: str
+    format: str
+    first: int
+    has_first: bool
+    last: int
+
+    @classmethod
+    def of(cls, labels: Labels) -> Self:
+        """The numbers of a label file."""
+        first = labels.first_frame
+        return cls(str(labels.path), labels.format, first, first == labels.labelled[0], int(labels.labelled[-1]))
+
+    def is_like(self, labels: Labels) -> bool:
+        """Whether a file may be expected to count frames from the same number."""
+        return self.format == labels.format or {self.format, labels.format} <= set(_EITHER)
+
+
+def share_numbers(tables: Mapping[Role, Labels], log: Sequence[Numbered] = ()) -> None:
+    """Let files whose first number isn't known count frames as the files and the labels of the log beside them do.
+
+    A file without a frame 0 counts from 0 if labels beside it do: a tracker may have seen nothing there. It counts from
+    1 if it has as many frames as those, or is ground truth that begins with 1, as data sets do.
+    """
+    counting = {role: labels for role, labels in tables.items() if labels.times_s is None and len(labels.labelled)}
+    others = [*log, *map(Numbered.of, counting.values())]
+    for role, labels in counting.items():
+        if not labels.is_first_assumed:
+            continue
+        first, last = int(labels.labelled[0]), int(labels.labelled[-1])
+        beside = [entry for entry in others if entry.name != str(labels.path)]
+        zero = next((entry for entry in beside if (entry.first, entry.has_first) == (0, True) and entry.is_like(labels)), None)
+        if zero is not None and not (first == 1 and (last == zero.last + 1 or (role == "truth" and last != zero.last))):
+            _count_from(labels, zero)
+        elif labels.first_frame > 1 and beside:
+            _count_from(labels, min(beside, key=lambda entry: entry.first))
+
+
+def _count_from(labels: Labels, like: Numbered) -> None:
+    """Set the first number of a file to that of other labels."""
+    labels.first_frame, labels.is_first_assumed = like.first, False
+    labels.doubts = [doubt for doubt in labels.doubts if doubt[1] != "clock"]
+    text = f": frames begin with {labels.labelled[0]}, and are taken to count from {like.first}, as those of"
+    labels.doubt(f"{text} {like.name} do; `first_frame=` sets the number of the first picture", "clock")
+
+
+def warn_of_firsts(tables: Iterable[Labels]) -> None:
+    """Warn of files that count frames from different numbers."""
+    firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in tables}
+    if len(firsts) > 1:
+        text = f"{' and '.join(firsts.values())} are assumed to be the same picture"
+        warn(f"{text}; `first_frame=` sets the number", "clock")
+
+
+class Described(NamedTuple):
+    """The pictures that a file describes, as a mask (P,), and how that is known: "" for all that there are."""
+
+    pictures: Bools
+    ranges: FrameRanges | None = None
+    by: str = ""
+
+
+def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameRanges | None, of: str) -> Described:
+    """Which pictures a file describes, whether or not there are boxes in them.
+
+    Parameters
+    ----------
+    labels : Labels
+    role : str
+        Of detections and tracks all frames count, also before the first box and after the last one.
+    number : int array (P,)
+        The numbers of the pictures in the file, rising.
+    at : int array (F,)
+        The numbers that have labels, or that the file states to be labelled, rising.
+    ranges : FrameRanges, optional
+        What ``--frames`` says.
+    of : str
+        What the pictures are, for messages.
+
+    Returns
+    -------
+    Described
+    """
+    if labels.labelled_by:
+        is_labelled: Bools = np.isin(number, at)
+    else:
+        is_labelled = np.asarray((number - at[0]) % labels.step_of(at) == 0, bool)
+    if ranges is not None:
+        outside = int((~ranges.hold(labels.frame)).sum()) if labels.times_s is None else 0
+        if outside:
+            warn(f"{labels.path}: {outside} labels lie outside of the frames {ranges}; they are left out", "left-out")
+        is_labelled &= ranges.hold(number)
+        if not is_labelled.any():
+            raise McaptrackError(
+                f"{labels.path}: none of the frames {ranges} is labelled; the labels are of frames {at[0]} to {at[-1]}"
+            )
+        return Described(is_labelled, ranges, "`frames=`")
+    if role in ("detections", "tracks") or (labels.labelled_by and is_labelled.any()):
+        return Described(is_labelled, None, labels.labelled_by)
+    inside = is_labelled & (number >= at[0]) & (number <= at[-1])
+    if role == "corrections":  # frames beyond those that were looked at stay as they are
+        return Described(inside)
+    first, last, step = int(at[0]), int(at[-1]), labels.step_of(at)
+    of_all = max(last, int(number[-1])) - min(first, int(number[0])) + step
+    if last - first + step >= _COVERED * of_all or is_whole(labels):
+        return Described(is_labelled)
+    assumed = FrameRanges.span(first, last)
+    warn_partly(labels, assumed, of)
+    return Described(inside, assumed, ASSUMED)
+
+
+#: How it is known which frames were labelled, where a file doesn't state it.
+ASSUMED: Final = "its first and last label"
+
+
+def is_whole(labels: Labels) -> bool:
+    """Whether labels are of the whole of a sequence by the seqinfo.ini beside them."""
+    info = find_seqinfo(labels.path.parent)
+    return info is not None and info.frames is not None
+
+
+def warn_partly(labels: Labels, assumed: FrameRanges, of: str) -> None:
+    """Warn of frames that are taken as not labelled."""
+    (first, end), *_ = assumed.ranges
+    assert end is not None
+    text = f"{labels.path} has labels in frames {first} to {end - 1}, {of} go on beyond; frames outside of these are "
+    warn(f"{text}taken as not labelled and count in no score; `frames='{assumed}'` says which frames are", "labelled")
