@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from html import escape
 from itertools import count
 from pathlib import Path
@@ -14,15 +13,14 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, optional_path, paths_of, warn_unused
+from mcaptrack.api import labels
+from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, paths_of, warn_unused
 from mcaptrack.api.declared import Argument, Option, checked, declared
-from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import (
     LABELS,
     SCORES,
     Camera,
     GroundPlane,
-    LabelFps,
     MinIou,
     PathLike,
     PointOfBox,
@@ -31,7 +29,7 @@ from mcaptrack.api.options import (
     no_progress,
     similarity,
 )
-from mcaptrack.choices import Point, Similarity
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import (
     COMBINED,
@@ -55,6 +53,7 @@ from mcaptrack.pipeline.rebuild import rebuild
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import compare_files, pair_files
 from mcaptrack.transforms import STAGES, Predict
 
@@ -308,11 +307,17 @@ def evaluate(
     rules: Annotated[Rules, Option(SCORES, tuning=True)] = "trackeval",
     smoothed: Annotated[bool, Option(SCORES, tuning=True)] = False,
     topic: Annotated[str | Sequence[str] | None, Option(SCORES)] = None,
-    classes: Annotated[str | None, Option(LABELS)] = None,
+    label_format: labels.Format = "auto",
+    columns: labels.Columns = None,
+    classes: labels.Classes = None,
+    class_map: labels.ClassNames = None,
+    first_frame: labels.FirstFrame = None,
+    frames: labels.LabelledFrames = None,
+    fps: labels.LabelFps = None,
+    size: labels.Size = None,
     camera: Camera = None,
     ground_plane: GroundPlane = None,
     point: PointOfBox = "foot",
-    fps: LabelFps = None,
     progress: Reports = no_progress,
 ) -> Scores:
     """Score tracks and predictions against ground truth.
@@ -340,9 +345,6 @@ def evaluate(
         They are called "samples, smoothed"; the paper names them SORT + smoothing.
     topic : str or sequence of str, optional
         Score these channels; by default tracks, samples, retracks, retracks/online; of 3D boxes retracks/full, too.
-    classes : str, optional
-        Classes of label files to score, by name or number, as in person,car; all for every one; by default person; 3D
-        boxes: all.
 
     Returns
     -------
@@ -371,15 +373,16 @@ def evaluate(
     topics, notes = names_of(topic), Notes()
     gates = tuple(np.asarray(gate_m, float).reshape(-1).tolist())
     options = EvaluateOptions((similarity,) if similarity else (), gates, min_iou, rules, topics)
+    how = labels.label_options(
+        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
+        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
+    )  # fmt: skip
     paths = locations_of(tracks)
     with collected() as warnings:
         if truth is None:
             sequences = _from_logs(paths, camera, topics, smoothed)
         else:
-            plane = optional_path(ground_plane)
-            sequences = _from_files(
-                [as_path(path) for path in paths], paths_of(truth), parse_fps(fps), plane, point, topics, classes, notes
-            )
+            sequences = _from_files([as_path(path) for path in paths], paths_of(truth), how, topics, notes)
         total, counter = sum(len(sequence.candidates) for sequence in sequences), count()
 
         def tell(candidate: str) -> None:
@@ -390,15 +393,13 @@ def evaluate(
         progress("evaluate", total, total)
         for note in outcome.notes:
             warn(note, "not-compared")
-        has_point, has_plane = point != "foot", ground_plane is not None
         if truth is None:
-            reason = "it is about label files; logs have theirs inside"
-            warn_unused(reason, ground_plane=has_plane, point=has_point, fps=fps is not None)
+            labels.warn_of_unused(how, "it is about label files; logs have theirs inside", "classes")
             warn_unused("logs are scored by all classes that they have", classes=classes is not None)
         else:
             warn_unused("files of tracks are of no camera", camera=camera is not None)
             warn_unused("files hold no samples with predictions", smoothed=smoothed)
-            warn_unused("there is no ground plane", point=has_point and not has_plane)
+            warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
             is_unused = classes is not None and any(map(holds_tables, [*paths, *paths_of(truth)]))
             warn_unused("tables are compared as a whole", classes=is_unused)
             warn_unused("only tables hold several channels", topic=bool(topics) and not any(map(holds_tables, paths)))
@@ -453,21 +454,14 @@ def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
 
 
 def _from_files(
-    tracks: Sequence[Path],
-    truths: Sequence[Path],
-    fps: Fraction | None,
-    ground_plane: Path | None,
-    point: Point,
-    topics: tuple[str, ...],
-    classes: str | None,
-    notes: Notes,
+    tracks: Sequence[Path], truths: Sequence[Path], how: IngestOptions, topics: tuple[str, ...], notes: Notes
 ) -> list[EvaluationInput]:
     pairs, note_on_pairs = pair_files(tracks, truths)
     if note_on_pairs:
         notes.say(note_on_pairs)
     sequences = []
-    for name, path, labels in pairs:
-        both = compare_files(path, labels, fps, ground_plane, point, topics, classes)
+    for name, path, truth in pairs:
+        both = compare_files(path, truth, how, topics)
         for note in both.notes:
             notes.say(note)
         sequences.append(sequence_of_files(name, path, both.ground_truth, both.tracks, len(pairs), both.classes))

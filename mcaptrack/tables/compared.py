@@ -32,7 +32,7 @@ from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
-from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts
+from mcaptrack.sources.ingest.labels.frames import described, share_numbers, warn_of_firsts
 from mcaptrack.sources.ingest.labels.reading import in_order, is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import label_rows
 
@@ -41,6 +41,7 @@ _COUNTING: Final = ("mot", "kitti", "parquet")
 _ALIKE: Final = 0.5
 #: The largest size of a file that can be blank.
 _BLANK_BYTES: Final = 4096
+_DEFAULTS: Final = IngestOptions()
 _EPS: Final = float(np.finfo(float).eps)
 
 
@@ -97,7 +98,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def compare_files(
-    tracks: Path, ground_truth: Path, options: IngestOptions = IngestOptions(), topics: Sequence[str] = ()
+    tracks: Path, ground_truth: Path, options: IngestOptions = _DEFAULTS, topics: Sequence[str] = ()
 ) -> AlignedFiles:
     """Tracks and ground truth as frames, read as ``options`` say.
 

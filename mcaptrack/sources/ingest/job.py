@@ -24,7 +24,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
 from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
-from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
+from mcaptrack.schema.classes import ClassMap, classes_beside_rows, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
@@ -99,6 +99,7 @@ class IngestOptions:
     columns: Mapping[str, str] | None = None
     size: tuple[int, int] | None = None
     classes: WantedClasses | None = None
+    class_map: ClassMap | None = None
     frame_id: str | None = None
     scene: str | None = None
 

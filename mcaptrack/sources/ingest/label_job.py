@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.choices import Point, Role
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
@@ -33,7 +33,7 @@ from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
 from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
+from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, describe_classes
 from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, share_numbers
 from mcaptrack.sources.ingest.labels.reading import chosen_format, read_boxes_3d
 from mcaptrack.sources.ingest.labels.timeline import (
@@ -140,7 +140,7 @@ class LabelJob(IngestJob):
             self.prefix, self.pictures = camera_of(into, options.camera)
             existing = labels_of(into, self.prefix).items()
             beside = [
-                Numbered(f"{topic} of {into.path}", "mot", 0, has_first=True, last=labels.frames - 1)
+                Numbered(f"{topic} of {into.path}", "mot", 0, begins_with_0=True, last=labels.frames - 1)
                 for topic, labels in existing
                 if labels.counts_from_0
             ]

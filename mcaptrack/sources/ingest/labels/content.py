@@ -198,8 +198,9 @@ class BoxTable(CheckedRows):
     of its track or ``NO_ID``, ``boxes`` (N, ...) its box, ``score`` (N,) NaN where there is none, ``class_id`` (N,) the
     class as the file has it (``NO_CLASS``: none), and as the schema of detections has it once the rows are settled.
     ``classes`` are then names by class id. ``labelled`` (F,) are the frames that the file describes, with or without
-    boxes; ``labelled_by`` says how the file states them, "" if they are those that have boxes. ``left_out`` describes the rows that were left out. ``remarks`` and ``doubts`` (warnings and their codes) say
-    how the file was understood. ``plugin`` is the format, if it is of another package.
+    boxes; ``states_labelled``: the file says so, and it isn't concluded from the boxes. ``left_out`` describes the rows
+    that were left out. ``remarks`` and ``doubts`` (warnings and their codes) say how the file was understood.
+    ``plugin`` is the format, if it is of another package.
     """
 
     path: Path
@@ -213,7 +214,7 @@ class BoxTable(CheckedRows):
     classes: Mapping[int, str] = field(default_factory=dict)
     left_out: str = ""
     labelled: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    labelled_by: str = ""
+    states_labelled: bool = False
     remarks: list[str] = field(default_factory=list)
     doubts: list[tuple[str, Code]] = field(default_factory=list)
     plugin: Plugin | None = None

@@ -308,7 +308,7 @@ def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
         return f"{path}:{values[row, 8]:.0f}"
 
     rows = Labels(path, "cvat", at, values[:, 0], values[:, _ID], values[:, 1:5], none, kind, observed=is_seen)
-    rows.labelled, rows.labelled_by, doubt = _frames(parser, values[:, 0])
+    rows.labelled, rows.states_labelled, doubt = _frames(parser, values[:, 0])
     if doubt:
         rows.doubt(f": {doubt}", "clock")
     if parser.tracks:
@@ -342,24 +342,28 @@ def _classes(labels: dict[str, int]) -> tuple[Floats, dict[int, str]]:
     return np.array(numbers, float), names or {PERSON: "person"}
 
 
-def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, str, str]:
-    """The frames (F,) that were annotated, how the file states them, and what is odd: those of the images or the task,
-    or those with boxes.
+def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, bool, str]:
+    """The frames (F,) that were annotated, whether the file states them, and what is odd: those of the images or the
+    task, or up to the last box.
     """
     if parser.images:
-        return np.array(sorted(parser.images), np.int64), "its images", ""
+        return np.array(sorted(parser.images), np.int64), True, ""
     first, last, every = parser.span()
     if not first <= last < first + _MAX_FRAMES:
-        return np.arange(int(frame.min()), int(min(frame.max(), frame.min() + _MAX_FRAMES)) + 1), "", ""
+        return np.arange(int(frame.min()), int(min(frame.max(), frame.min() + _MAX_FRAMES)) + 1), False, ""
     frames = np.arange(first, last + 1, every)
     others = ~np.isin(frame, frames)
     if not others.any():
-        return frames, "its task", ""
+        return frames, True, ""
     listed = f"frames {first} to {last}" + (f" in steps of {every}" if every > 1 else "")
     text = (
         f"{int(others.sum())} boxes are in frames that its task doesn't have ({listed}), as in {frame[others][0]:.0f}"
     )
-    return np.unique(frame.astype(np.int64)), "", f"{text}; frames are taken as they are, and only those with boxes count"
+    return (
+        np.unique(frame.astype(np.int64)),
+        False,
+        f"{text}; frames are taken as they are, and only those with boxes count",
+    )
 
 
 def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | None, list[str]]:

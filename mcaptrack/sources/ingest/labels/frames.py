@@ -36,11 +36,6 @@ class FrameRanges:
 
     ranges: tuple[tuple[int | None, int | None], ...]
 
-    @classmethod
-    def span(cls, first: int, last: int) -> Self:
-        """The frames from ``first`` to ``last``, with both."""
-        return cls(((first, last + 1),))
-
     def hold(self, number: Ints) -> Bools:
         """Mask the numbers (P,) that are in one of the ranges."""
         out = np.zeros(len(number), bool)
@@ -92,7 +87,7 @@ def parse_first_frames(value: int | str | Mapping[str, int] | None, most: int = 
     roles = ("", "detections", "tracks", "truth", "corrections")
     if all(name in roles and is_count(number, 13) and int(number) <= most for name, number in entries.items()):
         numbers = {name: int(number) for name, number in entries.items()}
-        return numbers[""] if "" in numbers else numbers
+        return numbers.get("", numbers)
     raise McaptrackError(
         f"`first_frame=` is a whole number from 0 to {most}, or one for each kind of file as in tracks=0,truth=1, not "
         f"{value!r:.40}"
@@ -101,20 +96,20 @@ def parse_first_frames(value: int | str | Mapping[str, int] | None, most: int = 
 
 class Numbered(NamedTuple):
     """Labels with numbers of frames: what they are called in messages, their format, the number of the first picture,
-    whether there are labels of it, and the number of the last labelled one.
+    whether there is a frame 0, and the number of the last labelled one.
     """
 
     name: str
     format: str
     first: int
-    has_first: bool
+    begins_with_0: bool
     last: int
 
     @classmethod
     def of(cls, labels: Labels) -> Self:
         """The numbers of a label file."""
-        first = labels.first_frame
-        return cls(str(labels.path), labels.format, first, first == labels.labelled[0], int(labels.labelled[-1]))
+        begins_with_0 = bool(labels.labelled[0] == 0 == labels.first_frame)
+        return cls(str(labels.path), labels.format, labels.first_frame, begins_with_0, int(labels.labelled[-1]))
 
     def is_like(self, labels: Labels) -> bool:
         """Whether a file may be expected to count frames from the same number."""
@@ -134,7 +129,7 @@ def share_numbers(tables: Mapping[Role, Labels], log: Sequence[Numbered] = ()) -
             continue
         first, last = int(labels.labelled[0]), int(labels.labelled[-1])
         beside = [entry for entry in others if entry.name != str(labels.path)]
-        zero = next((entry for entry in beside if (entry.first, entry.has_first) == (0, True) and entry.is_like(labels)), None)
+        zero = next((entry for entry in beside if entry.begins_with_0 and entry.is_like(labels)), None)
         if zero is not None and not (first == 1 and (last == zero.last + 1 or (role == "truth" and last != zero.last))):
             _count_from(labels, zero)
         elif labels.first_frame > 1 and beside:
@@ -158,7 +153,9 @@ def warn_of_firsts(tables: Iterable[Labels]) -> None:
 
 
 class Described(NamedTuple):
-    """The pictures that a file describes, as a mask (P,), and how that is known: "" for all that there are."""
+    """The pictures that a file describes, as a mask (P,); the ranges of frames that were labelled, None if it is all of
+    them; and how these are known.
+    """
 
     pictures: Bools
     ranges: FrameRanges | None = None
@@ -166,7 +163,7 @@ class Described(NamedTuple):
 
 
 def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameRanges | None, of: str) -> Described:
-    """Which pictures a file describes, whether or not there are boxes in them.
+    """Which pictures a file describes, whether or not there are boxes in them; warns of what is assumed.
 
     Parameters
     ----------
@@ -185,48 +182,41 @@ def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameR
     Returns
     -------
     Described
+
+    Raises
+    ------
+    McaptrackError
+        If none of the frames that ``--frames`` names is labelled.
     """
-    if labels.labelled_by:
-        is_labelled: Bools = np.isin(number, at)
-    else:
-        is_labelled = np.asarray((number - at[0]) % labels.step_of(at) == 0, bool)
+    first, last, step = int(at[0]), int(at[-1]), labels.step_of(at)
+    is_labelled: Bools = np.isin(number, at) if labels.states_labelled else (number - first) % step == 0
     if ranges is not None:
-        outside = int((~ranges.hold(labels.frame)).sum()) if labels.times_s is None else 0
-        if outside:
-            warn(f"{labels.path}: {outside} labels lie outside of the frames {ranges}; they are left out", "left-out")
         is_labelled &= ranges.hold(number)
         if not is_labelled.any():
             raise McaptrackError(
-                f"{labels.path}: none of the frames {ranges} is labelled; the labels are of frames {at[0]} to {at[-1]}"
+                f"{labels.path}: none of the frames {ranges} is labelled; it has labels of frames {first} to {last}"
             )
-        return Described(is_labelled, ranges, "`frames=`")
-    if role in ("detections", "tracks") or (labels.labelled_by and is_labelled.any()):
-        return Described(is_labelled, None, labels.labelled_by)
-    inside = is_labelled & (number >= at[0]) & (number <= at[-1])
+        if labels.times_s is None and (outside := int((~ranges.hold(labels.frame)).sum())):
+            warn(f"{labels.path}: {outside} labels are of frames outside of {ranges}; they are left out", "left-out")
+        return Described(is_labelled, ranges, "frames")
+    beyond = (number < first) | (number > last)
+    span = FrameRanges(((first, last + 1),)) if beyond.any() else None
     if role == "corrections":  # frames beyond those that were looked at stay as they are
-        return Described(inside)
-    first, last, step = int(at[0]), int(at[-1]), labels.step_of(at)
-    of_all = max(last, int(number[-1])) - min(first, int(number[0])) + step
-    if last - first + step >= _COVERED * of_all or is_whole(labels):
+        return Described(is_labelled & ~beyond)
+    if labels.states_labelled:
+        return Described(is_labelled, span, "file" if span else "")
+    whole = max(last, int(number[-1])) - min(first, int(number[0])) + step
+    if role != "truth" or last - first + step >= _COVERED * whole or _is_of_sequence(labels):
         return Described(is_labelled)
-    assumed = FrameRanges.span(first, last)
-    warn_partly(labels, assumed, of)
-    return Described(inside, assumed, ASSUMED)
+    warn(
+        f"{labels.path} has labels from frame {first} to {last}, which are less than {_COVERED:.0%} of {of}: the "
+        f"others are taken as not labelled, and count in no score; `frames='{span}'` names those that are labelled",
+        "labelled",
+    )
+    return Described(is_labelled & ~beyond, span, "labels")
 
 
-#: How it is known which frames were labelled, where a file doesn't state it.
-ASSUMED: Final = "its first and last label"
-
-
-def is_whole(labels: Labels) -> bool:
-    """Whether labels are of the whole of a sequence by the seqinfo.ini beside them."""
+def _is_of_sequence(labels: Labels) -> bool:
+    """Whether labels are of a whole sequence: a seqinfo.ini beside them counts its frames."""
     info = find_seqinfo(labels.path.parent)
     return info is not None and info.frames is not None
-
-
-def warn_partly(labels: Labels, assumed: FrameRanges, of: str) -> None:
-    """Warn of frames that are taken as not labelled."""
-    (first, end), *_ = assumed.ranges
-    assert end is not None
-    text = f"{labels.path} has labels in frames {first} to {end - 1}, {of} go on beyond; frames outside of these are "
-    warn(f"{text}taken as not labelled and count in no score; `frames='{assumed}'` says which frames are", "labelled")

@@ -224,7 +224,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> Labels:
     out = rows.done()
     is_labelled = np.array([image.get("is_labeled") is not False for image in images], bool)  # PoseTrack
     numbers = np.array(frames, np.int64)
-    out.labelled, out.labelled_by = np.unique(numbers[is_labelled]), "its images"
+    out.labelled, out.states_labelled = np.unique(numbers[is_labelled]), True
     out.first_frame = int(numbers.min()) if len(numbers) else 0
     out.is_first_assumed = out.first_frame > 0
     out.remark(f": {len(images)} images, in order of {order}")

@@ -68,7 +68,7 @@ class FormatOfPackage(NamedTuple):
         rows = Labels(
             path, self.entry.name, given.at, given.frame, given.id, given.boxes, given.score, given.kind,
             labelled=given.labelled, first_frame=given.first_frame, plugin=self.plugin, times_s=given.times_s,
-            labelled_by="its format" if len(given.labelled) else "",
+            states_labelled=bool(len(given.labelled)),
         )  # fmt: skip
         numbers = _numbers_of(given.names)
         rows.class_id = np.array([*numbers, NO_CLASS])[given.kind]

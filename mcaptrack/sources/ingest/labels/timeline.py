@@ -225,7 +225,10 @@ class Timeline:
         if last // every <= end != (last - first) // every + 1:
             labels.first_frame = int(last // every == end)
             text = f"is taken to be picture {first - labels.first_frame} of {end}, counted from 0"
-        warn(f"{labels.path}: its first image has the number {first}, and {text}; `first_frame=` sets the number", "clock")
+        warn(
+            f"{labels.path}: its first image has the number {first}, and {text}; `first_frame=` sets the number",
+            "clock",
+        )
 
     def _beyond(self, labels: Labels, beyond: int, end: int) -> str:
         """The error for labels after frame ``end`` of the file, the last picture."""

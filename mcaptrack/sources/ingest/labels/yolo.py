@@ -94,7 +94,7 @@ def read_yolo(folder: Path, role: Role, wanted: WantedClasses) -> Labels:
     boxes = np.concatenate([centre - size / 2, size], axis=1)
     out = Labels(folder, "yolo", at, rows[:, 0], track_id, boxes, score, rows[:, 1], remarks=remarks)
     out.labelled, out.is_normalised, out.first_frame = np.array(sorted(numbers), np.int64), True, UNKNOWN_FIRST
-    out.labelled_by = "its files" if any(len(part) == 0 for part in values[1:]) else ""  # others are not written
+    out.states_labelled = any(len(part) == 0 for part in values[1:])  # others are not written
     names, named_by = _class_names(folder, files[0].parent, out.doubts)
     if named_by is not None:
         out.remark(f": class names by {named_by}")
