@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from html import escape
 from itertools import count
 from pathlib import Path
@@ -38,6 +38,7 @@ from mcaptrack.evaluation import (
     EvaluateOptions,
     EvaluationInput,
     EvaluationRow,
+    Labelled,
     sequence_of_files,
     sequence_of_log,
 )
@@ -53,6 +54,7 @@ from mcaptrack.pipeline.rebuild import rebuild
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import compare_files, pair_files
 from mcaptrack.transforms import STAGES, Predict
@@ -84,6 +86,9 @@ class Scores:
         by one for each class, with the name of the class in ``of_class``.
     notes : tuple of str
         How files were paired and read.
+    labelled : dict of str to mcaptrack.evaluation.Labelled
+        For each sequence which frames of its ground truth were labelled, and how that is known; others count in no
+        score.
     warnings : tuple of mcaptrack.Notice
         What was assumed, and what could not be compared.
 
@@ -92,6 +97,7 @@ class Scores:
     results: tuple[EvaluationRow, ...]
     notes: tuple[str, ...]
     warnings: tuple[Notice, ...]
+    labelled: Mapping[str, Labelled] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Scores({len(self.results)} results; `rows` returns them)"
@@ -408,7 +414,8 @@ def evaluate(
             warn_unused("nothing is compared by distance on the ground", gate_m=gates != DEFAULT_GATES_M)
         if compared <= {"metres"}:
             warn_unused("nothing is compared by overlap", min_iou=min_iou != IOU_THRESHOLD)
-    return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)))
+    labelled = {sequence.name: sequence.labelled for sequence in sequences}
+    return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)), labelled)
 
 
 def holds_tables(path: Location) -> bool:
@@ -427,6 +434,8 @@ def _from_logs(
         with logs.read(path) as opened:
             prefix = pipeline.find_camera(opened, camera)
             sequence = sequence_of_log(opened, prefix, topics)
+            if how := provenance_of(opened, camera_at(opened, prefix).truth):
+                how.warn_again()
             if smoothed:
                 sequence.candidates = [*sequence.candidates, _smoothed(opened, prefix)]
             sequence.name = name
@@ -464,5 +473,8 @@ def _from_files(
         both = compare_files(path, truth, how, topics)
         for note in both.notes:
             notes.say(note)
-        sequences.append(sequence_of_files(name, path, both.ground_truth, both.tracks, len(pairs), both.classes))
+        sequence = sequence_of_files(
+            name, path, both.ground_truth, both.tracks, len(pairs), both.classes, both.labelled
+        )
+        sequences.append(sequence)
     return sequences

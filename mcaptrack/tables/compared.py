@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,18 +24,18 @@ from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.boxes import iou
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels
 from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
-from mcaptrack.sources.ingest.labels.frames import described, share_numbers, warn_of_firsts
+from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts
 from mcaptrack.sources.ingest.labels.reading import in_order, is_3d, read_homography, read_labels
-from mcaptrack.sources.ingest.labels.timeline import label_rows
+from mcaptrack.sources.ingest.labels.timeline import Placed, label_rows
 
 #: Formats that give the frame number of each row.
 _COUNTING: Final = ("mot", "kitti", "parquet")
@@ -49,13 +50,15 @@ _EPS: Final = float(np.finfo(float).eps)
 class AlignedFiles:
     """Ground truth and tracks as frames at the same times, and notes for people.
 
-    ``classes`` are the names of the classes of the ground truth and of the tracks.
+    ``classes`` are the names of the classes of the ground truth and of the tracks; ``labelled`` are the frames that
+    were labelled, None for all, and how that is known.
     """
 
     ground_truth: list[Frame]
     tracks: list[Frame]
     notes: list[str] = field(default_factory=list)
     classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {})
+    labelled: tuple[str | None, str | None] = (None, None)
 
 
 def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[list[tuple[str, Path, Path]], str]:
@@ -119,14 +122,27 @@ def compare_files(
     if not all(name in _COUNTING for name in formats) and len(set(formats)) > 1:
         if "parquet" in formats:
             raise McaptrackError(f"{tracks} and {ground_truth} share no clock: one counts frames, the other does not")
-        frames = ingest.label_frames({"tracks": tracks, "truth": ground_truth}, _may_lack(options))
-        return AlignedFiles(frames["truth"], frames["tracks"], classes=_names_of(both))
+        files: list[tuple[Role | None, Path]] = [("tracks", tracks), ("truth", ground_truth)]
+        with LabelJob(files, _may_lack(options), default_fps=Fraction(1)) as job:
+            job.report_assumptions()
+            truth, placed = job.placed_frames("truth")
+            return AlignedFiles(truth, job.all_frames("tracks"), [], _names_of(both), _labelled(placed))
     share_numbers(both)
     warn_of_firsts(labels for labels in both.values() if len(labels.frame))
+    for text, code in (doubt for labels in both.values() for doubt in labels.doubts):
+        warn(text, code)
     notes = [f"{labels.path} also holds {labels.left_out}" for labels in both.values() if labels.left_out]
     if options.fps is not None:
         notes.append("frames are compared by their numbers, whatever the frames per second")
+    if options.frames is not None:
+        text = "`frames=` with a number of frames changes nothing here: frames are compared by their numbers"
+        warn(f"{text}; `frames=':'` says that all were labelled", "option-not-used")
     return _by_number(both, options, notes)
+
+
+def _labelled(shown: Placed | Described) -> tuple[str | None, str | None]:
+    """Which frames were labelled, and how that is known."""
+    return (None if shown.ranges is None else str(shown.ranges), shown.by or None)
 
 
 def _may_lack(options: IngestOptions) -> IngestOptions:
@@ -145,7 +161,10 @@ def _boxes_3d(tracks: Path, ground_truth: Path, options: IngestOptions) -> Align
     with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], together) as job:
         job.report_assumptions()
         classes = (job.boxes["truth"].classes, job.boxes["tracks"].classes)
-        return AlignedFiles(job.all_frames("truth"), job.all_frames("tracks"), job.report.remarks, classes)
+        ranges = options.frame_ranges
+        labelled = (str(ranges), "frames") if ranges else (None, None)
+        frames = job.all_frames("truth"), job.all_frames("tracks")
+        return AlignedFiles(*frames, job.report.remarks, classes, labelled)
 
 
 @dataclass
@@ -183,6 +202,8 @@ def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions)
         return _no_tracks(path)
     wanted = replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks")
     labels = read_labels(path, options.label_format, role, options.first_of(role), options.columns, wanted)
+    if options.size is not None and labels.is_normalised:
+        labels.fit(options.size)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
         raise McaptrackError(f"{path} has {what}; make a log of it with {call('ingest', path)}, and compare that")
@@ -250,7 +271,7 @@ def _by_number(both: dict[Role, Labels], options: IngestOptions, notes: list[str
         frames["tracks"], gone = _without_ignored(frames["truth"], frames["tracks"], ground_truth)
         if gone:
             notes.append(f"{gone} boxes of {both['tracks'].path} match labels that don't count; they are ignored")
-    return AlignedFiles(frames["truth"], frames["tracks"], notes, _names_of(both))
+    return AlignedFiles(frames["truth"], frames["tracks"], notes, _names_of(both), _labelled(shown))
 
 
 def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels) -> GroundPlane | None:

@@ -140,7 +140,7 @@ class LabelJob(IngestJob):
             self.prefix, self.pictures = camera_of(into, options.camera)
             existing = labels_of(into, self.prefix).items()
             beside = [
-                Numbered(f"{topic} of {into.path}", "mot", 0, begins_with_0=True, last=labels.frames - 1)
+                Numbered(f"{topic} of {into.path}", "mot", 0, 0, labels.frames - 1)
                 for topic, labels in existing
                 if labels.counts_from_0
             ]
@@ -333,8 +333,12 @@ class LabelJob(IngestJob):
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The labels of a role as frames, including empty frames."""
+        return self.placed_frames(role)[0]
+
+    def placed_frames(self, role: Role) -> tuple[list[Frame], Placed]:
+        """As ``all_frames``, and which frames these are."""
         placed = self.timeline.place(self.labels[role], role, self.report.lost, self.ranges_of(role))
-        return list(self.frames(role, self.ground, placed)())
+        return list(self.frames(role, self.ground, placed)()), placed
 
 
 def _seconds(t_ns: int) -> str:
@@ -465,7 +469,7 @@ class Boxes3DJob(IngestJob):
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
         for rows in self.boxes.values():
             rows.frame_id = self._frame_id(rows)
-        self.boxes = {role: self._at_times(role, rows) for role, rows in self.boxes.items()}
+        self.boxes = {role: self._at_times(role, self._in_ranges(role, rows)) for role, rows in self.boxes.items()}
 
     @property
     def roles(self) -> Set[Role]:
@@ -485,8 +489,25 @@ class Boxes3DJob(IngestJob):
         (rows.doubt if reason == "assumed" else rows.remark)(text)
         return frame_id
 
+    def _in_ranges(self, role: Role, rows: BoxRows3D) -> BoxRows3D:
+        """The rows of the frames that a user says were labelled."""
+        ranges = self.ranges_of(role)
+        if ranges is None:
+            return rows
+        if rows.is_timed:
+            raise McaptrackError(f"{rows.path} has times, which say what it describes; leave `frames=` out")
+        inside = ranges.hold(rows.frame)
+        if not inside.any():
+            raise McaptrackError(
+                f"{rows.path}: none of the frames {ranges} is labelled; it has labels of frames {rows.frame.min()} to "
+                f"{rows.frame.max()}"
+            )
+        if outside := int((~inside).sum()):
+            warn(f"{rows.path}: {outside} labels are of frames outside of {ranges}; they are left out", "left-out")
+        return replace(rows.take(inside), labelled=rows.labelled[ranges.hold(rows.labelled)])
+
     def _at_times(self, role: Role, rows: BoxRows3D) -> BoxRows3D:
-        t_ns, labelled = self._times(rows, rows.frame, rows.labelled)
+        t_ns, labelled = self._times(rows, self.options.first_of(role), rows.frame, rows.labelled)
         timed = rows.settled(t_ns, labelled, role, self.options.classes)
         if self.into is not None and any(part.index.counts for part in self.into.parts):
             first, last = int(timed.labelled[0]), int(timed.labelled[-1])
@@ -498,15 +519,16 @@ class Boxes3DJob(IngestJob):
                 )
         return timed
 
-    def _times(self, rows: BoxRows3D, number: Ints, labelled: Ints) -> tuple[Ints, Ints]:
-        """The times of rows (N,) and of labelled frames (F,), by their own times, a frame rate, or the log."""
+    def _times(self, rows: BoxRows3D, first: int | None, number: Ints, labelled: Ints) -> tuple[Ints, Ints]:
+        """The times of rows (N,) and of labelled frames (F,), by their own times, a frame rate, or the log; ``first``
+        is the number of the first one, if it is given.
+        """
         options = self.options
         if rows.is_timed:
             if name := options.given("fps", "first_frame"):
                 raise McaptrackError(f"{rows.path} has times; leave {name} out")
             shift = 0 if options.start_ns is None else options.start_ns - int(labelled[0])
             return number + shift, labelled + shift
-        first = options.first_frame
         if first is None:
             first = rows.assume_first(int(labelled[0])) if rows.format == "csv" else 0
         if int(labelled[0]) < first:
@@ -559,7 +581,8 @@ class Boxes3DJob(IngestJob):
     def _parameters(self, role: Role) -> dict[str, Any]:
         options = self.options
         parameters: Mapping[str, Any] = {
-            "first_frame": options.first_frame,
+            "first_frame": options.first_of(role),
+            "frames": str(ranges) if (ranges := self.ranges_of(role)) else None,
             "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
             "classes": options.classes.text if options.classes and role != "detections" else None,
             "scene": options.scene,

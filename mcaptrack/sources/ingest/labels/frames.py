@@ -96,20 +96,24 @@ def parse_first_frames(value: int | str | Mapping[str, int] | None, most: int = 
 
 class Numbered(NamedTuple):
     """Labels with numbers of frames: what they are called in messages, their format, the number of the first picture,
-    whether there is a frame 0, and the number of the last labelled one.
+    and the numbers of the first and of the last labelled one.
     """
 
     name: str
     format: str
     first: int
-    begins_with_0: bool
+    least: int
     last: int
 
     @classmethod
     def of(cls, labels: Labels) -> Self:
         """The numbers of a label file."""
-        begins_with_0 = bool(labels.labelled[0] == 0 == labels.first_frame)
-        return cls(str(labels.path), labels.format, labels.first_frame, begins_with_0, int(labels.labelled[-1]))
+        least, last = int(labels.labelled[0]), int(labels.labelled[-1])
+        return cls(str(labels.path), labels.format, labels.first_frame, least, last)
+
+    def has_numbers_of(self, labels: Labels) -> bool:
+        """Whether these are of the same frames as those of a file, by their numbers."""
+        return (self.least, self.last) == (int(labels.labelled[0]), int(labels.labelled[-1]))
 
     def is_like(self, labels: Labels) -> bool:
         """Whether a file may be expected to count frames from the same number."""
@@ -129,24 +133,27 @@ def share_numbers(tables: Mapping[Role, Labels], log: Sequence[Numbered] = ()) -
             continue
         first, last = int(labels.labelled[0]), int(labels.labelled[-1])
         beside = [entry for entry in others if entry.name != str(labels.path)]
-        zero = next((entry for entry in beside if entry.begins_with_0 and entry.is_like(labels)), None)
+        zero = next((entry for entry in beside if entry.first == entry.least == 0 and entry.is_like(labels)), None)
         if zero is not None and not (first == 1 and (last == zero.last + 1 or (role == "truth" and last != zero.last))):
             _count_from(labels, zero)
-        elif labels.first_frame > 1 and beside:
-            _count_from(labels, min(beside, key=lambda entry: entry.first))
+        elif labels.first_frame > 1 and beside:  # images whose numbers begin later
+            _count_from(labels, next((entry for entry in beside if entry.has_numbers_of(labels)), beside[0]))
 
 
 def _count_from(labels: Labels, like: Numbered) -> None:
-    """Set the first number of a file to that of other labels."""
-    labels.first_frame, labels.is_first_assumed = like.first, False
+    """Set the first number of a file to that of other labels, if these are of its kind, and otherwise to 0."""
+    is_like = like.is_like(labels) or like.has_numbers_of(labels)
+    labels.first_frame = like.first if is_like else 0
     labels.doubts = [doubt for doubt in labels.doubts if doubt[1] != "clock"]
-    text = f": frames begin with {labels.labelled[0]}, and are taken to count from {like.first}, as those of"
-    labels.doubt(f"{text} {like.name} do; `first_frame=` sets the number of the first picture", "clock")
+    text = f": frames begin with {labels.labelled[0]}, and are taken to count from {labels.first_frame}"
+    text += f", as those of {like.name} do" if is_like else ""
+    labels.doubt(f"{text}; `first_frame=` sets the number of the first picture", "clock")
 
 
 def warn_of_firsts(tables: Iterable[Labels]) -> None:
     """Warn of files that count frames from different numbers."""
-    firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in tables}
+    counting = [labels for labels in tables if labels.times_s is None]
+    firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in counting}
     if len(firsts) > 1:
         text = f"{' and '.join(firsts.values())} are assumed to be the same picture"
         warn(f"{text}; `first_frame=` sets the number", "clock")
@@ -192,7 +199,7 @@ def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameR
     is_labelled: Bools = np.isin(number, at) if labels.states_labelled else (number - first) % step == 0
     if ranges is not None:
         is_labelled &= ranges.hold(number)
-        if not is_labelled.any():
+        if not ranges.hold(at).any():
             raise McaptrackError(
                 f"{labels.path}: none of the frames {ranges} is labelled; it has labels of frames {first} to {last}"
             )
@@ -205,8 +212,9 @@ def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameR
         return Described(is_labelled & ~beyond)
     if labels.states_labelled:
         return Described(is_labelled, span, "file" if span else "")
-    whole = max(last, int(number[-1])) - min(first, int(number[0])) + step
-    if role != "truth" or last - first + step >= _COVERED * whole or _is_of_sequence(labels):
+    before, after = max(first - int(number[0]), 0) // step, max(int(number[-1]) - last, 0) // step
+    covered = (last - first) // step + 1
+    if role != "truth" or covered >= _COVERED * (before + covered + after) or _is_of_sequence(labels):
         return Described(is_labelled)
     warn(
         f"{labels.path} has labels from frame {first} to {last}, which are less than {_COVERED:.0%} of {of}: the "

@@ -214,12 +214,18 @@ class Timeline:
         return self.every
 
     def _choose_first(self, labels: Labels, every: int, end: int) -> None:
-        """Choose the number of the first picture for images whose numbers begin later, and warn of it.
+        """Choose the number of the first picture by that of the last one where the file doesn't tell, and warn of it.
 
-        They are numbers of pictures if they fit, and otherwise the first one is of the first picture.
+        A file that was taken to count from 0, as others do, counts from 1 if it has a label one after the last picture.
+        Images whose numbers begin later have numbers of pictures if these fit; otherwise the first is the first picture.
         """
         first, last = labels.first_frame, int(labels.labelled[-1])
-        if first <= 1 or not labels.is_first_assumed:
+        if not labels.is_first_assumed or first == 1:
+            return
+        if first == 0:
+            if last // every == end:
+                labels.first_frame = 1
+                warn(f"{labels.path}: frame {last} is taken to be the last of {end} pictures, counted from 1", "clock")
             return
         text = "is assumed to be the first picture"
         if last // every <= end != (last - first) // every + 1:
