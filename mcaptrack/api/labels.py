@@ -1,4 +1,4 @@
-"""How label files are read: options that mean the same in every command that takes such files."""
+"""Options of label files, which mean the same in every command that takes such files."""
 
 from __future__ import annotations
 

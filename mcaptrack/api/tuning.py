@@ -201,10 +201,7 @@ def tune(
         elif not has_tracker:
             raise McaptrackError(f"files of detections are for `stage='track'`; to tune {stage} give logs")
         else:
-            pairs, note_on_pairs = pair_files(paths_of(inputs), paths_of(truth))
-            if note_on_pairs:
-                notes.say(note_on_pairs)
-            tasks = _tasks_of_files(pairs, how)
+            tasks = _tasks_of_files(paths_of(inputs), paths_of(truth), how, notes)
         if force and trials_file is not None:
             trials_file.unlink(missing_ok=True)
         proposals = "Optuna" if uses_optuna() else _BY_CHANCE
@@ -217,17 +214,9 @@ def tune(
                 detail(f"trial {trial.number}: {metric} {trial.scores[metric]:.4f} {values}".rstrip())
 
         first, best = searching.tune(
-            base,
-            tasks,
-            ranges,
-            scoring,
-            metric=metric,
-            trials=trials,
-            seed=seed,
-            study=trials_file,
-            on_trial=tell,
+            base, tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=tell,
             entry=entry,
-        )
+        )  # fmt: skip
     settings = ({"tracker": tracker or "sort"} if has_tracker else {}) | dict(best.parameters)
     return TuneResult(
         stage=stage,
@@ -267,7 +256,10 @@ def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -
     return out
 
 
-def _tasks_of_files(pairs: Sequence[tuple[str, Path, Path]], how: IngestOptions) -> list[Task]:
+def _tasks_of_files(inputs: Sequence[Path], truths: Sequence[Path], how: IngestOptions, notes: Notes) -> list[Task]:
+    pairs, note_on_pairs = pair_files(inputs, truths)
+    if note_on_pairs:
+        notes.say(note_on_pairs)
     tasks = []
     for name, path, truth in pairs:
         detected = detections_and_ground_truth(path, truth, how)

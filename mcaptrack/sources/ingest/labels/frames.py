@@ -136,7 +136,7 @@ def share_numbers(tables: Mapping[Role, Labels], log: Sequence[Numbered] = ()) -
         zero = next((entry for entry in beside if entry.first == entry.least == 0 and entry.is_like(labels)), None)
         if zero is not None and not (first == 1 and (last == zero.last + 1 or (role == "truth" and last != zero.last))):
             _count_from(labels, zero)
-        elif labels.first_frame > 1 and beside:  # images whose numbers begin later
+        elif labels.first_frame > 1 and beside:  # images with numbers that begin later
             _count_from(labels, next((entry for entry in beside if entry.has_numbers_of(labels)), beside[0]))
 
 

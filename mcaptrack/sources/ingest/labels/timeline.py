@@ -217,7 +217,7 @@ class Timeline:
         """Choose the number of the first picture by that of the last one where the file doesn't tell, and warn of it.
 
         A file that was taken to count from 0, as others do, counts from 1 if it has a label one after the last picture.
-        Images whose numbers begin later have numbers of pictures if these fit; otherwise the first is the first picture.
+        The numbers of images that begin later are those of pictures if they fit; otherwise the first one is the first.
         """
         first, last = labels.first_frame, int(labels.labelled[-1])
         if not labels.is_first_assumed or first == 1:
