@@ -184,8 +184,7 @@ def tune(
     if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})
-    is_own = STAGES[stage].is_built_in(type(base))
-    entry = None if is_own else STAGES[stage].entry(type(base))
+    entry = None if STAGES[stage].is_built_in(type(base)) else STAGES[stage].entry(type(base))
     ranges = _ranges(type(base), search, entry)
     chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
