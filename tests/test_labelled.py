@@ -15,10 +15,12 @@ from mcaptrack import log
 from mcaptrack.api import ingesting, labels, scoring, training, tuning
 from mcaptrack.api.declared import hints_of
 from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.labels.frames import FrameRanges, Frames, parse_first_frames
-from tests.worlds import write_clip
+from mcaptrack.transforms import Predict
+from tests.worlds import walk, write_clip
 
 PICTURES, FPS, PEOPLE = 60, 10, 2
 SIZE = (640, 360)
@@ -341,3 +343,16 @@ def test_tables_say_which_frames_were_labelled(tmp_path, clip):
         == json.loads(row["source"])["/camera/truth"]
     )
     assert [warning["code"] for warning in json.loads(row["warning_texts"])] == ["labelled"]
+
+
+def test_forecasts_with_a_past_that_was_not_labelled_are_not_judged():
+    """Right tracks of two walkers, and of a third that is nobody: of the labelled steps 10 to 19 with a whole past."""
+    walks = walk(lambda k: {1: (0.5 * k, 0.0), 2: (4.0, 0.5 * k), 3: (80.0, 80.0)}, 30)
+    people = [frame._replace(rows=frame.rows[:2]) for frame in walks]
+    forecasts = [frame for (frame,) in Predict(predictor="cv")(walks)]
+    whole, part = (score_forecasts(forecasts, walks, truth, "x") for truth in (people, people[10:20]))
+    assert whole is not None
+    assert part is not None
+    assert (part.frames, part.false_forecasts) == (7, 7)  # the third one, at the steps 13 to 19
+    assert whole.false_forecasts >= 27
+    assert part.people == 0 or part.people < whole.people
