@@ -256,8 +256,8 @@ def ingest(
     from mcaptrack.api.common import as_path, optional_path, paths_of, warnings_about
     from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
-    from mcaptrack.sources.ingest.labels.content import WantedClasses
     from mcaptrack.sources.ingest.labels.delimited import parse_columns
+    from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
     _check_places(output, into, sidecar)
     path, labels = as_path(source), {"detections": detections, "tracks": tracks, "truth": truth}

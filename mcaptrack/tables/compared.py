@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,9 @@ from mcaptrack.sources import ingest
 from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
-from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels, WantedClasses
-from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
-from mcaptrack.sources.ingest.labels.reading import in_order, is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE, WantedClasses
+from mcaptrack.sources.ingest.labels.table import BoxTable, Facts, IgnoredBoxes
 from mcaptrack.sources.ingest.labels.timeline import label_rows
 
 #: Formats that give the frame number of each row.
@@ -116,7 +116,7 @@ def compare_files(
     if any(have_3d):
         text = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
         raise McaptrackError(f"{text} does not; they can't be compared")
-    both: dict[Role, Labels] = {
+    both: dict[Role, BoxTable] = {
         "truth": _read(ground_truth, "truth", topics, WantedClasses(classes or ONLY_PEOPLE.text)),
         "tracks": _read(tracks, "tracks", topics, WantedClasses(classes or ONLY_PEOPLE.text, may_lack=True)),
     }
@@ -135,7 +135,7 @@ def compare_files(
     return _by_number(both, ground_plane, point, notes)
 
 
-def _names_of(both: Mapping[Role, Labels]) -> tuple[Mapping[int, str], Mapping[int, str]]:
+def _names_of(both: Mapping[Role, BoxTable]) -> tuple[Mapping[int, str], Mapping[int, str]]:
     """The names of the classes of ground truth and tracks."""
     return both["truth"].classes, both["tracks"].classes
 
@@ -170,7 +170,7 @@ def detections_and_ground_truth(
     """
     options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point)
     with _PairJob([("detections", detections), ("truth", ground_truth)], options) as job:
-        if not all(labels.has_boxes for labels in job.labels.values()):
+        if not all(labels.boxes_px is not None for labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
         return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
@@ -179,11 +179,11 @@ def detections_and_ground_truth(
 class _PairJob(LabelJob):
     """Labels of detections and of ground truth, which may be a table."""
 
-    def read(self, path: Path, role: Role) -> Labels:
+    def read(self, path: Path, role: Role | None) -> BoxTable:
         return _read(path, role, (), ONLY_PEOPLE) if role == "truth" else super().read(path, role)
 
 
-def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) -> Labels:
+def _read(path: Path, role: Role, topics: Sequence[str], wanted: WantedClasses) -> BoxTable:
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
@@ -201,14 +201,17 @@ def _is_blank(path: Path) -> bool:
     return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
-def _no_tracks(path: Path) -> Labels:
+def _no_tracks(path: Path) -> BoxTable:
     """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
     kinds = np.empty(0, np.uint32)
-    return Labels(path, "mot", str, none, none, np.empty((0, 4)), np.empty(0), kinds, first_frame=1)
+    facts = Facts(path, "mot", first_frame=1)
+    return BoxTable(
+        facts=facts, frame=none, id=none, boxes_px=np.empty((0, 4)), score=np.empty(0), class_id=kinds, role="tracks"
+    )
 
 
-def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
+def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> BoxTable:
     """A table of tracks in the format of ``mcaptrack export``: the rows of one topic."""
     columns = ("topic", "frame", "track_id", "x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
     table = tables.read_columns(path, columns)
@@ -228,13 +231,14 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     boxes = np.stack([table[name][mine] for name in columns[3:7]], axis=-1)
     xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
     people = np.full(len(frame), PERSON, np.uint32)
-    name: Any = "parquet"
-    labels = Labels(path, name, str, frame, track_id, boxes, table["score"][mine], people, xy_m=xy_m)
-    labels.labelled = np.unique(frame)
-    return in_order(labels, has_ids=True)
+    facts = Facts(path, "parquet", labelled=np.unique(frame))
+    return BoxTable(
+        facts=facts, frame=frame, id=track_id, boxes_px=boxes, xy_m=xy_m, score=table["score"][mine], class_id=people,
+        role=role,
+    ).in_order()  # fmt: skip
 
 
-def _by_number(both: dict[Role, Labels], ground_plane: Path | None, point: Point, notes: list[str]) -> AlignedFiles:
+def _by_number(both: dict[Role, BoxTable], ground_plane: Path | None, point: Point, notes: list[str]) -> AlignedFiles:
     """The frames with rows in either file, by their numbers, both counted from 0."""
     ground_truth, tracks = both["truth"], both["tracks"]
     plane = _plane(ground_plane, point, ground_truth, tracks)
@@ -261,7 +265,7 @@ def _by_number(both: dict[Role, Labels], ground_plane: Path | None, point: Point
     return AlignedFiles(frames["truth"], frames["tracks"], notes, _names_of(both))
 
 
-def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels) -> GroundPlane | None:
+def _plane(path: Path | None, point: Point, ground_truth: BoxTable, tracks: BoxTable) -> GroundPlane | None:
     if path is None:
         return None
     boxes = np.concatenate(
@@ -275,7 +279,7 @@ def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels
 
 
 def _frames(
-    labels: Labels, numbers: NDArray[np.int64], row_frames: NDArray[np.int64], plane: GroundPlane | None, role: Role
+    labels: BoxTable, numbers: NDArray[np.int64], row_frames: NDArray[np.int64], plane: GroundPlane | None, role: Role
 ) -> list[Frame]:
     """The rows of labels in the frames ``numbers``; ``row_frames`` are the frame numbers of all rows, rising."""
     rows = label_rows(labels, role, plane)
@@ -283,7 +287,9 @@ def _frames(
     return split_rows(numbers * NS_PER_S, numbers, rows[kept], np.searchsorted(row_frames[kept], numbers, "right"))
 
 
-def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
+def _without_ignored(
+    ground_truth: Sequence[Frame], tracks: Sequence[Frame], labels: BoxTable
+) -> tuple[list[Frame], int]:
     """Remove boxes that match labels which don't count, as MOTChallenge and KITTI do; returns their number, too."""
     assert labels.ignored is not None
     ignored = labels.ignored
@@ -293,7 +299,7 @@ def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], lab
     out, gone = [], 0
     for true, track in zip(ground_truth, tracks, strict=True):
         low, high = np.searchsorted(at, [true.index, true.index + 1])
-        kept = ~_is_ignored(_boxes(true), _boxes(track), _rows(ignored, slice(low, high)), labels.format == "kitti")
+        kept = ~_is_ignored(_boxes(true), _boxes(track), _rows(ignored, slice(low, high)), labels.facts.least_height_px)
         gone += int((~kept).sum())
         out.append(track if kept.all() else track._replace(rows=track.rows[kept]))
     return out, gone
@@ -307,7 +313,7 @@ def _boxes(frame: Frame) -> Floats:
     return np.stack([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
 
 
-def _is_ignored(true: Floats, tracked: Floats, ignored: IgnoredBoxes, kitti: bool) -> Bools:
+def _is_ignored(true: Floats, tracked: Floats, ignored: IgnoredBoxes, least_height_px: float) -> Bools:
     """Mark the boxes of tracks (K,) to ignore, given true boxes (N, 4) and labels that don't count."""
     forgiven = np.zeros(len(tracked), bool)
     if not len(tracked):
@@ -323,8 +329,8 @@ def _is_ignored(true: Floats, tracked: Floats, ignored: IgnoredBoxes, kitti: boo
         matched[columns] = True
         of_aside = rows >= len(true)
         forgiven[columns[of_aside]] = ignored.forgiven[other][rows[of_aside] - len(true)]
-    if kitti:
-        forgiven |= ~matched & (tracked[:, 3] <= KITTI_HEIGHT_PX + _EPS)
+    if least_height_px:
+        forgiven |= ~matched & (tracked[:, 3] <= least_height_px + _EPS)
         for region in ignored.boxes_px[ignored.region]:
             low, high = (
                 np.maximum(tracked[:, :2], region[:2]),

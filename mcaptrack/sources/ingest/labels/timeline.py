@@ -33,7 +33,7 @@ from mcaptrack.schema.framing import joined_parts
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import DEFAULT_CAMERA, provenance_of
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.ingest.labels.content import Labels
+from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.sources.video import is_video_codec, read_head
 from mcaptrack.transforms import STAGES
@@ -128,7 +128,7 @@ class Timeline:
         gaps = np.diff(self.t_ns) / np.diff(self.index)
         return NS_PER_S / float(np.median(gaps)) if len(gaps) else 0.0
 
-    def place(self, labels: Labels, lost: list[str]) -> Placed:
+    def place(self, labels: BoxTable, lost: list[str]) -> Placed:
         """Assign the labelled frames of a file to pictures, including frames without labels in between.
 
         Raises McaptrackError if there are labels before the first or after the last picture. If pictures are known to
@@ -138,7 +138,7 @@ class Timeline:
         if labels.times_s is not None:
             return self._place_by_time(path, labels.times_s)
         every = self._every(labels)
-        frame, count = labels.frame_counts()
+        frame, count = labels.extent.frames
         at = (frame - labels.first_frame) // every
         end = int(self.index[-1]) + 1
         if at[0] < 0:
@@ -191,7 +191,7 @@ class Timeline:
         number[nearest] = np.arange(len(seconds))
         return Placed(number, self.index, self.t_ns)
 
-    def _every(self, labels: Labels) -> int:
+    def _every(self, labels: BoxTable) -> int:
         """The step of frame numbers in a label file, which may use the numbers in the names of images."""
         if self.every == 1 or ((labels.labelled - labels.first_frame) % self.every).any():
             return 1
@@ -199,9 +199,9 @@ class Timeline:
             warn(f"{labels.path} counts frames as the names of {self.of} do, every {self.every}", "clock")
         return self.every
 
-    def _beyond(self, labels: Labels, beyond: int, end: int) -> str:
+    def _beyond(self, labels: BoxTable, beyond: int, end: int) -> str:
         """The error for labels after frame ``end`` of the file, the last picture."""
-        frame, count = labels.frame_counts()
+        frame, count = labels.extent.frames
         first, last = int(frame[0]), int(frame[-1])
         some = "all" if beyond == count.sum() else beyond
         text = (
@@ -223,12 +223,12 @@ def frame_times_ns(index: Ints, fps: Fraction) -> Ints:
     return rounded
 
 
-def count_frames(labels: Labels) -> int:
+def count_frames(labels: BoxTable) -> int:
     """The number of frames up to the last one that a file labels.
 
     Raises McaptrackError if nearly all of them would be empty, which means that the numbers are wrong.
     """
-    last = max(int(labels.labelled[-1]), int(labels.frame_counts()[0][-1]))
+    last = max(int(labels.labelled[-1]), int(labels.extent.frames[0][-1]))
     count = last - labels.first_frame + 1
     most = max(_EMPTY_FRAMES, _EMPTY_A_LABELLED * len(labels.labelled) * labels.step)
     if count > min(most, MAX_FRAMES):
@@ -248,7 +248,7 @@ def count_frames(labels: Labels) -> int:
 _BLOCK: Final = 4096
 
 
-def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
+def label_rows(labels: BoxTable, role: Role, plane: GroundPlane | None) -> Rows:
     """Convert the N rows of labels to rows of detections or tracks, with positions in metres if a plane is given."""
     if role == "detections" and labels.boxes_px is not None:
         x, y, w, h = labels.boxes_px.T
@@ -266,7 +266,7 @@ def label_rows(labels: Labels, role: Role, plane: GroundPlane | None) -> Rows:
 
 
 def frames_of_labels(
-    parts: Sequence[Callable[[], Labels]], role: Role, plane: GroundPlane | None, placed: Placed
+    parts: Sequence[Callable[[], BoxTable]], role: Role, plane: GroundPlane | None, placed: Placed
 ) -> Callable[[], Iterator[Frame]]:
     """The rows of labels, in parts of whole frames, as frames: those that are ``placed``, also empty ones.
 
