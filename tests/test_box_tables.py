@@ -13,14 +13,14 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import content, delimited, json_boxes, yolo
-from mcaptrack.sources.ingest.labels.content import Labels
+from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 
 NAN = float("nan")
 
 
-def read(folder: Path, content: Any, role: str = "detections", name: str = "a", **options: Any) -> Labels:
+def read(folder: Path, content: Any, role: str = "detections", name: str = "a", **options: Any) -> BoxTable:
     """Labels of a file with this text, or of JSON of something else."""
     path = folder / name
     path.write_text(content if isinstance(content, str) else json.dumps(content))
@@ -35,7 +35,7 @@ def refused(folder: Path, content: Any, role: str = "detections") -> str:
     return str(error.value)[len(str(folder / "a")) :]
 
 
-def said(folder: Path, labels: Labels) -> list[str]:
+def said(folder: Path, labels: BoxTable) -> list[str]:
     """Doubts, after the name of the file."""
     assert all(words.startswith(str(folder)) for words, _ in labels.doubts)
     return [words.removeprefix(str(folder / "a")) for words, _ in labels.doubts]

@@ -6,7 +6,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import cvat
-from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.cvat import read_cvat
 
 ALL = WantedClasses("all")

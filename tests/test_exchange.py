@@ -20,7 +20,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import find
 from mcaptrack.schema import TRACKS
-from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.tables.exchange import _FORMATS
 from mcaptrack.tables.exchange.boxes import ExportedBoxes

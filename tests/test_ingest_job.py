@@ -11,7 +11,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.timeline import boxes_extent
 from tests.logs import add_rows
 from tests.worlds import boxes_at, tracks_at

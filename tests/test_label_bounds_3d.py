@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.labels.content import BoxRows3D, WantedClasses, headings, numbered
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
+from mcaptrack.sources.ingest.labels.table import BoxTable
+from mcaptrack.sources.ingest.labels.text import headings, numbered
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_boxes_3d
 
 USUAL = {
@@ -46,7 +48,7 @@ def usual(**changes: object) -> dict[str, object]:
     return {key: value for key, value in (USUAL | changes).items() if value is not None}
 
 
-def timed(rows: BoxRows3D, role: str = "truth", classes: str | None = None) -> BoxRows3D:
+def timed(rows: BoxTable, role: str = "truth", classes: str | None = None) -> BoxTable:
     return rows.settled(rows.frame, rows.labelled, role, WantedClasses(classes) if classes else None)
 
 

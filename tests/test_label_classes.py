@@ -10,7 +10,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
 
 MOT = "".join(f"{t},{who},{10 * who},20,30,60,{flag},{kind},1\n" for t in (1, 2)

@@ -24,7 +24,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
-from mcaptrack.sources.ingest.labels.content import DATA_SETS
 from mcaptrack.sources.ingest.labels.timeline import timeline_of
 from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.codecs import CODECS

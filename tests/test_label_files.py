@@ -15,7 +15,8 @@ from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
 from mcaptrack.sources.ingest.labels import content, formats
-from mcaptrack.sources.ingest.labels.content import Labels, WantedClasses
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
+from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
 
@@ -269,7 +270,7 @@ def test_a_homography_says_how_many_numbers_it_found(text, shape, tmp_path):
 # Frames and pictures
 
 
-def labels_of(frames: list[int], tmp_path: Path, first: int | None = None) -> tuple[Path, Labels]:
+def labels_of(frames: list[int], tmp_path: Path, first: int | None = None) -> tuple[Path, BoxTable]:
     path = written(tmp_path / "a.txt", "".join(f"{n},1,1,1,1,1\n" for n in frames))
     return path, read_labels(path, "mot", first_frame=first)
 

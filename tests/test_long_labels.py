@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import reading
-from mcaptrack.sources.ingest.labels.content import Labels
+from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.reading import LongLabels, read_labels
 
 read_labels_of_any_length = partial(read_labels, in_parts=True)

@@ -119,9 +119,9 @@ def label_options(
     from mcaptrack.api.common import optional_path
     from mcaptrack.schema.classes import ClassMap
     from mcaptrack.sources.ingest import IngestOptions
-    from mcaptrack.sources.ingest.labels.content import WantedClasses
     from mcaptrack.sources.ingest.labels.delimited import parse_columns
     from mcaptrack.sources.ingest.labels.frames import Frames, parse_first_frames
+    from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
     count, ranges = Frames.parse(frames)
     return IngestOptions(

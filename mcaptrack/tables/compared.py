@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,12 +29,12 @@ from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
-from mcaptrack.sources.ingest.job import IngestOptions
+from mcaptrack.sources.ingest.job import IngestOptions, fitted
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
-from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE, IgnoredBoxes, Labels
-from mcaptrack.sources.ingest.labels.formats import KITTI_HEIGHT_PX
 from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts
-from mcaptrack.sources.ingest.labels.reading import in_order, is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE
+from mcaptrack.sources.ingest.labels.table import BoxTable, Facts, IgnoredBoxes
 from mcaptrack.sources.ingest.labels.timeline import Placed, label_rows
 
 #: Formats that give the frame number of each row.
@@ -114,7 +114,7 @@ def compare_files(
     if any(have_3d):
         text = f"{tracks if have_3d[0] else ground_truth} holds 3D boxes, and {tracks if have_3d[1] else ground_truth}"
         raise McaptrackError(f"{text} does not; they can't be compared")
-    both: dict[Role, Labels] = {
+    both: dict[Role, BoxTable] = {
         "truth": _read(ground_truth, "truth", topics, options),
         "tracks": _read(tracks, "tracks", topics, options),
     }
@@ -150,7 +150,7 @@ def _may_lack(options: IngestOptions) -> IngestOptions:
     return replace(options, classes=options.classes and replace(options.classes, may_lack=True))
 
 
-def _names_of(both: Mapping[Role, Labels]) -> tuple[Mapping[int, str], Mapping[int, str]]:
+def _names_of(both: Mapping[Role, BoxTable]) -> tuple[Mapping[int, str], Mapping[int, str]]:
     """The names of the classes of ground truth and tracks."""
     return both["truth"].classes, both["tracks"].classes
 
@@ -182,7 +182,7 @@ def detections_and_ground_truth(detections: Path, ground_truth: Path, options: I
     Raises McaptrackError if they can't be read, or if the frame rate is not known.
     """
     with _PairJob([("detections", detections), ("truth", ground_truth)], options) as job:
-        if not all(labels.has_boxes for labels in job.labels.values()):
+        if not all(labels.boxes_px is not None for labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
         return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
@@ -191,11 +191,11 @@ def detections_and_ground_truth(detections: Path, ground_truth: Path, options: I
 class _PairJob(LabelJob):
     """Labels of detections and of ground truth, which may be a table."""
 
-    def read(self, path: Path, role: Role) -> Labels:
+    def read(self, path: Path, role: Role | None) -> BoxTable:
         return _read(path, role, (), self.options) if role == "truth" else super().read(path, role)
 
 
-def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions) -> Labels:
+def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions) -> BoxTable:
     if path.suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
@@ -203,7 +203,7 @@ def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions)
     wanted = replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks")
     labels = read_labels(path, options.label_format, role, options.first_of(role), options.columns, wanted)
     if options.size is not None and labels.is_normalised:
-        labels.fit(options.size)
+        labels = fitted(labels, options.size)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"
         raise McaptrackError(f"{path} has {what}; make a log of it with {call('ingest', path)}, and compare that")
@@ -216,14 +216,17 @@ def _is_blank(path: Path) -> bool:
     return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
-def _no_tracks(path: Path) -> Labels:
+def _no_tracks(path: Path) -> BoxTable:
     """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
     kinds = np.empty(0, np.uint32)
-    return Labels(path, "mot", str, none, none, np.empty((0, 4)), np.empty(0), kinds, first_frame=1)
+    facts = Facts(path, "mot", first_frame=1)
+    return BoxTable(
+        facts=facts, frame=none, id=none, boxes_px=np.empty((0, 4)), score=np.empty(0), class_id=kinds, role="tracks"
+    )
 
 
-def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
+def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> BoxTable:
     """A table of tracks in the format of ``mcaptrack export``: the rows of one topic."""
     columns = ("topic", "frame", "track_id", "x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score")
     table = tables.read_columns(path, columns)
@@ -243,13 +246,14 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> Labels:
     boxes = np.stack([table[name][mine] for name in columns[3:7]], axis=-1)
     xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
     people = np.full(len(frame), PERSON, np.uint32)
-    name: Any = "parquet"
-    labels = Labels(path, name, str, frame, track_id, boxes, table["score"][mine], people, xy_m=xy_m)
-    labels.labelled = np.unique(frame)
-    return in_order(labels, has_ids=True)
+    facts = Facts(path, "parquet", labelled=np.unique(frame))
+    return BoxTable(
+        facts=facts, frame=frame, id=track_id, boxes_px=boxes, xy_m=xy_m, score=table["score"][mine], class_id=people,
+        role=role,
+    ).in_order()  # fmt: skip
 
 
-def _by_number(both: dict[Role, Labels], options: IngestOptions, notes: list[str]) -> AlignedFiles:
+def _by_number(both: dict[Role, BoxTable], options: IngestOptions, notes: list[str]) -> AlignedFiles:
     """The frames with rows in either file that the ground truth describes, by their numbers, both counted from 0."""
     ground_truth, tracks = both["truth"], both["tracks"]
     plane = _plane(options.ground_plane, options.point, ground_truth, tracks)
@@ -274,7 +278,7 @@ def _by_number(both: dict[Role, Labels], options: IngestOptions, notes: list[str
     return AlignedFiles(frames["truth"], frames["tracks"], notes, _names_of(both), _labelled(shown))
 
 
-def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels) -> GroundPlane | None:
+def _plane(path: Path | None, point: Point, ground_truth: BoxTable, tracks: BoxTable) -> GroundPlane | None:
     if path is None:
         return None
     boxes = np.concatenate(
@@ -288,7 +292,7 @@ def _plane(path: Path | None, point: Point, ground_truth: Labels, tracks: Labels
 
 
 def _frames(
-    labels: Labels, numbers: NDArray[np.int64], row_frames: NDArray[np.int64], plane: GroundPlane | None, role: Role
+    labels: BoxTable, numbers: NDArray[np.int64], row_frames: NDArray[np.int64], plane: GroundPlane | None, role: Role
 ) -> list[Frame]:
     """The rows of labels in the frames ``numbers``; ``row_frames`` are the frame numbers of all rows, rising."""
     rows = label_rows(labels, role, plane)
@@ -296,7 +300,9 @@ def _frames(
     return split_rows(numbers * NS_PER_S, numbers, rows[kept], np.searchsorted(row_frames[kept], numbers, "right"))
 
 
-def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], labels: Labels) -> tuple[list[Frame], int]:
+def _without_ignored(
+    ground_truth: Sequence[Frame], tracks: Sequence[Frame], labels: BoxTable
+) -> tuple[list[Frame], int]:
     """Remove boxes that match labels which don't count, as MOTChallenge and KITTI do; returns their number, too."""
     assert labels.ignored is not None
     ignored = labels.ignored
@@ -306,7 +312,7 @@ def _without_ignored(ground_truth: Sequence[Frame], tracks: Sequence[Frame], lab
     out, gone = [], 0
     for true, track in zip(ground_truth, tracks, strict=True):
         low, high = np.searchsorted(at, [true.index, true.index + 1])
-        kept = ~_is_ignored(_boxes(true), _boxes(track), _rows(ignored, slice(low, high)), labels.format == "kitti")
+        kept = ~_is_ignored(_boxes(true), _boxes(track), _rows(ignored, slice(low, high)), labels.facts.least_height_px)
         gone += int((~kept).sum())
         out.append(track if kept.all() else track._replace(rows=track.rows[kept]))
     return out, gone
@@ -320,7 +326,7 @@ def _boxes(frame: Frame) -> Floats:
     return np.stack([frame.rows[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
 
 
-def _is_ignored(true: Floats, tracked: Floats, ignored: IgnoredBoxes, kitti: bool) -> Bools:
+def _is_ignored(true: Floats, tracked: Floats, ignored: IgnoredBoxes, least_height_px: float) -> Bools:
     """Mark the boxes of tracks (K,) to ignore, given true boxes (N, 4) and labels that don't count."""
     forgiven = np.zeros(len(tracked), bool)
     if not len(tracked):
@@ -336,8 +342,8 @@ def _is_ignored(true: Floats, tracked: Floats, ignored: IgnoredBoxes, kitti: boo
         matched[columns] = True
         of_aside = rows >= len(true)
         forgiven[columns[of_aside]] = ignored.forgiven[other][rows[of_aside] - len(true)]
-    if kitti:
-        forgiven |= ~matched & (tracked[:, 3] <= KITTI_HEIGHT_PX + _EPS)
+    if least_height_px:
+        forgiven |= ~matched & (tracked[:, 3] <= least_height_px + _EPS)
         for region in ignored.boxes_px[ignored.region]:
             low, high = (
                 np.maximum(tracked[:, :2], region[:2]),

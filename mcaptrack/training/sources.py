@@ -22,8 +22,8 @@ from mcaptrack.location import sibling
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.ingest import IngestOptions, label_frames
-from mcaptrack.sources.ingest.labels.content import ONLY_PEOPLE
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE
 from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows
@@ -32,7 +32,6 @@ from mcaptrack.transforms import Sample
 SYNTHETIC: Final = "synthetic"
 #: The channels of a log to train on, the best first.
 _BEST: Final = ("truth", "retracks", "samples", "tracks")
-_SDD_FPS: Final = Fraction(30)
 
 
 @dataclass(frozen=True)
@@ -89,9 +88,9 @@ def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scen
     if not labels.has_ids:
         raise McaptrackError(f"{path} has boxes without track ids; predictors learn from tracks")
     fps = given.fps
-    if fps is None and labels.format == "sdd":
-        fps = _SDD_FPS
-    if fps is None and (labels.format == "mot" or not labels.is_of_data_set):
+    if fps is None:
+        fps = labels.facts.fps
+    if fps is None and labels.facts.interval_s is None:
         raise McaptrackError(f"{path}: how many frames a second? Say it with `fps=`")
     if fps is None:  # annotated at the rate of prediction
         fps = Fraction(labels.step / step_s).limit_denominator(1000)

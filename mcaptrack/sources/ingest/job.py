@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
@@ -32,18 +32,12 @@ from mcaptrack.sources.calibrations import is_rectified_topic
 from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
-from mcaptrack.sources.ingest.labels.content import (
-    ONLY_PEOPLE,
-    BoxTable,
-    Format,
-    Labels,
-    NumberTable,
-    WantedClasses,
-    describe_classes,
-    lines_of,
-)
+from mcaptrack.sources.ingest.labels.checks import find_outside
 from mcaptrack.sources.ingest.labels.frames import FrameRanges, share_numbers, warn_of_firsts
-from mcaptrack.sources.ingest.labels.reading import chosen_format, is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE, WantedClasses, describe_classes
+from mcaptrack.sources.ingest.labels.table import BoxTable, refuse
+from mcaptrack.sources.ingest.labels.text import lines_of, read_numbers
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
 from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
@@ -90,7 +84,7 @@ class IngestOptions:
     calibration_unit: LengthUnit = "auto"
     point: Point = "foot"
     labels: Mapping[Role, Path] = field(default_factory=dict)
-    label_format: Format = "auto"
+    label_format: str = "auto"
     first_frame: int | Mapping[str, int] | None = None
     frames: int | None = None
     frame_ranges: FrameRanges | None = None
@@ -113,9 +107,9 @@ class IngestOptions:
             fps=self.fps,
         )
 
-    def first_of(self, role: Role) -> int | None:
+    def first_of(self, role: Role | None) -> int | None:
         """The number of the first picture in files with this role; None if it wasn't given."""
-        return self.first_frame.get(role) if isinstance(self.first_frame, Mapping) else self.first_frame
+        return self.first_frame.get(role or "") if isinstance(self.first_frame, Mapping) else self.first_frame
 
     def given(self, *names: str) -> str:
         """The first of these options that was given, as a user writes it; "" if none was."""
@@ -129,7 +123,7 @@ class IngestReport:
     """The result of ``ingest``: messages by topic, ``remarks``, details (``notes``), and what was lost.
 
     ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
-    ``uses_camera``: topics below the camera's name were written.
+    ``uses_camera``: topics below the camera's name were written. ``facts`` is what is known of label files, by role.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
@@ -139,6 +133,23 @@ class IngestReport:
     warnings: list[Notice] = field(default_factory=list)
     has_labels: bool = False
     uses_camera: bool = False
+    facts: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def fitted(labels: BoxTable, size: tuple[int, int]) -> BoxTable:
+    """Labels of pictures of this width and height: boxes in shares of it become pixels, and those outside of it are
+    warned of.
+    """
+    facts = labels.facts
+    if labels.boxes_px is not None and facts.is_normalised:
+        facts = replace(facts, is_normalised=False, size=None)
+        labels = replace(labels, boxes_px=labels.boxes_px * np.array([*size, *size], float), facts=facts)
+    if facts.size not in (None, size):
+        text = f": its pictures are {facts.size[0]}x{facts.size[1]}, and those here {size[0]}x{size[1]}"
+        labels.find(f"{text}; boxes stay as they are", "outside")
+    if facts.size != size:
+        find_outside(labels, np.array(size, float))
+    return labels
 
 
 #: The last parts of the topics of the ground plane and the calibration that a user gave.
@@ -159,18 +170,20 @@ def read_motions(path: Path) -> Floats:
 
     Raises McaptrackError, with the line, for anything else.
     """
-    table = NumberTable(path, lines_of(path), _MOTION, _MOTION_COLUMNS)
-    if not len(table.values):
+    values, at = read_numbers(path, lines_of(path), _MOTION, _MOTION_COLUMNS)
+    if not len(values):
         raise McaptrackError(f"{path} holds no camera motion")
-    frame, motions = table.values[:, 0], table.values[:, 1:].reshape(-1, 2, 3)
-    table.refuse(
+    frame, motions = values[:, 0], values[:, 1:].reshape(-1, 2, 3)
+    refuse(
+        at,
         frame != np.arange(len(frame)),
         lambda row: f"frame {frame[row]:g} is not {row}: frames count from 0, without gaps",
     )
     wrong = np.array([not is_motion(motion) for motion in motions])
-    table.refuse(wrong, lambda row: "the motion is not finite, or can't be inverted")
+    refuse(at, wrong, lambda row: "the motion is not finite, or can't be inverted")
     scale = np.array([scale_of(motion) for motion in motions])
-    table.refuse(
+    refuse(
+        at,
         (scale > _MOST_ZOOM) | (scale < 1 / _MOST_ZOOM),
         lambda row: f"the motion enlarges the picture {scale[row]:.3g} times; no camera does that in a frame",
     )
@@ -226,23 +239,26 @@ class IngestJob:
         if self._homography and self.calibration and self.calibration.has_pose:
             names = ", ".join(map(str, self.calibration.paths))
             raise McaptrackError(f"{options.ground_plane} and {names} are both a ground plane; give one")
-        self.labels: dict[Role, Labels] = {role: self.read(path, role) for role, path in options.labels.items()}
+        self.labels: dict[Role, BoxTable] = {role: self.read(path, role) for role, path in options.labels.items()}
         self.motions = read_motions(options.motion) if options.motion else None
         share_numbers(self.labels)
-        self.check_labels()
 
-    def read(self, path: Path, role: Role) -> Labels:
-        """Read a label file with the format options."""
+    def read(self, path: Path, role: Role | None) -> BoxTable:
+        """Read a label file with the format options. Without a role, it is that of tracks if the file has ids."""
         options = self.options
         wanted = options.classes or (WantedClasses("all") if role == "corrections" else ONLY_PEOPLE)
-        label_format = chosen_format(path, options.label_format, options.columns)
-        if is_3d(path, label_format, options.columns):
+        if is_3d(path, options.label_format, options.columns):
             raise McaptrackError(
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        given = (label_format, role, options.first_of(role), options.columns, wanted)
-        return read_labels(path, *given, in_parts=True)
+        given = (options.label_format, role, options.first_of(role), options.columns, wanted)
+        labels = read_labels(path, *given, in_parts=True)
+        if role is None and isinstance(options.first_frame, Mapping):
+            return self.read(path, labels.role)
+        if labels.role == "detections" and labels.boxes_px is None:
+            raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
+        return labels
 
     @property
     def has_ground_given(self) -> bool:
@@ -270,9 +286,9 @@ class IngestJob:
         ``size`` returns width and height of the pictures; None if there are none. Raises McaptrackError if the size is
         not known, or isn't the given one.
         """
+        tables = {role: labels for role, labels in self.labels.items() if labels.boxes_px is not None}
         stated = self.options.size
-        paths = [labels.path for labels in self.labels.values() if labels.is_normalised]
-        if all(labels.is_of_data_set for labels in self.labels.values()):
+        if not tables:
             return
         actual = size() if size else stated
         if stated and actual and actual != stated:
@@ -280,24 +296,14 @@ class IngestJob:
                 f"{self.source}: the pictures are {actual[0]}x{actual[1]}, not {stated[0]}x{stated[1]}; "
                 "leave `size=` out"
             )
-        if paths and actual is None:
-            raise McaptrackError(
-                f"{paths[0]} has boxes in shares of the picture's size; give it with `size='WIDTHxHEIGHT'`, or add the "
-                "labels to a log with pictures with `into=`"
-            )
-        if actual is None:
-            return
-        for labels in self.labels.values():
-            if not labels.is_of_data_set:
-                labels.fit(actual)
-
-    def check_labels(self) -> None:
-        """Refuse labels that don't suit their role."""
-        for role, labels in self.labels.items():
-            if role == "detections" and not labels.has_boxes:
-                raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
-            if role != "detections" and not labels.has_ids:
-                raise McaptrackError(f"{labels.path} has no ids (all are -1); {role} need ids")
+        for role, labels in tables.items():
+            if actual is not None:
+                self.labels[role] = fitted(labels, actual)
+            elif labels.is_normalised:
+                raise McaptrackError(
+                    f"{labels.path} has boxes in shares of the picture's size; give it with `size='WIDTHxHEIGHT'`, or "
+                    "add the labels to a log with pictures with `into=`"
+                )
 
     def report_assumptions(self) -> None:
         """Report what is assumed about the labels, and what of them is left out."""
@@ -306,10 +312,11 @@ class IngestJob:
         for role, labels in self.labels.items():
             path = labels.path
             self.report_table(role, labels)
+            self.report.facts[role] = labels.facts.to_json()
             if labels.step > 1:
                 text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{text}; the frames in between are left out")
-            kinds, counts = labels.class_counts()
+            kinds, counts = labels.extent.classes
             if len(kinds) > 1:
                 text = describe_classes(kinds, counts, labels.classes)
                 self.report.remarks.append(f"{path} has several classes; class_id is {text}")
@@ -449,15 +456,15 @@ class IngestJob:
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
-    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: BoxTable) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
         is_stated = self.options.first_of(role) is not None or (labels.format, labels.first_frame) == ("mot", 0)
         out: dict[str, Any] = {"first_frame": labels.first_frame} if is_stated else {}
-        if self.options.columns and labels.format in ("csv", "supervision"):
+        if self.options.columns:
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
         if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
-        if self.options.size and not labels.is_of_data_set:
+        if self.options.size and labels.boxes_px is not None:
             out["size"] = "{}x{}".format(*self.options.size)
         return out
 
@@ -489,7 +496,7 @@ class IngestJob:
 
         classes = {} if labels is None else labels.classes
         names, class_id = {str(number): name for number, name in sorted(classes.items())}, str(only) if only else ""
-        plugins = {"label_format": labels.plugin} if labels is not None and labels.plugin else {}
+        plugins = {"label_format": labels.facts.plugin} if labels is not None and labels.facts.plugin else {}
         of_rows = digest(messages(), classes_beside_rows(class_id, names))
         provenance = Provenance(
             INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id,

@@ -18,7 +18,8 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.notices import warn
-from mcaptrack.sources.ingest.labels.content import MAX_FRAME, Labels, is_count
+from mcaptrack.sources.ingest.labels.table import MAX_FRAME, BoxTable
+from mcaptrack.sources.ingest.labels.text import is_count
 from mcaptrack.sources.video import find_seqinfo
 
 #: Labels cover all frames if they cover this share of them.
@@ -106,30 +107,35 @@ class Numbered(NamedTuple):
     last: int
 
     @classmethod
-    def of(cls, labels: Labels) -> Self:
+    def of(cls, labels: BoxTable) -> Self:
         """The numbers of a label file."""
         least, last = int(labels.labelled[0]), int(labels.labelled[-1])
         return cls(str(labels.path), labels.format, labels.first_frame, least, last)
 
-    def has_numbers_of(self, labels: Labels) -> bool:
+    def has_numbers_of(self, labels: BoxTable) -> bool:
         """Whether these are of the same frames as those of a file, by their numbers."""
         return (self.least, self.last) == (int(labels.labelled[0]), int(labels.labelled[-1]))
 
-    def is_like(self, labels: Labels) -> bool:
+    def is_like(self, labels: BoxTable) -> bool:
         """Whether a file may be expected to count frames from the same number."""
         return self.format == labels.format or {self.format, labels.format} <= set(_EITHER)
 
 
-def share_numbers(tables: Mapping[Role, Labels], log: Sequence[Numbered] = ()) -> None:
+def _counts(labels: BoxTable) -> bool:
+    """Whether a file has frames by number."""
+    return labels.times_s is None and not labels.facts.is_timed and len(labels.labelled) > 0
+
+
+def share_numbers(tables: Mapping[Role, BoxTable], log: Sequence[Numbered] = ()) -> None:
     """Let files whose first number isn't known count frames as the files and the labels of the log beside them do.
 
     A file without a frame 0 counts from 0 if labels beside it do: a tracker may have seen nothing there. It counts from
     1 if it has as many frames as those, or is ground truth that begins with 1, as data sets do.
     """
-    counting = {role: labels for role, labels in tables.items() if labels.times_s is None and len(labels.labelled)}
+    counting = {role: labels for role, labels in tables.items() if _counts(labels)}
     others = [*log, *map(Numbered.of, counting.values())]
     for role, labels in counting.items():
-        if not labels.is_first_assumed:
+        if not labels.facts.is_first_assumed:
             continue
         first, last = int(labels.labelled[0]), int(labels.labelled[-1])
         beside = [entry for entry in others if entry.name != str(labels.path)]
@@ -140,19 +146,19 @@ def share_numbers(tables: Mapping[Role, Labels], log: Sequence[Numbered] = ()) -
             _count_from(labels, next((entry for entry in beside if entry.has_numbers_of(labels)), beside[0]))
 
 
-def _count_from(labels: Labels, like: Numbered) -> None:
+def _count_from(labels: BoxTable, like: Numbered) -> None:
     """Set the first number of a file to that of other labels, if these are of its kind, and otherwise to 0."""
     is_like = like.is_like(labels) or like.has_numbers_of(labels)
-    labels.first_frame = like.first if is_like else 0
-    labels.doubts = [doubt for doubt in labels.doubts if doubt[1] != "clock"]
+    labels.facts.first_frame = like.first if is_like else 0
+    labels.findings = [finding for finding in labels.findings if finding.code != "clock"]
     text = f": frames begin with {labels.labelled[0]}, and are taken to count from {labels.first_frame}"
     text += f", as those of {like.name} do" if is_like else ""
-    labels.doubt(f"{text}; `first_frame=` sets the number of the first picture", "clock")
+    labels.find(f"{text}; `first_frame=` sets the number of the first picture", "clock")
 
 
-def warn_of_firsts(tables: Iterable[Labels]) -> None:
+def warn_of_firsts(tables: Iterable[BoxTable]) -> None:
     """Warn of files that count frames from different numbers."""
-    counting = [labels for labels in tables if labels.times_s is None]
+    counting = filter(_counts, tables)
     firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in counting}
     if len(firsts) > 1:
         text = f"{' and '.join(firsts.values())} are assumed to be the same picture"
@@ -169,12 +175,12 @@ class Described(NamedTuple):
     by: str = ""
 
 
-def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameRanges | None, of: str) -> Described:
+def described(labels: BoxTable, role: Role, number: Ints, at: Ints, ranges: FrameRanges | None, of: str) -> Described:
     """Which pictures a file describes, whether or not there are boxes in them; warns of what is assumed.
 
     Parameters
     ----------
-    labels : Labels
+    labels : BoxTable
     role : str
         Of detections and tracks all frames count, also before the first box and after the last one.
     number : int array (P,)
@@ -196,21 +202,22 @@ def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameR
         If none of the frames that ``--frames`` names is labelled.
     """
     first, last, step = int(at[0]), int(at[-1]), labels.step_of(at)
-    is_labelled: Bools = np.isin(number, at) if labels.states_labelled else (number - first) % step == 0
+    is_labelled: Bools = np.isin(number, at) if labels.facts.states_labelled else (number - first) % step == 0
     if ranges is not None:
         is_labelled &= ranges.hold(number)
         if not ranges.hold(at).any():
             raise McaptrackError(
                 f"{labels.path}: none of the frames {ranges} is labelled; it has labels of frames {first} to {last}"
             )
-        if labels.times_s is None and (outside := int((~ranges.hold(labels.frame)).sum())):
+        frames, counts = labels.extent.frames
+        if labels.times_s is None and (outside := int(counts[~ranges.hold(frames)].sum())):
             warn(f"{labels.path}: {outside} labels are of frames outside of {ranges}; they are left out", "left-out")
         return Described(is_labelled, ranges, "frames")
     beyond = (number < first) | (number > last)
     span = FrameRanges(((first, last + 1),)) if beyond.any() else None
     if role == "corrections":  # frames beyond those that were looked at stay as they are
         return Described(is_labelled & ~beyond)
-    if labels.states_labelled:
+    if labels.facts.states_labelled:
         return Described(is_labelled, span, "file" if span else "")
     before, after = max(first - int(number[0]), 0) // step, max(int(number[-1]) - last, 0) // step
     covered = (last - first) // step + 1
@@ -224,7 +231,7 @@ def described(labels: Labels, role: Role, number: Ints, at: Ints, ranges: FrameR
     return Described(is_labelled & ~beyond, span, "labels")
 
 
-def _is_of_sequence(labels: Labels) -> bool:
+def _is_of_sequence(labels: BoxTable) -> bool:
     """Whether labels are of a whole sequence: a seqinfo.ini beside them counts its frames."""
     info = find_seqinfo(labels.path.parent)
     return info is not None and info.frames is not None
