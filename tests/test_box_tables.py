@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels import content, delimited, json_boxes, yolo
-from mcaptrack.sources.ingest.labels.table import BoxTable
+from mcaptrack.sources.ingest.labels import coco, delimited, text, yolo
+from mcaptrack.sources.ingest.labels import format as formats
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 
 NAN = float("nan")
@@ -136,15 +137,15 @@ def test_results_need_an_image(tmp_path):
 
 
 def test_files_have_no_more_boxes_and_classes_than_the_limits(tmp_path, monkeypatch):
-    monkeypatch.setattr(json_boxes, "_MAX_ROWS", 2)
-    monkeypatch.setattr(json_boxes, "_MAX_CLASSES", 2)
+    monkeypatch.setattr(coco, "_MAX_ROWS", 2)
+    monkeypatch.setattr(coco, "_MAX_CLASSES", 2)
     kinds = [{"id": number, "name": f"n{number}"} for number in range(5, 8)]
     for make in (lambda count: coco([0], [box(0)] * count), lambda count: [box(0)] * count):
         assert len(read(tmp_path, make(2)).frame) == 2
         assert refused(tmp_path, make(3)) == " has more than 2 boxes; give it in parts"
     assert len(read(tmp_path, coco([0], [box(0)], categories=kinds[:2])).frame) == 1
     assert refused(tmp_path, coco([0], [box(0)], categories=kinds)) == " has 3 categories; at most 2 are read"
-    monkeypatch.setattr(json_boxes, "_MAX_BYTES", 100)
+    monkeypatch.setattr(formats, "_MAX_BYTES", 100)
     text = json.dumps([box(0)])
     assert len(read(tmp_path, text.ljust(100)).frame) == 1
     assert refused(tmp_path, text.ljust(101)) == " has 101 bytes; at most 100 of JSON are read: give it in parts"
@@ -423,7 +424,7 @@ def test_a_header_has_four_names_and_no_number(tmp_path):
 
 
 def test_names_of_pictures_are_numbered_in_one_sequence():
-    numbers = content.numbers_of_names
+    numbers = text.numbers_of_names
     assert numbers(["d/x12_a.jpg", "e\\x007_a.png"]) == [12, 7]
     assert numbers(["1_2.jpg", "1_3.jpg"]) == [2, 3]
     assert numbers(["x1.jpg", "y2.jpg"]) is None
@@ -434,7 +435,7 @@ def test_names_of_pictures_are_numbered_in_one_sequence():
     assert numbers([f"{2**31 - 1}"]) == [2**31 - 1]
     assert numbers([f"{2**31}"]) is None
     with pytest.raises(ValueError, match=r"names of several sequences, 'a.b' and 'c'"):
-        reader = content.FrameNames()
+        reader = text.FrameNames()
         assert (reader.number("a.3b.jpg"), reader.number("4c")) == (3, 4)
 
 

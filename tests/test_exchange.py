@@ -20,8 +20,8 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import find
 from mcaptrack.schema import TRACKS
-from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.tables.exchange import _FORMATS
 from mcaptrack.tables.exchange.boxes import ExportedBoxes
 from mcaptrack.tables.exchange.cvat import KEYFRAME_PX, describe_classes

