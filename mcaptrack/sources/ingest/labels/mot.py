@@ -71,7 +71,7 @@ class Mot(LabelFormat):
         facts.not_counting = "score 0"
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=values[:, 2:6], score=score,
-            class_id=np.full(len(values), PERSON), counts=score != 0,
+            class_id=np.full(len(values), NO_CLASS), counts=score != 0,
         )  # fmt: skip
         tens = np.array(sample).reshape(-1, 2)
         kind = np.where(np.isfinite(kind) & (kind < 2**31), kind, NO_CLASS)
