@@ -356,3 +356,22 @@ def test_forecasts_with_a_past_that_was_not_labelled_are_not_judged():
     assert (part.frames, part.false_forecasts) == (7, 7)  # the third one, at the steps 13 to 19
     assert whole.false_forecasts >= 27
     assert part.people == 0 or part.people < whole.people
+
+
+def kitti_3d(path: Path, frames: Iterable[int]) -> Path:
+    path.write_text("".join(f"{k} 1 Car 0 0 0 1 2 3 4 1.5 1.6 4.0 {k / 2} 1.5 10 0.0\n" for k in frames))
+    return path
+
+
+def test_boxes_in_space_count_from_the_first_label_to_the_last(tmp_path):
+    tracks = kitti_3d(tmp_path / "tracks.txt", range(60))
+    for frames, given, false in ((PART, None, 0), ([20, 21, 26], None, 4), (PART, "22:25", 0), ([20, 22, 24], None, 0)):
+        truth = kitti_3d(tmp_path / "truth.txt", frames)
+        scores = mcaptrack.evaluate(
+            tracks, truth=truth, label_format="kitti-3d", fps=FPS, similarity="metres", gate_m=2, frames=given
+        )
+        assert (scores.score("FP"), scores.score("FN")) == (false, 0)
+        assert scores.labelled["tracks"] == ((given, "frames") if given else (None, None))
+    (tmp_path / "t.csv").write_text("t,id,x_m,y_m,length_m\n0.1,1,2,3,1\n0.2,1,2,3,1\n")
+    with pytest.raises(McaptrackError, match=r"has times, which say what it describes; leave `frames=` out"):
+        mcaptrack.ingest(tmp_path / "t.csv", tmp_path / "x.mcap", role="truth", frames="1:")
