@@ -17,6 +17,7 @@ from mcaptrack.api.declared import hints_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.schema import TRACKS
+from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.labels.frames import FrameRanges, Frames, parse_first_frames
 from mcaptrack.transforms import Predict
@@ -375,3 +376,18 @@ def test_boxes_in_space_count_from_the_first_label_to_the_last(tmp_path):
     (tmp_path / "t.csv").write_text("t,id,x_m,y_m,length_m\n0.1,1,2,3,1\n0.2,1,2,3,1\n")
     with pytest.raises(McaptrackError, match=r"has times, which say what it describes; leave `frames=` out"):
         mcaptrack.ingest(tmp_path / "t.csv", tmp_path / "x.mcap", role="truth", frames="1:")
+
+
+@pytest.mark.parametrize("told", ["2=person,7=car", {"2": "person", "7": "car"}])
+def test_a_class_map_names_classes_in_every_command(tmp_path, told):
+    lines = (f"{k},{n},{30 * k},2,20,40,{n}" for k in range(10) for n in (2, 7))
+    table = tmp_path / "table.csv"
+    table.write_text("\n".join(["frame,id,x,y,w,h,class", *lines]) + "\n")
+    result = mcaptrack.ingest(table, tmp_path / "log.mcap", role="truth", fps=FPS, classes="all", class_map=told)
+    with log.read(tmp_path / "log.mcap") as opened:
+        assert class_names(opened.channel("/camera/truth").metadata) == {1: "person", 7: "car"}
+    assert not result.warnings
+    scores = mcaptrack.evaluate(table, truth=table, classes="all", class_map=told)
+    assert {row["class"] for row in scores.rows()} == {None, "person", "car"}
+    other = mcaptrack.evaluate(table, truth=table, classes="all", class_map={"x": "y"})
+    assert "option-not-used" in codes(other.warnings)

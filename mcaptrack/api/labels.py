@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Final, get_args
@@ -124,11 +125,14 @@ def label_options(
     from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
     count, ranges = Frames.parse(frames)
+    pairs = (
+        json.dumps({str(own): name for own, name in class_map.items()}) if isinstance(class_map, Mapping) else class_map
+    )
     return IngestOptions(
         label_format=label_format,
         columns=parse_columns(columns) if columns else None,
         classes=None if classes is None else WantedClasses(classes),
-        class_map=None if class_map is None else ClassMap.parse(class_map),
+        class_map=None if pairs is None else ClassMap.parse(pairs),
         first_frame=parse_first_frames(first_frame),
         frames=count,
         frame_ranges=ranges,

@@ -201,7 +201,8 @@ def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions)
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks(path)
     wanted = replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks")
-    labels = read_labels(path, options.label_format, role, options.first_of(role), options.columns, wanted)
+    given = (options.label_format, role, options.first_of(role), options.columns, wanted)
+    labels = read_labels(path, *given, class_map=options.class_map)
     if options.size is not None and labels.is_normalised:
         labels = fitted(labels, options.size)
     if labels.times_s is not None or labels.is_normalised:

@@ -84,7 +84,8 @@ def _files(path: Path) -> list[Path]:
 def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
     given = options.labels
     wanted = given.classes or ONLY_PEOPLE
-    labels = read_labels(path, given.label_format, "truth", given.first_of("truth"), given.columns, wanted)
+    how = (given.label_format, "truth", given.first_of("truth"), given.columns, wanted)
+    labels = read_labels(path, *how, class_map=given.class_map)
     if not labels.has_ids:
         raise McaptrackError(f"{path} has boxes without track ids; predictors learn from tracks")
     fps = given.fps

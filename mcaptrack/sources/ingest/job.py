@@ -253,7 +253,7 @@ class IngestJob:
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
         given = (options.label_format, role, options.first_of(role), options.columns, wanted)
-        labels = read_labels(path, *given, in_parts=True)
+        labels = read_labels(path, *given, in_parts=True, class_map=options.class_map)
         if role is None and isinstance(options.first_frame, Mapping):
             return self.read(path, labels.role)
         if labels.role == "detections" and labels.boxes_px is None:
@@ -464,6 +464,8 @@ class IngestJob:
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
         if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
+        if self.options.class_map is not None:
+            out["class_map"] = str(self.options.class_map)
         if self.options.size and labels.boxes_px is not None:
             out["size"] = "{}x{}".format(*self.options.size)
         return out

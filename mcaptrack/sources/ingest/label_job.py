@@ -438,7 +438,7 @@ class Boxes3DJob(IngestJob):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
             given = (options.label_format, stated, options.first_of(stated), options.columns, options.classes)
-            rows = read_labels(path, *given, scene=options.scene)
+            rows = read_labels(path, *given, scene=options.scene, class_map=options.class_map)
             role = rows.role
             if not rows.in_space:
                 raise McaptrackError(f"{path} holds boxes in pictures, and {self.source} holds 3D boxes")
@@ -564,6 +564,7 @@ class Boxes3DJob(IngestJob):
             "frames_by": "frames" if ranges else None,
             "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
             "classes": options.classes.text if options.classes and role != "detections" else None,
+            "class_map": str(options.class_map) if options.class_map else None,
             "scene": options.scene,
             "fps": None if options.fps is None else str(options.fps),
         }

@@ -23,7 +23,7 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
-from mcaptrack.schema.classes import UNKNOWN
+from mcaptrack.schema.classes import UNKNOWN, ClassMap
 from mcaptrack.schema.provenance import Plugin
 
 if TYPE_CHECKING:
@@ -420,7 +420,7 @@ class Asked:
     ``role`` is what its rows are, None: tracks if they have ids; ``columns`` are names of the columns of a table by
     what they hold; ``scene`` the name of a part of a data set; ``classes`` are those of tracks and ground truth
     (detections keep all), by default people, and of boxes in space all; ``first_frame`` is the number of the first
-    picture.
+    picture; ``class_map`` are names of classes by what the source calls them.
     """
 
     label_format: str = "auto"
@@ -429,3 +429,4 @@ class Asked:
     scene: str | None = None
     classes: WantedClasses | None = None
     first_frame: int | None = None
+    class_map: ClassMap | None = None
