@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, declared
 from mcaptrack.api.options import (
@@ -27,7 +27,7 @@ from mcaptrack.api.options import (
     no_progress,
     output,
 )
-from mcaptrack.choices import ImageFormat, InputRole, LabelFormat, LengthUnit
+from mcaptrack.choices import ImageFormat, InputRole, LengthUnit
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.location import sibling
 from mcaptrack.notices import Notice
@@ -50,7 +50,7 @@ Source = Annotated[
     ),
 ]
 _Labels = Annotated[PathLike | None, Option(LABELS)]
-_Format = Annotated[LabelFormat | str, named("label_format", get_args(LabelFormat), _READING, "format", PLUGIN)]
+_Format = Annotated[str, named("label_format", ("auto",), _READING, "format", PLUGIN, "FORMAT")]
 
 
 @dataclass(frozen=True)

@@ -121,7 +121,7 @@ class _Rows:
         frame, score, number, track_id, crowd, unseen = (values[:, at] for at in (0, 5, 6, 7, 8, 9))
         track_id, said = self._texts.of(self._path, track_id)
         rows = BoxTable(
-            facts=Facts(self._path, "coco", region="crowds, iscrowd"), at=self.at, frame=frame, id=track_id,
+            facts=Facts(self._path, "coco", region="iscrowd"), at=self.at, frame=frame, id=track_id,
             boxes_px=values[:, 1:5], score=score, class_id=number, observed=unseen == 0, remarks=said,
             aside=np.where(crowd != 0, REGION, NOTHING) if crowd.any() else None,
         )  # fmt: skip
@@ -195,7 +195,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
         if is_number(image.get("width")) and is_number(image.get("height"))
     }
     sizes = {size for size in facts.sizes.values() if all(map(math.isfinite, size))}
-    if len(sizes) == 1:
+    if len(sizes) == 1 and len(facts.sizes) == len(images):
         ((width, height),) = sizes
         facts.size = (int(width), int(height))
     out.remark(f": {len(images)} images, in order of {order}")

@@ -127,7 +127,7 @@ class _Opened(NamedTuple):
 
 def _opened(file: LabelFile) -> _Opened:
     """Read the header of a table. Raises McaptrackError if it has none."""
-    path, lines = file.path, file.lines()
+    path, lines = file.path, file.lines(MAX_LINE)
     number, first = next(lines, (0, ""))
     if not number:
         raise McaptrackError(f"{path} holds no labels")
@@ -240,7 +240,7 @@ def is_table(file: LabelFile) -> bool:
 class Csv(LabelFormat):
     """Tables with a header, of boxes in pictures and in metres."""
 
-    title = "a table with a header"
+    title = "tables with a header"
     row = "columns by their names: `frame,x,y,w,h,score,class,id`"
     takes = ("columns",)
 
@@ -524,7 +524,7 @@ _HEADERS_3D: Final[Mapping[str, tuple[str, ...]]] = {
     "vy_m_per_s": ("vympers", "vyms", "vym/s", "vy", "velocityy"),
 }
 #: Headers that only tables of 3D boxes have.
-_ONLY_3D: Final = frozenset(("zm", "tzm", "lengthm", "headingrad", "headingdeg"))
+_ONLY_3D: Final = frozenset(("xm", "ym", "zm", "tzm", "lengthm", "headingrad", "headingdeg"))
 #: A length in another unit than metres, at the end of a header.
 _OTHER_UNIT: Final = re.compile(r"(?:^|[_ \[(])(mm|cm|km|ft|feet|inch|inches|px)[\])]?$", re.IGNORECASE)
 
@@ -537,7 +537,7 @@ def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
     if not header:
         return False
     plain = _plain(header)
-    if {"xm", "ym"} <= set(plain) or _ONLY_3D & set(plain):
+    if _ONLY_3D & set(plain):
         return True
     keys = {key for key, names in _HEADERS_3D.items() if set(names) & set(plain)}
     return set(_PLACE) <= keys and bool(keys & {*_HEADING, "qw"})

@@ -67,7 +67,7 @@ class Mot(LabelFormat):
         values, at = read_numbers(file.path, file.lines(), what, 8, parse, _split)
         score, kind = values[:, 6], values[:, 7]
         facts = Facts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
-        facts.not_counting = "score 0"
+        facts.not_counting, facts.scores_truth = "score 0", False
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=values[:, 2:6], score=score,
             class_id=np.full(len(values), PERSON), counts=score != 0,
@@ -104,7 +104,8 @@ def _name(table: BoxTable, kind: Ints, tens: Floats) -> None:
     facts.named_by, table.class_id, table.aside = "", kind, np.full(len(kind), OCCUPIED)
     name_classes(table, [table.path.parent], first=int(stated.min() > 0))
     is_visdrone = len(tens) > 0 and bool((tens >= 0).all())
-    names = _VISDRONE if is_visdrone else {} if len(tens) else MOT_CLASSES
+    are_people = bool((stated == PERSON).all())
+    names = _VISDRONE if is_visdrone and not are_people else MOT_CLASSES if are_people or not len(tens) else {}
     if facts.names is None and np.isin(stated, [*names]).all():
         facts.names, facts.named_by = names, "format"
         table.class_id = np.where(kind == NO_CLASS, PERSON, kind)

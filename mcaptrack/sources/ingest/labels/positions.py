@@ -10,6 +10,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from mcaptrack.schema.classes import PERSON
+from mcaptrack.sources.ingest.labels.delimited import is_table
 from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Facts
 from mcaptrack.sources.ingest.labels.text import read_numbers
@@ -44,7 +45,7 @@ class Trajnet(_Positions):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 4 columns, and no names of columns."""
-        return len(file.cells) == self.columns
+        return len(file.cells) == self.columns and not is_table(file)
 
 
 class Obsmat(_Positions):
@@ -55,4 +56,4 @@ class Obsmat(_Positions):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 8 columns without commas."""
-        return len(file.cells) == self.columns and "," not in file.row
+        return len(file.cells) == self.columns and "," not in file.row and not is_table(file)

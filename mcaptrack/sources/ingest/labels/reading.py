@@ -117,11 +117,11 @@ def read_labels(
     name = label_format if label_format != _AUTO else _name_of(made)
     for option in ("columns", "scene"):
         if getattr(asked, option) and option not in made.takes:
-            takers = [other for other in BUILT_IN["label_format"] if option in _made(other).takes]
-            raise McaptrackError(f"{path}: `{option}=` is for {' and '.join(takers)}, not for {name}")
+            takers = [other.title for other in map(_made, BUILT_IN["label_format"]) if option in other.takes]
+            raise McaptrackError(f"{path}: `{option}=` is for {' and '.join(takers[::-1])}, not for {name}")
     if file.is_folder and not made.reads_folders:
         raise McaptrackError(f"{path} is a folder, and {name} labels are a file")
-    is_alike = role == "detections" or (role != "truth" and (wanted is None or wanted.is_people))
+    is_alike = role == "detections" or (role in ("tracks", None) and (wanted is None or wanted.is_people))
     if in_parts and made.in_parts and is_alike and path.stat().st_size >= _LONG_BYTES:
         table = _read_in_parts(file, made, replace(asked, role=role or "tracks"))
         if table is not None:
@@ -222,7 +222,8 @@ def _part(like: BoxTable, spilled: SpillFile, stored: Mapping[str, Stored]) -> B
     for name, place in stored.items():
         values = columns[name]
         columns[name] = np.frombuffer(spilled.get(place), values.dtype).reshape(-1, *values.shape[1:])
-    part = replace(like, **columns, stored=(), stored_extent=None, findings=[])
+    path = like.path
+    part = replace(like, **columns, at=lambda _: str(path), stored=(), stored_extent=None, findings=[])
     if like.has_ids:
         return part.take(np.lexsort((part.id, part.frame)))
     return part

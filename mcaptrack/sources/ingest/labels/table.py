@@ -87,6 +87,8 @@ class Facts:
         Whether the source says so, and it isn't concluded from the boxes.
     frame_id : str
         The frame of reference of places in metres, if the source names it.
+    scores_truth : bool
+        Ground truth has scores; otherwise the column holds something else there.
     not_counting, region : str
         What ``counts`` and ``REGION`` mean in this format, for messages.
     least_height_px : float
@@ -117,6 +119,7 @@ class Facts:
     labelled: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     states_labelled: bool = False
     frame_id: str = ""
+    scores_truth: bool = True
     not_counting: str = ""
     region: str = ""
     least_height_px: float = 0.0
