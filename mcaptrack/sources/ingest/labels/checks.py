@@ -1,4 +1,4 @@
-"""What is checked of every source of labels, and assumed where it doesn't say: one list, for all formats.
+"""The checks of every source of labels, and assumptions where it doesn't say: one list, for all formats.
 
 A check refuses rows that can't be labels (``McaptrackError`` with the place of the row), or adds a finding to the
 table: a text with a code, which becomes a warning. Checks look at the rows of a source as they are

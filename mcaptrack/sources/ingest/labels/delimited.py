@@ -23,8 +23,8 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
-from mcaptrack.sources.ingest.labels.format import MAX_LINE, LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import MAX_LINE, Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import (
     ClassNames,
     FrameNames,
@@ -194,7 +194,7 @@ class _Cells:
         """Columns (N, K) side by side."""
         return np.stack([self.column(key) for key in keys], axis=-1)
 
-    def name_classes(self, facts: Facts) -> Floats:
+    def name_classes(self, facts: LabelFacts) -> Floats:
         """The classes of rows (N,), with their names in the facts: numbers, with the names beside them, or names."""
         columns, texts = self.columns, self.classes.names
         kind, name = columns.get("class"), columns.get("name")
@@ -237,7 +237,7 @@ def is_table(file: LabelFile) -> bool:
     return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
 
 
-class Csv(LabelFormat):
+class Csv(Format):
     """Tables with a header, of boxes in pictures and in metres."""
 
     title = "tables with a header"
@@ -259,8 +259,8 @@ class Csv(LabelFormat):
         return _read_table(_opened(file), "csv", asked.columns)
 
 
-class Supervision(LabelFormat):
-    """What supervision writes: tables of its CSVSink, and JSON of its JSONSink."""
+class Supervision(Format):
+    """Tables of the CSVSink of supervision, and JSON of its JSONSink."""
 
     title = "supervision"
     row = f"`{','.join(SUPERVISION)},...`, or JSON with these keys"
@@ -307,7 +307,7 @@ def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTabl
 
     cells = _Cells(table, places, {"frame": frame_of, "id": id_of})
     track_id, said = ids.of(path, cells.column("id"))
-    remarks, facts = [cells.remark, *said], Facts(path, name)
+    remarks, facts = [cells.remark, *said], LabelFacts(path, name)
     are_rows = "id" in places and header[places["id"]].lower() == "id" and "id" not in chosen
     if are_rows and len(np.unique(track_id)) == len(track_id) > 1:
         remarks.append(f"{path}: every box has another {header[places['id']]}, so it numbers rows, not tracks")
@@ -567,7 +567,7 @@ def _read_table_3d(table: _Opened, chosen: Mapping[str, str]) -> BoxTable:
         track_id[is_known], are_numbers = numbered([ids[row] for row in np.flatnonzero(is_known)])
         if not are_numbers:
             remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
-    facts = Facts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
+    facts = LabelFacts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
     facts.names = (cells.names if "name" in places else cells.classes).names
     boxes = np.column_stack([cells.stacked((*_PLACE, *_SIZE)), heading])
     kind = cells.column("name" if "name" in places else "class")

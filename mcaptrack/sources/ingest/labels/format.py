@@ -1,4 +1,4 @@
-"""What a format of labels is: a class in a module of its own, and a line in the registry.
+"""Formats of labels: each is a class in a module of its own, and a line in the registry.
 
 To add one, write a module like ``trajnet``, name it in ``registry.BUILT_IN["label_format"]``, and add a file of it to
 tests/test_border.py. Nothing else names a format.
@@ -95,7 +95,7 @@ class LabelFile:
         return McaptrackError(f"{self.path}:{number}: {text}")
 
 
-class LabelFormat:
+class Format:
     """A format of labels.
 
     ``title`` and ``row`` describe it in documents, ``takes`` are options that it reads. ``in_parts``: a row says all

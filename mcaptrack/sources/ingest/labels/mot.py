@@ -15,9 +15,9 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.delimited import is_table
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import name_classes
-from mcaptrack.sources.ingest.labels.table import FORGIVEN, NO_CLASS, OCCUPIED, REGION, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.table import FORGIVEN, NO_CLASS, OCCUPIED, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import check_columns, read_numbers
 
 #: The classes of MOT16, 17 and 20, and of VisDrone.
@@ -38,7 +38,7 @@ _SAMPLE: Final = 10_000
 _TRUNCATED, _OCCLUDED = 1, 2
 
 
-class Mot(LabelFormat):
+class Mot(Format):
     """Rows of MOTChallenge."""
 
     title = "MOTChallenge"
@@ -66,7 +66,7 @@ class Mot(LabelFormat):
         what = "MOTChallenge (frame, id, left, top, width, height, score, ...)"
         values, at = read_numbers(file.path, file.lines(), what, 8, parse, _split)
         score, kind = values[:, 6], values[:, 7]
-        facts = Facts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
+        facts = LabelFacts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
         facts.not_counting, facts.scores_truth = "score 0", False
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=values[:, 2:6], score=score,

@@ -11,15 +11,15 @@ import numpy as np
 
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.delimited import is_table
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import read_numbers
 
 #: The label interval of files that are annotated at the sampling rate of prediction benchmarks.
 INTERVAL_S: Final = Fraction(2, 5)
 
 
-class _Positions(LabelFormat):
+class _Positions(Format):
     """Rows of numbers: a frame, a track, and others, two of which are a position."""
 
     in_parts = True
@@ -30,7 +30,7 @@ class _Positions(LabelFormat):
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""
         values, at = read_numbers(file.path, file.lines(), f"{self.title} ({self.row.strip('`')})", self.columns)
-        facts = Facts(file.path, self.name, first_frame=0, interval_s=INTERVAL_S, named_by="format")
+        facts = LabelFacts(file.path, self.name, first_frame=0, interval_s=INTERVAL_S, named_by="format")
         facts.clock_of = f"{self.name}, a label every 0.4 s"
         return BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], xy_m=values[:, self.place],

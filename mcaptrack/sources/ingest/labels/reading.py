@@ -19,7 +19,7 @@ from mcaptrack.files import refuse_special
 from mcaptrack.registry import BUILT_IN, find
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, check
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package, recognised
 from mcaptrack.sources.ingest.labels.roles import WantedClasses, settled
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Extent
@@ -32,7 +32,7 @@ _LONG_BYTES: Final = 20_000_000
 _PART_ROWS: Final = 200_000
 
 
-def _made(name: str) -> LabelFormat:
+def _made(name: str) -> Format:
     """The format of a name. Raises McaptrackError if there is none, or if it can't be used."""
     if name in BUILT_IN["label_format"]:
         return find("label_format", name).cls()  # type: ignore[no-any-return]
@@ -41,9 +41,7 @@ def _made(name: str) -> LabelFormat:
     return made
 
 
-def known_format(
-    file: LabelFile, label_format: str = _AUTO, columns: Mapping[str, str] | None = None
-) -> LabelFormat | None:
+def known_format(file: LabelFile, label_format: str = _AUTO, columns: Mapping[str, str] | None = None) -> Format | None:
     """The format of a file: the one that is given, or by its content; None if it is of no known one.
 
     Raises McaptrackError if there is no such format, or if formats of several other packages recognise the file.
@@ -129,7 +127,7 @@ def read_labels(
     return read_by(made, file, asked)
 
 
-def read_by(made: LabelFormat, file: LabelFile, asked: Asked) -> BoxTable:
+def read_by(made: Format, file: LabelFile, asked: Asked) -> BoxTable:
     """The rows of a file of a format. Raises McaptrackError as ``read_labels`` does."""
     table = made.read(file, asked)
     table.facts.found_by = "content" if asked.label_format == _AUTO else "option"
@@ -141,7 +139,7 @@ def read_by(made: LabelFormat, file: LabelFile, asked: Asked) -> BoxTable:
     return table
 
 
-def _name_of(made: LabelFormat) -> str:
+def _name_of(made: Format) -> str:
     if isinstance(made, FormatOfPackage):
         return made.entry.name
     where = f"{type(made).__module__}:{type(made).__qualname__}"
@@ -174,7 +172,7 @@ def read_homography(path: Path) -> tuple[float, ...]:
 # programs write detections and tracks. Others are in memory as a whole.
 
 
-def _read_in_parts(file: LabelFile, made: LabelFormat, asked: Asked) -> BoxTable | None:
+def _read_in_parts(file: LabelFile, made: Format, asked: Asked) -> BoxTable | None:
     """Read a label file in parts; None if it isn't sorted by frame, or if parts aren't understood alike."""
     lines, spilled, stored = lines_of(file.path), SpillFile(), list[Mapping[str, Stored]]()
     tables, extent = list[BoxTable](), Extent.of_none()

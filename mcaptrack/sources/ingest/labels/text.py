@@ -1,4 +1,4 @@
-"""What readers of label files share: text of numbers, line by line, and names of classes, tracks and pictures.
+"""Parts of all readers of label files: text of numbers, line by line, and names of classes, tracks and pictures.
 
 Letters: N rows, C columns.
 """
