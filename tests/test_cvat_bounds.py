@@ -6,6 +6,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import cvat
+from mcaptrack.sources.ingest.labels import text as texts
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
@@ -65,10 +66,10 @@ def test_frames_and_classes_have_limits(read, monkeypatch):
     assert len(read(track(box(0), box(5))).id) == 6
     refused(read, "5 boxes would be interpolated; at most 5 are", track(box(0), box(6)))
     assert len(read(track(box(0, more='outside="1"'), box(60))).id) == 1
-    monkeypatch.setattr(cvat, "_MAX_CLASSES", 2)
+    monkeypatch.setattr(texts, "_MAX_NAMES", 2)
     named = read(*(track(box(0), label=label) for label in ("a", " b  c ", "b c")))
     assert named.classes == {2: "a", 3: "b c"}
-    refused(read, "more than 2 labels", *[track(box(0), label=name) for name in "abc"])
+    refused(read, "more than 2 names", *[track(box(0), label=name) for name in "abc"])
     monkeypatch.setattr(cvat, "_MAX_DEPTH", 5)
     assert len(read(track(box(0, inner="<a><b></b></a>"))).id) == 1
     refused(read, ":3: nested deeper than annotations of CVAT are", track(box(0, inner="<a><b><c/></b></a>")))
@@ -127,7 +128,7 @@ def test_frames_of_a_task(read, meta, boxes, frames, labelled):
 def test_ids_of_tracks(read):
     numbered = [track(box(0), more=f'id="{n}"') for n in (7, 0, 3)]
     found = read(*numbered)
-    assert (found.id.tolist(), found.facts.made_ids) == ([7, 0, 3], None)
+    assert (found.id.tolist(), found.facts.made_ids) == ([0, 3, 7], None)
     twice = read(*numbered, track(box(1), more='id="7"'))
     assert (twice.id.tolist(), twice.frame.tolist()) == ([0, 1, 2, 3], [0, 0, 0, 1])
     assert any("ids of tracks occur twice; its tracks are counted from 0" in one for one in twice.remarks)

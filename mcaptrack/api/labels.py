@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import TYPE_CHECKING, Annotated, Final, get_args
+from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack import notices
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import PLUGIN, PathLike, named
-from mcaptrack.choices import LabelFormat, Point
+from mcaptrack.choices import Point
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
@@ -22,9 +22,9 @@ READING: Final = "Reading of label files"
 FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
 
 Format = Annotated[
-    LabelFormat | str,
+    str,
     named(
-        "label_format", get_args(LabelFormat), READING, "format", PLUGIN,
+        "label_format", ("auto",), READING, "format", PLUGIN, "FORMAT",
         "Format of label files, one of an installed package, or module:Class. auto: as the content tells; csv: any "
         "table with a header.\n\nThose of 3D boxes are csv, kitti-3d, nuscenes and argoverse.",
     ),
@@ -105,7 +105,7 @@ _NAMES: Final = (
 
 def label_options(
     *,
-    label_format: LabelFormat | str = "auto",
+    label_format: str = "auto",
     columns: str | Mapping[str, str] | None = None,
     classes: str | None = None,
     class_map: str | Mapping[str, str] | None = None,

@@ -34,7 +34,7 @@ from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE
-from mcaptrack.sources.ingest.labels.table import BoxTable, Facts, IgnoredBoxes
+from mcaptrack.sources.ingest.labels.table import BoxTable, IgnoredBoxes, LabelFacts
 from mcaptrack.sources.ingest.labels.timeline import Placed, label_rows
 
 #: Formats that give the frame number of each row.
@@ -221,7 +221,7 @@ def _no_tracks(path: Path) -> BoxTable:
     """A file of tracks without rows: of a tracker that found no people."""
     none = np.empty(0, np.int64)
     kinds = np.empty(0, np.uint32)
-    facts = Facts(path, "mot", first_frame=1)
+    facts = LabelFacts(path, "mot", first_frame=1)
     return BoxTable(
         facts=facts, frame=none, id=none, boxes_px=np.empty((0, 4)), score=np.empty(0), class_id=kinds, role="tracks"
     )
@@ -247,7 +247,7 @@ def _read_parquet(path: Path, role: Role, topics: Sequence[str]) -> BoxTable:
     boxes = np.stack([table[name][mine] for name in columns[3:7]], axis=-1)
     xy_m = np.stack([table["x_m"][mine], table["y_m"][mine]], axis=-1)
     people = np.full(len(frame), PERSON, np.uint32)
-    facts = Facts(path, "parquet", labelled=np.unique(frame))
+    facts = LabelFacts(path, "parquet", labelled=np.unique(frame))
     return BoxTable(
         facts=facts, frame=frame, id=track_id, boxes_px=boxes, xy_m=xy_m, score=table["score"][mine], class_id=people,
         role=role,

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack import log, pipeline, tables
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -84,7 +85,8 @@ def _files(path: Path) -> list[Path]:
 def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
     given = options.labels
     wanted = given.classes or ONLY_PEOPLE
-    how = (given.label_format, "truth", given.first_of("truth"), given.columns, wanted)
+    role: Role = "truth"
+    how = (given.label_format, role, given.first_of(role), given.columns, wanted)
     labels = read_labels(path, *how, class_map=given.class_map)
     if not labels.has_ids:
         raise McaptrackError(f"{path} has boxes without track ids; predictors learn from tracks")

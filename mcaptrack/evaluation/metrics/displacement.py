@@ -422,8 +422,9 @@ def pair_forecasts(
     horizon = forecasts.mean_m.shape[1]
     people, paths = _sorted_positions(ground_truth, fill=False), _sorted_positions(tracks, fill=True)
     counts = np.ones(len(forecasts.step), bool)
-    for step in (forecasts.step - back for back in range(t_obs if labelled is not None else 0)):
-        counts &= (step < 0) | np.isin(step, labelled)
+    for back in range(t_obs) if labelled is not None else ():
+        step = forecasts.step - back
+        counts &= (step < 0) | np.isin(step, np.asarray(labelled))
     steps = np.unique(forecasts.step[counts])
     has_past, has_future = people.is_continuous(1 - t_obs), people.is_continuous(horizon)
     place = paths.find(forecasts.id, forecasts.step)

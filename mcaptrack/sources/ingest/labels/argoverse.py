@@ -9,8 +9,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, headings, numbered
 
 BOXES: Final = "annotations.feather"
@@ -22,7 +22,7 @@ _SIZE: Final = ("length_m", "width_m", "height_m")
 CITY, VEHICLE = "map", "base_link"
 
 
-class Argoverse(LabelFormat):
+class Argoverse(Format):
     """A table of boxes, or the folder of a log with it."""
 
     title = "Argoverse 2"
@@ -72,7 +72,9 @@ def _read(path: Path) -> BoxTable:
     except ValueError as error:
         raise McaptrackError(f"{path}: {error}") from None
     remarks.append(f"{path}: tracks are numbered from 1 on, a number for each track_uuid")
-    facts = Facts(path, "argoverse", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=frame_id)
+    facts = LabelFacts(
+        path, "argoverse", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=frame_id
+    )
     return BoxTable(
         facts=facts, at=at, frame=t_ns, id=numbered([f"#{track}" for track in table["track_uuid"]])[0],
         boxes_m=np.column_stack([place, _floats(path, table, _SIZE), heading]), score=np.full(count, np.nan),

@@ -1,4 +1,4 @@
-"""What is checked of every source of labels, and assumed where it doesn't say: one list, for all formats.
+"""The checks of every source of labels, and assumptions where it doesn't say: one list, for all formats.
 
 A check refuses rows that can't be labels (``McaptrackError`` with the place of the row), or adds a finding to the
 table: a text with a code, which becomes a warning. Checks look at the rows of a source as they are
@@ -162,12 +162,13 @@ def check_shares(table: BoxTable, _: Asked) -> None:
     facts, boxes = table.facts, table.boxes_px
     if boxes is None:
         return
-    largest = np.abs(boxes).max(axis=1, initial=0)
+    parts = np.abs(np.concatenate([boxes[:, :2] + boxes[:, 2:] / 2, boxes[:, 2:]], axis=1))  # centres and sizes
+    largest = parts.max(axis=1, initial=0)
     if facts.is_normalised:
         table.refuse(
             largest > _MOST_SHARE, lambda row: f"{largest[row]:g} is no share of the picture's size, as its boxes are"
         )
-    elif facts.is_normalised is None and (largest <= _MOST_SHARE).all() and (boxes != np.rint(boxes)).any():
+    elif facts.is_normalised is None and (np.abs(boxes) <= _MOST_SHARE).all() and (boxes != np.rint(boxes)).any():
         facts.is_normalised = True
         text = f": no number of a box is above {_MOST_SHARE:g}, so they are taken as shares of the picture's size"
         table.find(text, "units")

@@ -16,8 +16,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, NOTHING, REGION, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import FrameNames, TrackIds, is_count, is_number, numbers_of_names
 
 _MAX_ROWS: Final = 10_000_000
@@ -32,7 +32,7 @@ _BY_LIST: Final = "the list `images`"
 _COLUMNS: Final = 10
 
 
-class Coco(LabelFormat):
+class Coco(Format):
     """Annotations or results, as the content tells."""
 
     title = "COCO"
@@ -121,7 +121,7 @@ class _Rows:
         frame, score, number, track_id, crowd, unseen = (values[:, at] for at in (0, 5, 6, 7, 8, 9))
         track_id, said = self._texts.of(self._path, track_id)
         rows = BoxTable(
-            facts=Facts(self._path, "coco", region="crowds, iscrowd"), at=self.at, frame=frame, id=track_id,
+            facts=LabelFacts(self._path, "coco", region="iscrowd"), at=self.at, frame=frame, id=track_id,
             boxes_px=values[:, 1:5], score=score, class_id=number, observed=unseen == 0, remarks=said,
             aside=np.where(crowd != 0, REGION, NOTHING) if crowd.any() else None,
         )  # fmt: skip
@@ -198,7 +198,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
         if is_number(image.get("width")) and is_number(image.get("height"))
     }
     sizes = {size for size in facts.sizes.values() if all(map(math.isfinite, size))}
-    if len(sizes) == 1:
+    if len(sizes) == 1 and len(facts.sizes) == len(images):
         ((width, height),) = sizes
         facts.size = (int(width), int(height))
     out.remark(f": {len(images)} images, in order of {order}")

@@ -25,8 +25,8 @@ import numpy as np
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, is_count
 
 _MAX_BYTES: Final = 512 * 2**20
@@ -283,7 +283,7 @@ def _is(attributes: dict[str, str], name: str) -> bool:
     return attributes.get(name, "").lower() in ("1", "true")
 
 
-class Cvat(LabelFormat):
+class Cvat(Format):
     """Annotations for video and for images."""
 
     title = "CVAT"
@@ -310,7 +310,7 @@ class Cvat(LabelFormat):
 def _table(path: Path, parser: _Parser) -> BoxTable:
     values: Floats = np.frombuffer(parser.values, np.float64).reshape(-1, _COLUMNS)
     names = parser.labels.names
-    facts = Facts(path, "cvat", first_frame=0, names=names or None, numbering={} if names else None)
+    facts = LabelFacts(path, "cvat", first_frame=0, names=names or None, numbering={} if names else None)
     facts.named_by, facts.size = "file" if names else "", _size(parser)
     facts.labelled, facts.states_labelled, doubt = _frames(parser, values[:, 0])
     rows = BoxTable(

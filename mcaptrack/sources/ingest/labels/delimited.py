@@ -23,8 +23,8 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
-from mcaptrack.sources.ingest.labels.format import MAX_LINE, LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import MAX_LINE, Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import (
     ClassNames,
     FrameNames,
@@ -127,7 +127,7 @@ class _Opened(NamedTuple):
 
 def _opened(file: LabelFile) -> _Opened:
     """Read the header of a table. Raises McaptrackError if it has none."""
-    path, lines = file.path, file.lines()
+    path, lines = file.path, file.lines(MAX_LINE)
     number, first = next(lines, (0, ""))
     if not number:
         raise McaptrackError(f"{path} holds no labels")
@@ -194,7 +194,7 @@ class _Cells:
         """Columns (N, K) side by side."""
         return np.stack([self.column(key) for key in keys], axis=-1)
 
-    def name_classes(self, facts: Facts) -> Floats:
+    def name_classes(self, facts: LabelFacts) -> Floats:
         """The classes of rows (N,), with their names in the facts: numbers, with the names beside them, or names."""
         columns, texts = self.columns, self.classes.names
         kind, name = columns.get("class"), columns.get("name")
@@ -237,10 +237,10 @@ def is_table(file: LabelFile) -> bool:
     return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
 
 
-class Csv(LabelFormat):
+class Csv(Format):
     """Tables with a header, of boxes in pictures and in metres."""
 
-    title = "a table with a header"
+    title = "tables with a header"
     row = "columns by their names: `frame,x,y,w,h,score,class,id`"
     takes = ("columns",)
 
@@ -259,8 +259,8 @@ class Csv(LabelFormat):
         return _read_table(_opened(file), "csv", asked.columns)
 
 
-class Supervision(LabelFormat):
-    """What supervision writes: tables of its CSVSink, and JSON of its JSONSink."""
+class Supervision(Format):
+    """Tables of the CSVSink of supervision, and JSON of its JSONSink."""
 
     title = "supervision"
     row = f"`{','.join(SUPERVISION)},...`, or JSON with these keys"
@@ -307,7 +307,7 @@ def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTabl
 
     cells = _Cells(table, places, {"frame": frame_of, "id": id_of})
     track_id, said = ids.of(path, cells.column("id"))
-    remarks, facts = [cells.remark, *said], Facts(path, name)
+    remarks, facts = [cells.remark, *said], LabelFacts(path, name)
     are_rows = "id" in places and header[places["id"]].lower() == "id" and "id" not in chosen
     if are_rows and len(np.unique(track_id)) == len(track_id) > 1:
         remarks.append(f"{path}: every box has another {header[places['id']]}, so it numbers rows, not tracks")
@@ -524,7 +524,7 @@ _HEADERS_3D: Final[Mapping[str, tuple[str, ...]]] = {
     "vy_m_per_s": ("vympers", "vyms", "vym/s", "vy", "velocityy"),
 }
 #: Headers that only tables of 3D boxes have.
-_ONLY_3D: Final = frozenset(("zm", "tzm", "lengthm", "headingrad", "headingdeg"))
+_ONLY_3D: Final = frozenset(("xm", "ym", "zm", "tzm", "lengthm", "headingrad", "headingdeg"))
 #: A length in another unit than metres, at the end of a header.
 _OTHER_UNIT: Final = re.compile(r"(?:^|[_ \[(])(mm|cm|km|ft|feet|inch|inches|px)[\])]?$", re.IGNORECASE)
 
@@ -537,7 +537,7 @@ def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
     if not header:
         return False
     plain = _plain(header)
-    if {"xm", "ym"} <= set(plain) or _ONLY_3D & set(plain):
+    if _ONLY_3D & set(plain):
         return True
     keys = {key for key, names in _HEADERS_3D.items() if set(names) & set(plain)}
     return set(_PLACE) <= keys and bool(keys & {*_HEADING, "qw"})
@@ -567,7 +567,7 @@ def _read_table_3d(table: _Opened, chosen: Mapping[str, str]) -> BoxTable:
         track_id[is_known], are_numbers = numbered([ids[row] for row in np.flatnonzero(is_known)])
         if not are_numbers:
             remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
-    facts = Facts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
+    facts = LabelFacts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
     facts.names = (cells.names if "name" in places else cells.classes).names
     boxes = np.column_stack([cells.stacked((*_PLACE, *_SIZE)), heading])
     kind = cells.column("name" if "name" in places else "class")

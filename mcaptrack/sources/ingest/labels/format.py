@@ -1,4 +1,4 @@
-"""What a format of labels is: a class in a module of its own, and a line in the registry.
+"""Formats of labels: each is a class in a module of its own, and a line in the registry.
 
 To add one, write a module like ``trajnet``, name it in ``registry.BUILT_IN["label_format"]``, and add a file of it to
 tests/test_border.py. Nothing else names a format.
@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, read_json
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
-from mcaptrack.sources.ingest.labels.text import Lines, lines_of, split
+from mcaptrack.sources.ingest.labels.text import MAX_ROW, Lines, lines_of, split
 
 _BEGIN_BYTES: Final = 4096
 #: The largest number of characters of a row.
@@ -45,7 +45,7 @@ class LabelFile:
     @cached_property
     def row(self) -> str:
         """Its first row, without comments; "" if it has none, as JSON, XML and what isn't text."""
-        is_other = self.is_folder or b"\0" in self.head or self.head[:1] in (b"{", b"[", b"<")
+        is_other = self.is_folder or b"\0" in self.head.partition(b"\n")[0] or self.head[:1] in (b"{", b"[", b"<")
         try:
             return "" if is_other else next(lines_of(self.path, MAX_LINE), (0, ""))[1]
         except McaptrackError:
@@ -76,26 +76,26 @@ class LabelFile:
         content = content[0] if isinstance(content, list) and content else content
         return list(content) if isinstance(content, dict) else []
 
-    def lines(self, most: int = MAX_LINE) -> Lines:
-        """Its lines. Raises McaptrackError if it isn't text."""
+    def lines(self, most: int = MAX_ROW) -> Lines:
+        """Its lines as ``lines_of`` gives them. Raises McaptrackError if it isn't text."""
         return lines_of(self.path, most) if self._lines is None else self._lines
 
     def unknown(self, formats: str) -> McaptrackError:
         """The error for a file of none of these formats, with what it is instead."""
         if self.is_folder:
             return McaptrackError(f"{self.path} is a folder of no label format ({formats})")
-        if self.is_json:
+        if self.is_json and self.json != []:
             kind = "an object" if isinstance(self.json, dict) else "a list"
             keys = f" with {', '.join(self.keys)}"[:300] if self.keys else ""
             return McaptrackError(f"{self.path} is JSON ({kind}{keys}) of no label format ({formats})")
         number, line = next(lines_of(self.path, MAX_LINE), (0, ""))
-        if not number:
-            return McaptrackError(f"{self.path} holds no labels")
+        if not number or self.is_json:
+            return McaptrackError(f"{self.path} holds no boxes")
         text = f"a row of {len(split(line))} columns fits no label format ({formats}): {line.strip()[:_SHOWN]}"
         return McaptrackError(f"{self.path}:{number}: {text}")
 
 
-class LabelFormat:
+class Format:
     """A format of labels.
 
     ``title`` and ``row`` describe it in documents, ``takes`` are options that it reads. ``in_parts``: a row says all

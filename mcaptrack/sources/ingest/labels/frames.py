@@ -50,9 +50,9 @@ class FrameRanges:
 
 
 class Frames(NamedTuple):
-    """What ``--frames`` says: how many frames there are, or which of them were labelled; None: it doesn't."""
+    """The meaning of ``--frames``: a number of frames, or those that were labelled; None: it doesn't say."""
 
-    count: int | None = None
+    number: int | None = None
     ranges: FrameRanges | None = None
 
     @classmethod
@@ -62,7 +62,7 @@ class Frames(NamedTuple):
         if value is None:
             return cls()
         if is_count(text, _DIGITS) and 0 < int(text) <= MAX_FRAMES:
-            return cls(count=int(text))
+            return cls(number=int(text))
         parts = [part.split(":") for part in text.split(",")]
         if all(len(ends) == 2 and all(not end or is_count(end, _DIGITS) for end in ends) for ends in parts):
             ranges = [(int(first) if first else None, int(end) if end else None) for first, end in parts]

@@ -12,8 +12,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema.classes import PERSON
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, Numbers, as_boxes, check_columns, read_numbers
 
 _COLUMNS: Final = (
@@ -50,7 +50,7 @@ def _named(
     return np.isin(kind, [number for number, name in names.items() if name.lower() in wanted])
 
 
-class Kitti(LabelFormat):
+class Kitti(Format):
     """Boxes in pictures."""
 
     title = "KITTI tracking"
@@ -67,7 +67,7 @@ class Kitti(LabelFormat):
         kind = values[:, 2].astype(np.int64)
         aside = np.where(_named(kind, names, (_REGION,)), REGION, NOTHING)
         aside[_named(kind, names, _SITTING)] = FORGIVEN
-        facts = Facts(file.path, "kitti", first_frame=0, names=names, numbering=_CLASSES, named_by="file")
+        facts = LabelFacts(file.path, "kitti", first_frame=0, names=names, numbering=_CLASSES, named_by="file")
         facts.not_counting, facts.region, facts.least_height_px = "hidden or cut off", "DontCare", _HEIGHT_PX
         return BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=as_boxes(values[:, 6:10]),
@@ -75,7 +75,7 @@ class Kitti(LabelFormat):
         )  # fmt: skip
 
 
-class Kitti3d(LabelFormat):
+class Kitti3d(Format):
     """Boxes in space, of which files look the same.
 
     In the file, x is right, y down and z forward, the position is the centre of the box's bottom, and the rotation
@@ -101,7 +101,7 @@ class Kitti3d(LabelFormat):
         height, width, length, x, y, z, rotation = values[:, 10:17].T
         left = [f"{int(is_region.sum())} regions (DontCare)"] if is_region.any() else []
         left += [f"{int(has_no_box.sum())} rows without a 3D box"] if has_no_box.any() else []
-        facts = Facts(file.path, "kitti-3d", first_frame=0, names=names, numbering={}, named_by="file")
+        facts = LabelFacts(file.path, "kitti-3d", first_frame=0, names=names, numbering={}, named_by="file")
         facts.frame_id, facts.labelled = _FRAME_ID, np.unique(values[:, 0])
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], score=values[:, 17], class_id=kind,

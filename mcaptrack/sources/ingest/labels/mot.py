@@ -15,9 +15,9 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.delimited import is_table
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import name_classes
-from mcaptrack.sources.ingest.labels.table import FORGIVEN, NO_CLASS, OCCUPIED, REGION, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.table import FORGIVEN, NO_CLASS, OCCUPIED, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import check_columns, read_numbers
 
 #: The classes of MOT16, 17 and 20, and of VisDrone.
@@ -38,7 +38,7 @@ _SAMPLE: Final = 10_000
 _TRUNCATED, _OCCLUDED = 1, 2
 
 
-class Mot(LabelFormat):
+class Mot(Format):
     """Rows of MOTChallenge."""
 
     title = "MOTChallenge"
@@ -66,9 +66,9 @@ class Mot(LabelFormat):
         what = "MOTChallenge (frame, id, left, top, width, height, score, ...)"
         values, at = read_numbers(file.path, file.lines(), what, 8, parse, _split)
         score, kind = values[:, 6], values[:, 7]
-        facts = Facts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
+        facts = LabelFacts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
         facts.is_first_assumed = facts.first_frame == 1  # some programs number frames from 0 in this format, too
-        facts.not_counting = "score 0"
+        facts.not_counting, facts.scores_truth = "score 0", False
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=values[:, 2:6], score=score,
             class_id=np.full(len(values), NO_CLASS), counts=score != 0,
@@ -105,7 +105,8 @@ def _name(table: BoxTable, kind: Ints, tens: Floats) -> None:
     facts.named_by, table.class_id, table.aside = "", kind, np.full(len(kind), OCCUPIED)
     name_classes(table, [table.path.parent], first=int(stated.min() > 0))
     is_visdrone = len(tens) > 0 and bool((tens >= 0).all())
-    names = _VISDRONE if is_visdrone else {} if len(tens) else MOT_CLASSES
+    are_people = bool((stated == PERSON).all())
+    names = _VISDRONE if is_visdrone and not are_people else MOT_CLASSES if are_people or not len(tens) else {}
     if facts.names is None and np.isin(stated, [*names]).all():
         facts.names, facts.named_by = names, "format"
         table.class_id = np.where(kind == NO_CLASS, PERSON, kind)

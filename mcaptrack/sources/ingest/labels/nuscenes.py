@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, headings, numbered
 
 TABLES: Final = ("scene", "sample", "sample_annotation", "instance", "category")
@@ -55,7 +55,7 @@ def tables_folder(path: Path) -> Path | None:
     return complete[0] if complete else None
 
 
-class NuScenes(LabelFormat):
+class NuScenes(Format):
     """The folder of the tables of a set; of these, a scene."""
 
     title = "nuScenes"
@@ -121,7 +121,9 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     remarks = [f"{folder}: {len(samples)} samples; tracks are numbered from 1 on, a number for each instance"]
     if unseen:
         remarks.append(f"{folder}: {unseen} of {len(boxes)} boxes have no points of lidar or radar; they stay")
-    facts = Facts(path, "nuscenes", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=FRAME)
+    facts = LabelFacts(
+        path, "nuscenes", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=FRAME
+    )
     facts.usual, facts.states_labelled = frozenset(_CLASSES), True
     facts.labelled = np.unique(np.array(list(samples.values()), np.int64))
     return BoxTable(

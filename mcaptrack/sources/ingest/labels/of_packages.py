@@ -1,4 +1,4 @@
-"""Label formats of other packages (``contracts.LabelFormat``): which file is of which, and their boxes, checked.
+"""Label formats of other packages (``contracts.Format``): which file is of which, and their boxes, checked.
 
 Letters: N rows, F frames.
 """
@@ -20,14 +20,14 @@ from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.schema.provenance import Plugin
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, numbered
 
 _KIND: Final = "label_format"
 
 
-class FormatOfPackage(LabelFormat):
+class FormatOfPackage(Format):
     """A format of another package, as the registry found it, and its object."""
 
     reads_folders = True
@@ -66,7 +66,7 @@ class FormatOfPackage(LabelFormat):
         return table
 
     def checking(self) -> AbstractContextManager[None]:
-        """What is refused in this block is of this format."""
+        """A block in which refusals are of this format."""
         return blamed(self.entry, "gave boxes that can't be labels")
 
 
@@ -86,7 +86,7 @@ def _table_of(path: Path, name: str, given: LabelBoxes, in_space: bool) -> BoxTa
     first = given.first_frame
     if isinstance(first, bool) or not isinstance(first, int | np.integer):
         raise ValueError(f"first_frame={first!r:.40}, which is no whole number")
-    facts = Facts(
+    facts = LabelFacts(
         path, name, first_frame=int(first), times_s=times_s, labelled=labelled, frame_id=str(given.frame_id),
         states_labelled=given.labelled is not None, names=names or None, numbering={} if names else None,
         named_by="file" if names else "",

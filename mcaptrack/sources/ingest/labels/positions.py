@@ -10,15 +10,16 @@ from typing import ClassVar, Final
 import numpy as np
 
 from mcaptrack.schema.classes import PERSON
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.delimited import is_table
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import read_numbers
 
 #: The label interval of files that are annotated at the sampling rate of prediction benchmarks.
 INTERVAL_S: Final = Fraction(2, 5)
 
 
-class _Positions(LabelFormat):
+class _Positions(Format):
     """Rows of numbers: a frame, a track, and others, two of which are a position."""
 
     in_parts = True
@@ -29,7 +30,7 @@ class _Positions(LabelFormat):
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""
         values, at = read_numbers(file.path, file.lines(), f"{self.title} ({self.row.strip('`')})", self.columns)
-        facts = Facts(file.path, self.name, first_frame=0, interval_s=INTERVAL_S, named_by="format")
+        facts = LabelFacts(file.path, self.name, first_frame=0, interval_s=INTERVAL_S, named_by="format")
         facts.clock_of = f"{self.name}, a label every 0.4 s"
         return BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], xy_m=values[:, self.place],
@@ -44,7 +45,7 @@ class Trajnet(_Positions):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 4 columns, and no names of columns."""
-        return len(file.cells) == self.columns
+        return len(file.cells) == self.columns and not is_table(file)
 
 
 class Obsmat(_Positions):
@@ -55,4 +56,4 @@ class Obsmat(_Positions):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 8 columns without commas."""
-        return len(file.cells) == self.columns and "," not in file.row
+        return len(file.cells) == self.columns and "," not in file.row and not is_table(file)

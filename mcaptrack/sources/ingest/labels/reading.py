@@ -20,7 +20,7 @@ from mcaptrack.registry import BUILT_IN, find
 from mcaptrack.schema.classes import ClassMap
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, check
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package, recognised
 from mcaptrack.sources.ingest.labels.roles import WantedClasses, rename, settled
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Extent
@@ -33,7 +33,7 @@ _LONG_BYTES: Final = 20_000_000
 _PART_ROWS: Final = 200_000
 
 
-def _made(name: str) -> LabelFormat:
+def _made(name: str) -> Format:
     """The format of a name. Raises McaptrackError if there is none, or if it can't be used."""
     if name in BUILT_IN["label_format"]:
         return find("label_format", name).cls()  # type: ignore[no-any-return]
@@ -42,9 +42,7 @@ def _made(name: str) -> LabelFormat:
     return made
 
 
-def known_format(
-    file: LabelFile, label_format: str = _AUTO, columns: Mapping[str, str] | None = None
-) -> LabelFormat | None:
+def known_format(file: LabelFile, label_format: str = _AUTO, columns: Mapping[str, str] | None = None) -> Format | None:
     """The format of a file: the one that is given, or by its content; None if it is of no known one.
 
     Raises McaptrackError if there is no such format, or if formats of several other packages recognise the file.
@@ -121,11 +119,11 @@ def read_labels(
     name = label_format if label_format != _AUTO else _name_of(made)
     for option in ("columns", "scene"):
         if getattr(asked, option) and option not in made.takes:
-            takers = [other for other in BUILT_IN["label_format"] if option in _made(other).takes]
-            raise McaptrackError(f"{path}: `{option}=` is for {' and '.join(takers)}, not for {name}")
+            takers = [other.title for other in map(_made, BUILT_IN["label_format"]) if option in other.takes]
+            raise McaptrackError(f"{path}: `{option}=` is for {' and '.join(takers[::-1])}, not for {name}")
     if file.is_folder and not made.reads_folders:
         raise McaptrackError(f"{path} is a folder, and {name} labels are a file")
-    is_alike = role == "detections" or (role != "truth" and (wanted is None or wanted.is_people))
+    is_alike = role == "detections" or (role in ("tracks", None) and (wanted is None or wanted.is_people))
     if in_parts and made.in_parts and is_alike and class_map is None and path.stat().st_size >= _LONG_BYTES:
         table = _read_in_parts(file, made, replace(asked, role=role or "tracks"))
         if table is not None:
@@ -133,7 +131,7 @@ def read_labels(
     return read_by(made, file, asked)
 
 
-def read_by(made: LabelFormat, file: LabelFile, asked: Asked) -> BoxTable:
+def read_by(made: Format, file: LabelFile, asked: Asked) -> BoxTable:
     """The rows of a file of a format. Raises McaptrackError as ``read_labels`` does."""
     table = made.read(file, asked)
     table.facts.found_by = "content" if asked.label_format == _AUTO else "option"
@@ -147,7 +145,7 @@ def read_by(made: LabelFormat, file: LabelFile, asked: Asked) -> BoxTable:
     return table
 
 
-def _name_of(made: LabelFormat) -> str:
+def _name_of(made: Format) -> str:
     if isinstance(made, FormatOfPackage):
         return made.entry.name
     where = f"{type(made).__module__}:{type(made).__qualname__}"
@@ -180,7 +178,7 @@ def read_homography(path: Path) -> tuple[float, ...]:
 # programs write detections and tracks. Others are in memory as a whole.
 
 
-def _read_in_parts(file: LabelFile, made: LabelFormat, asked: Asked) -> BoxTable | None:
+def _read_in_parts(file: LabelFile, made: Format, asked: Asked) -> BoxTable | None:
     """Read a label file in parts; None if it isn't sorted by frame, or if parts aren't understood alike."""
     lines, spilled, stored = lines_of(file.path), SpillFile(), list[Mapping[str, Stored]]()
     tables, extent = list[BoxTable](), Extent.of_none()
@@ -229,7 +227,8 @@ def _part(like: BoxTable, spilled: SpillFile, stored: Mapping[str, Stored]) -> B
     for name, place in stored.items():
         values = columns[name]
         columns[name] = np.frombuffer(spilled.get(place), values.dtype).reshape(-1, *values.shape[1:])
-    part = replace(like, **columns, stored=(), stored_extent=None, findings=[])
+    path = like.path
+    part = replace(like, **columns, at=lambda _: str(path), stored=(), stored_extent=None, findings=[])
     if like.has_ids:
         return part.take(np.lexsort((part.id, part.frame)))
     return part

@@ -113,7 +113,9 @@ def settled(table: BoxTable, role: Role, wanted: WantedClasses | None, may_be_em
     McaptrackError if there are none, unless it ``may_be_empty``.
     """
     class_id, classes = _class_ids(table)
-    table = replace(table, class_id=class_id, classes=classes, role=role, remarks=[*table.remarks])
+    table = replace(table, class_id=class_id, classes=classes, role=role)
+    if role == "truth" and not table.facts.scores_truth:
+        table.score = np.full(len(table.frame), np.nan)
     wanted = wanted if wanted or table.in_space else ONLY_PEOPLE
     kept = _kept(table, role, wanted)
     if not kept.any() and not may_be_empty:
@@ -124,6 +126,7 @@ def settled(table: BoxTable, role: Role, wanted: WantedClasses | None, may_be_em
     table.classes = {number: name for number, name in classes.items() if number in occurring}
     if table.facts.named_by == "format" and occurring == [PERSON]:
         table.classes = {}
+    table.counts = table.aside = None
     return table if kept.all() else table.take(kept)
 
 
@@ -177,6 +180,8 @@ def _class_ids(table: BoxTable) -> tuple[ClassIds, dict[int, str]]:
     if count := int((~stated).sum()):
         table.find(": {0} boxes without a class have class_id 0", "classes", count)
     names, places = facts.names, dict[int, int]()
+    if names is None and facts.named_by:  # all are people, as the format has it
+        return kind.astype(np.uint32), {}
     if names is not None and facts.numbering is not None and all(is_count(name, 9) for name in names.values()):
         kind = np.where(stated, np.array([*map(int, names.values())])[kind], NO_CLASS)
         names = None
@@ -228,7 +233,8 @@ def _numbered_by_name(
     the classes in ``first`` come before.
     """
     folded = {own: names[own].casefold() for own in names}
-    others = {name for name in folded.values() if name not in usual and not is_person(name) and name not in _UNNAMED}
+    mine = {folded[own] for own in used if own in folded}
+    others = {name for name in mine if name not in usual and not is_person(name) and name not in _UNNAMED}
     rank = {name.casefold() for name in first or ()}
     order = sorted(others, key=lambda name: (name not in rank, name))
     places = {name: number for number, name in enumerate(order, start=max(usual.values(), default=PERSON) + 1)}

@@ -9,8 +9,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema.classes import PERSON
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
-from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, as_boxes, check_columns, read_numbers
 
 _COLUMNS: Final = 'id xmin ymin xmax ymax frame lost occluded generated "label"'
@@ -18,7 +18,7 @@ _CLASSES: Final = {"pedestrian": PERSON, "biker": 2, "skater": 3, "cart": 4, "ca
 _FPS: Final = Fraction(30)
 
 
-class Sdd(LabelFormat):
+class Sdd(Format):
     """Annotations of the Stanford Drone Dataset."""
 
     title = "Stanford Drone"
@@ -37,7 +37,7 @@ class Sdd(LabelFormat):
             return [*map(float, parts[:9]), names.number(parts[9].strip('"'))]
 
         values, at = read_numbers(file.path, file.lines(), f"Stanford Drone annotations ({_COLUMNS})", 10, parse)
-        facts = Facts(file.path, "sdd", first_frame=0, names=names.names, numbering=_CLASSES, named_by="file")
+        facts = LabelFacts(file.path, "sdd", first_frame=0, names=names.names, numbering=_CLASSES, named_by="file")
         facts.fps, facts.clock_of, facts.labelled = _FPS, self.title, np.unique(values[:, 5])
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 5], id=values[:, 0], boxes_px=as_boxes(values[:, 1:5]),

@@ -44,8 +44,8 @@ _SHOWN: Final = 8
 
 
 @dataclass
-class Facts:
-    """What is known of a source of labels, beside its rows.
+class LabelFacts:
+    """The facts about a source of labels, beside its rows.
 
     Attributes
     ----------
@@ -89,6 +89,8 @@ class Facts:
         Whether the source says so, and it isn't concluded from the boxes.
     frame_id : str
         The frame of reference of places in metres, if the source names it.
+    scores_truth : bool
+        Ground truth has scores; otherwise the column holds something else there.
     not_counting, region : str
         What ``counts`` and ``REGION`` mean in this format, for messages.
     least_height_px : float
@@ -120,6 +122,7 @@ class Facts:
     labelled: Ints = field(default_factory=lambda: np.empty(0, np.int64))
     states_labelled: bool = False
     frame_id: str = ""
+    scores_truth: bool = True
     not_counting: str = ""
     region: str = ""
     least_height_px: float = 0.0
@@ -147,8 +150,8 @@ class Facts:
         }
 
 
-class Finding(NamedTuple):
-    """What a check says of rows: a code, and a text with places for counts, ``{0}``, ``{1}``, and for the extreme value
+class LabelFinding(NamedTuple):
+    """The finding of a check: a code, and a text with places for counts, ``{0}``, ``{1}``, and for the extreme value
     ``{most}`` and the number of all rows ``{rows}``. Findings of parts of a file are summed.
     """
 
@@ -173,7 +176,7 @@ class IgnoredBoxes:
 
 
 class Extent(NamedTuple):
-    """What is known of all rows of a file, of which not all may be in memory: values, sorted, and how many rows have
+    """Counts of all rows of a file, of which not all may be in memory: values, sorted, and how many rows have
     each; ``low`` and ``high`` (2,) are the least and the largest x and y of boxes.
     """
 
@@ -215,11 +218,11 @@ class BoxTable:
 
     Attributes
     ----------
-    facts : Facts
+    facts : LabelFacts
     at : callable
         The place of a row in messages.
     frame, id : array (N,)
-        The number of the picture, or a time (see ``Facts``); and of the track, or ``NO_ID``.
+        The number of the picture, or a time (see ``LabelFacts``); and of the track, or ``NO_ID``.
     boxes_px : float array (N, 4), optional, px
         Left, top, width, height.
     xy_m : float array (N, 2), optional, m
@@ -249,7 +252,7 @@ class BoxTable:
         The rows of a file that is too long for memory, in parts of whole frames; the table has none then.
     """
 
-    facts: Facts
+    facts: LabelFacts
     at: Callable[[int], str] = str
     frame: NDArray[Any]
     id: NDArray[Any]
@@ -266,7 +269,7 @@ class BoxTable:
     ignored: IgnoredBoxes | None = None
     left_out: str = ""
     remarks: list[str] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
+    findings: list[LabelFinding] = field(default_factory=list)
     role: Role = "detections"
     stored: Sequence[Callable[[], BoxTable]] = ()
     stored_extent: Extent | None = None
@@ -313,7 +316,7 @@ class BoxTable:
 
     @cached_property
     def extent(self) -> Extent:
-        """What is known of all rows."""
+        """Counts of all rows."""
         if self.stored_extent is not None:
             return self.stored_extent
         low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -373,13 +376,13 @@ class BoxTable:
         self.remarks.append(f"{self.path}{text}")
 
     def find(self, text: str, code: Code = "other", *counts: int, most: float = 0.0) -> None:
-        """Warn of something about the file, after its name; see ``Finding``."""
-        self.findings.append(Finding(code, text, counts, most))
+        """Warn of something about the file, after its name; see ``LabelFinding``."""
+        self.findings.append(LabelFinding(code, text, counts, most))
 
     @property
     def doubts(self) -> list[tuple[str, Code]]:
         """The findings as texts with their codes, those of parts in one."""
-        summed: dict[tuple[Code, str], Finding] = {}
+        summed: dict[tuple[Code, str], LabelFinding] = {}
         for finding in self.findings:
             before = summed.get((finding.code, finding.text))
             counts, most = finding.counts, finding.most
@@ -415,7 +418,7 @@ def refuse(at: Callable[[int], str], wrong: Any, describe: Callable[[int], str])
 
 @dataclass(frozen=True)
 class Asked:
-    """What a user says about a source of labels.
+    """The wishes of a user about a source of labels.
 
     ``role`` is what its rows are, None: tracks if they have ids; ``columns`` are names of the columns of a table by
     what they hold; ``scene`` the name of a part of a data set; ``classes`` are those of tracks and ground truth

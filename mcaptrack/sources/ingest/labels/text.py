@@ -1,4 +1,4 @@
-"""What readers of label files share: text of numbers, line by line, and names of classes, tracks and pictures.
+"""Parts of all readers of label files: text of numbers, line by line, and names of classes, tracks and pictures.
 
 Letters: N rows, C columns.
 """
@@ -22,7 +22,8 @@ from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID
 Lines = Iterator[tuple[int, str]]
 
 MAX_ROWS: Final = 10_000_000
-_MAX_LINE: Final = 4096
+#: The largest number of characters of a row of numbers.
+MAX_ROW: Final = 4096
 #: The number of characters of a line that errors show.
 _LINE_SHOWN: Final = 60
 #: The number of class names of a file, at most: there are data sets with 21,841 classes.
@@ -30,7 +31,7 @@ _MAX_NAMES: Final = 65_536
 _MAX_NAME: Final = 256
 
 
-def lines_of(path: Path, most: int = _MAX_LINE, has_comments: bool = False) -> Lines:
+def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lines:
     """The lines of a text file, of at most ``most`` characters, without empty lines and, unless they are wanted,
     comments.
 

@@ -15,9 +15,9 @@ import numpy as np
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.format import LabelFile, LabelFormat
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
-from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, Facts
+from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, numbers_of_names, read_numbers
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 
@@ -40,7 +40,7 @@ def _label_files(folder: Path) -> list[Path]:
     return []
 
 
-class Yolo(LabelFormat):
+class Yolo(Format):
     """Folders of text files."""
 
     title = "YOLO"
@@ -81,7 +81,9 @@ class Yolo(LabelFormat):
         score, track_id = _score_and_id(frame, rows, asked.role)
         if np.isfinite(rows[:, 5]).any() and not np.isfinite(rows[:, 6]).any():
             remarks.append(f"{folder}: column 6 holds {'confidences' if np.isfinite(score).any() else 'track ids'}")
-        facts = Facts(folder, "yolo", is_normalised=True, first_class=0, labelled=np.array(sorted(numbers), np.int64))
+        facts = LabelFacts(
+            folder, "yolo", is_normalised=True, first_class=0, labelled=np.array(sorted(numbers), np.int64)
+        )
         facts.states_labelled = 0 in counts  # others write no files without boxes
         table = BoxTable(
             facts=facts, at=at, frame=frame, id=track_id, score=score, class_id=rows[:, 0], remarks=remarks,
