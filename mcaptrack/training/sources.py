@@ -49,7 +49,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How label files are read, and which channel of logs and tables."""
+    """Options of label files, and the channel of logs and tables."""
 
     labels: IngestOptions = IngestOptions()
     topic: str | None = None

@@ -127,7 +127,7 @@ def _counts(labels: BoxTable) -> bool:
 
 
 def share_numbers(tables: Mapping[Role, BoxTable], log: Sequence[Numbered] = ()) -> None:
-    """Let files whose first number isn't known count frames as the files and the labels of the log beside them do.
+    """Let files that don't tell their first number count frames as the files and labels of the log beside them do.
 
     A file without a frame 0 counts from 0 if labels beside it do: a tracker may have seen nothing there. It counts from
     1 if it has as many frames as those, or is ground truth that begins with 1, as data sets do.
