@@ -7,23 +7,6 @@ from typing import Final, Literal, TypeAlias
 
 #: How pictures are stored.
 ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
-#: Formats of label files.
-LabelFormat = Literal[
-    "auto",
-    "mot",
-    "kitti",
-    "sdd",
-    "trajnet",
-    "obsmat",
-    "coco",
-    "cvat",
-    "yolo",
-    "supervision",
-    "csv",
-    "kitti-3d",
-    "nuscenes",
-    "argoverse",
-]
 #: Units of lengths in a calibration.
 LengthUnit = Literal["auto", "m", "cm", "mm"]
 #: Which point of a box touches the ground.

@@ -6,8 +6,9 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import cvat
-from mcaptrack.sources.ingest.labels.content import WantedClasses
-from mcaptrack.sources.ingest.labels.cvat import read_cvat
+from mcaptrack.sources.ingest.labels import text as texts
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
 ALL = WantedClasses("all")
 
@@ -32,7 +33,7 @@ def read(tmp_path):
     def read_one(*parts: str, meta: str = "", role: str = "tracks"):
         meta = f"<meta><task>{meta}</task></meta>" if meta else ""
         path.write_text(f"<annotations>\n{meta}{''.join(parts)}</annotations>")
-        return read_cvat(path, role, ALL)
+        return read_labels(path, "cvat", role, wanted=ALL)
 
     return read_one
 
@@ -65,10 +66,10 @@ def test_frames_and_classes_have_limits(read, monkeypatch):
     assert len(read(track(box(0), box(5))).id) == 6
     refused(read, "5 boxes would be interpolated; at most 5 are", track(box(0), box(6)))
     assert len(read(track(box(0, more='outside="1"'), box(60))).id) == 1
-    monkeypatch.setattr(cvat, "_MAX_CLASSES", 2)
+    monkeypatch.setattr(texts, "_MAX_NAMES", 2)
     named = read(*(track(box(0), label=label) for label in ("a", " b  c ", "b c")))
     assert named.classes == {2: "a", 3: "b c"}
-    refused(read, "more than 2 labels", *[track(box(0), label=name) for name in "abc"])
+    refused(read, "more than 2 names", *[track(box(0), label=name) for name in "abc"])
     monkeypatch.setattr(cvat, "_MAX_DEPTH", 5)
     assert len(read(track(box(0, inner="<a><b></b></a>"))).id) == 1
     refused(read, ":3: nested deeper than annotations of CVAT are", track(box(0, inner="<a><b><c/></b></a>")))
@@ -127,7 +128,7 @@ def test_frames_of_a_task(read, meta, boxes, frames, labelled):
 def test_ids_of_tracks(read):
     numbered = [track(box(0), more=f'id="{n}"') for n in (7, 0, 3)]
     found = read(*numbered)
-    assert (found.id.tolist(), found.made_ids) == ([7, 0, 3], None)
+    assert (found.id.tolist(), found.facts.made_ids) == ([0, 3, 7], None)
     twice = read(*numbered, track(box(1), more='id="7"'))
     assert (twice.id.tolist(), twice.frame.tolist()) == ([0, 1, 2, 3], [0, 0, 0, 1])
     assert any("ids of tracks occur twice; its tracks are counted from 0" in one for one in twice.remarks)
@@ -138,7 +139,7 @@ def test_ids_of_tracks(read):
     found = read(*stated, track(box(0, inner=own(50))), track(box(9)))
     rows = sorted(zip(found.id.tolist(), found.frame.tolist(), strict=True))
     assert rows == [(40, 0), (40, 1), (50, 0), (51, 0), (52, 0), (52, 1), (53, 0), (54, 9)]
-    assert found.made_ids.tolist() == [51, 52, 53, 54]
+    assert found.facts.made_ids.tolist() == [51, 52, 53, 54]
     assert any("several tracks state one track_id (40): 3 of them get new ids" in one for one in found.remarks)
     assert any("1 tracks state no track_id and get new ids" in one for one in found.remarks)
     changed = read(track(box(0, inner=own(4)), box(1, inner=own(5)), box(2, inner=own(4)), box(3, inner=own(""))))

@@ -20,8 +20,8 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import find
 from mcaptrack.schema import TRACKS
-from mcaptrack.sources.ingest.labels.content import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.tables.exchange import _FORMATS
 from mcaptrack.tables.exchange.boxes import ExportedBoxes
 from mcaptrack.tables.exchange.cvat import KEYFRAME_PX, describe_classes
@@ -283,7 +283,7 @@ def test_coco_of_polygons_and_of_numbers_with_a_point(tmp_path):
     images = [{"id": 1, "file_name": "0.jpg"}, {"id": 2, "file_name": "1.jpg"}]
     shape = {"image_id": 2.0, "category_id": 1.0, "segmentation": [[5, 7, 9, 7, 9, 20], [4, 8, 5, 8, 5, 9]]}
     content = {"images": images, "annotations": [shape], "categories": [{"id": 1, "name": "person"}]}
-    labels = read(tmp_path, json.dumps(content), "a.json")
+    labels = read(tmp_path, json.dumps(content), "a.json", role="detections")
     assert (labels.frame.tolist(), labels.boxes_px.tolist()) == ([1], [[4, 7, 5, 13]])
     assert any("1 boxes are those around polygons" in words for words in labels.remarks)
     shape["segmentation"] = {"counts": "abc", "size": [80, 100]}

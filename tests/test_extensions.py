@@ -22,7 +22,7 @@ from mcap.writer import Writer
 import mcaptrack
 from mcaptrack import log, testing
 from mcaptrack.api.declared import declared
-from mcaptrack.choices import BagFormat, ExchangeFormat, LabelFormat, TableFormat
+from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
 from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS
@@ -114,7 +114,6 @@ def test_every_kind_stands_on_the_page_with_an_example_of_at_most_40_lines():
 def test_the_names_of_options_are_those_of_the_registry():
     from typing import get_args
 
-    assert get_args(LabelFormat) == ("auto", *BUILT_IN["label_format"])
     exporters = (*get_args(TableFormat), *get_args(BagFormat), *get_args(ExchangeFormat))
     assert exporters == tuple(BUILT_IN["exporter"])
     assert set(BUILT_IN["command"]) == set(__import__("mcaptrack.cli.group", fromlist=["ENTRIES"]).ENTRIES)

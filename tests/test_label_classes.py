@@ -10,8 +10,8 @@ import pytest
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels.content import WantedClasses
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
 MOT = "".join(f"{t},{who},{10 * who},20,30,60,{flag},{kind},1\n" for t in (1, 2)
               for who, flag, kind in ((1, 1, 1), (2, 0, 3), (3, 0, 4), (4, 0, 1)))  # fmt: skip
@@ -139,17 +139,16 @@ def test_classes_of_the_motchallenge_that_are_scored_forgiven_or_false(tmp_path)
     (tmp_path / "a.txt").write_text("".join(rows))
     truth = read_labels(tmp_path / "a.txt", "mot", "truth", wanted=WantedClasses("person"))
     assert (truth.id.tolist(), truth.class_id.tolist(), truth.classes) == ([1], [1], {})
-    assert truth.left_out == "13 boxes that don't count (score 0 or a class but 1)"
+    assert truth.left_out.endswith(", 4 of other classes and 1 boxes that don't count (score 0)")
     assert truth.ignored.boxes_px[:, 0].tolist() == [*range(20, 140, 10), 5]
     assert np.flatnonzero(truth.ignored.forgiven).tolist() == [n - 2 for n in (2, 7, 8, 12)]
     assert not truth.ignored.region.any()
     every = read_labels(tmp_path / "a.txt", "mot", "truth", wanted=WantedClasses("all"))
     assert (every.id.tolist(), every.class_id.tolist()) == (list(range(1, 14)), list(range(1, 14)))
     assert every.classes == dict(enumerate(MOT_NAMES, start=1))
-    assert every.left_out == "1 boxes of other classes (column 8), or with a score of 0"
+    assert every.left_out == "1 boxes that don't count (score 0)"
     tracks = read_labels(tmp_path / "a.txt", "mot", "tracks", wanted=WantedClasses("person"))
-    assert (len(tracks.id), set(tracks.class_id.tolist())) == (14, {1})
-    assert tracks.left_out == "the classes of 12 boxes that aren't people (column 8)"
+    assert (tracks.id.tolist(), set(tracks.class_id.tolist())) == ([1, 14], {1})
 
 
 def test_people_of_kitti_that_are_hidden_or_cut_off_are_ignored_if_all_classes_count(tmp_path):
@@ -161,7 +160,10 @@ def test_people_of_kitti_that_are_hidden_or_cut_off_are_ignored_if_all_classes_c
         )
     ))  # fmt: skip
     every = read_labels(tmp_path / "a.txt", "kitti", "truth", wanted=WantedClasses("all"))
-    assert (every.id.tolist(), every.left_out) == ([10, 50], "1 DontCare and 2 boxes, hidden or cut off")
+    assert (every.id.tolist(), every.left_out) == (
+        [10, 50],
+        "1 regions (DontCare) and 2 boxes that don't count (hidden or cut off)",
+    )
     assert every.ignored.boxes_px[:, 0].tolist() == [20, 30, 60]
 
 

@@ -14,9 +14,11 @@ from hypothesis import strategies as st
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
-from mcaptrack.sources.ingest.labels import content, formats
-from mcaptrack.sources.ingest.labels.content import Labels, WantedClasses
+from mcaptrack.registry import BUILT_IN
+from mcaptrack.sources.ingest.labels import text as texts
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
+from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.timeline import Timeline, count_frames
 
 NAN = float("nan")
@@ -62,49 +64,48 @@ class Read(NamedTuple):
     ignored: tuple[list[Any], ...] | None = None
 
 
-NO_BOXES: tuple[list[Any], ...] = ([], [], [], [])
 #: Text, format that is detected, role, and what is read, sorted by frame and id.
 FILES: dict[str, tuple[str, str, str, Read]] = {
     "mot truth": (MOT, "mot", "truth", Read(
         [1, 3, 5], [1, 2, 6], [MOT_BOXES[k] for k in (1, 0, 5)], [NAN] * 3, [1, 2, 3, 4, 5], [1] * 3, {},
-        "3 boxes that don't count (score 0 or a class but 1)",
+        "1 static person, 1 car and 1 boxes that don't count (score 0)",
         ([3, 2, 4], [MOT_BOXES[k] for k in (2, 3, 4)], [True, False, False], [False] * 3))),
     "mot tracks": (MOT, "mot", "tracks", Read(
-        [1, 2, 3, 3, 4, 5], [1, 4, 1, 2, 5, 6], [MOT_BOXES[k] for k in (1, 3, 2, 0, 4, 5)], [0.25, 0.0, 1.0, 0.5, 1.0, 1.0],
-        [1, 2, 3, 4, 5], [1] * 6, {}, "the classes of 2 boxes that aren't people (column 8)", NO_BOXES)),
+        [1, 2, 3, 5], [1, 4, 2, 6], [MOT_BOXES[k] for k in (1, 3, 0, 5)], [0.25, 0.0, 0.5, 1.0],
+        [1, 2, 3, 4, 5], [1] * 4, {}, "1 static person, 1 car")),
     "mot detections": (MOT, "mot", "detections", Read(
         [1, 2, 3, 3, 4, 5], [1, 4, 1, 2, 5, 6], [MOT_BOXES[k] for k in (1, 3, 2, 0, 4, 5)], [0.25, 0.0, 1.0, 0.5, 1.0, 1.0],
-        [1, 2, 3, 4, 5], [1, 1, 7, 1, 3, 1], {}, "", NO_BOXES)),
+        [1, 2, 3, 4, 5], [1, 1, 7, 1, 3, 1], {1: "pedestrian", 3: "car", 7: "static person"})),
     "mot without classes": ("2,-1,1,2,3,4\n1,-1,5,6,7,8\n1,-1,4,4,4,4\n", "mot", "detections", Read(
         [1, 1, 2], [-1] * 3, [[5, 6, 7, 8], [4] * 4, [1, 2, 3, 4]], [NAN] * 3, [1, 2], [1] * 3)),
     "mot of ten columns": ("2,1,1,2,3,4,0.5,7,8,9\n", "mot", "truth", Read([2], [1], [[1, 2, 3, 4]], [NAN], [2], [1])),
     "kitti truth": (KITTI, "kitti", "truth", Read(
         [0, 2], [2, 1], [KITTI_BOXES[k] for k in (1, 0)], [NAN, 0.5], [0, 1, 2, 3, 4], [1, 1], {1: "Pedestrian"},
-        "1 Car, 1 DontCare, 1 Person_sitting, 1 Person, 1 Tricycle and 2 Pedestrian, hidden or cut off",
+        "2 Person_sitting, 1 Car, 1 Tricycle and 1 regions (DontCare) and 2 boxes that don't count (hidden or cut off)",
         ([0, 1, 1, 3, 3], [KITTI_BOXES[k] for k in (2, 3, 5, 6, 7)], [True, True, False, True, True],
          [False, False, True, False, False]))),
     "kitti tracks": (KITTI, "kitti", "tracks", Read(
         [0, 0, 1, 2], [2, 3, 4, 1], [KITTI_BOXES[k] for k in (1, 2, 3, 0)], [NAN, NAN, NAN, 0.5], [0, 1, 2, 3, 4], [1] * 4,
-        {1: "Pedestrian"}, "1 Car, 1 DontCare, 1 Person_sitting, 1 Person, 1 Tricycle")),
+        {1: "Pedestrian"}, "2 Person_sitting, 1 Car, 1 Tricycle and 1 regions (DontCare)")),
     "kitti detections": (KITTI, "kitti", "detections", Read(
         [0, 0, 1, 1, 2, 3, 3, 4], [2, 3, 4, 5, 1, 6, 7, 8], [KITTI_BOXES[k] for k in (1, 2, 3, 4, 0, 6, 7, 8)],
         [NAN, NAN, NAN, NAN, 0.5, NAN, NAN, NAN], [0, 1, 2, 3, 4], [1, 1, 1, 3, 1, 7, 7, 10],
-        {1: "Pedestrian", 3: "Car", 7: "Person", 10: "Tricycle"}, "1 DontCare")),
+        {1: "Pedestrian", 3: "Car", 7: "Person_sitting", 10: "Tricycle"}, "1 regions (DontCare)")),
     "sdd tracks": (SDD, "sdd", "tracks", Read(
         [1, 3], [1, 1], [[11, 20, 5, 9], [10, 20, 4, 8]], [NAN] * 2, [1, 2, 3, 4], [1, 1], {1: "Pedestrian"},
-        "1 Biker, 1 Scooter and 2 boxes out of sight (lost)")),
+        "2 boxes out of sight (lost) and 1 Biker, 1 Scooter")),
     "sdd detections": (SDD, "sdd", "detections", Read(
         [1, 1, 3, 4], [1, 2, 1, 5], [[11, 20, 5, 9], [1, 1, 8, 8], [10, 20, 4, 8], [5, 6, 4, 3]], [NAN] * 4, [1, 2, 3, 4],
         [1, 2, 1, 7], {1: "Pedestrian", 2: "Biker", 7: "Scooter"}, "2 boxes out of sight (lost)")),
 }  # fmt: skip
 
 
-def test_a_class_of_mot_that_no_row_can_have_is_taken_as_people(tmp_path):
+def test_a_class_of_mot_that_no_row_can_have_is_none(tmp_path):
     kinds = (2**31 - 1, 2**31, -1, 3)
     path = written(tmp_path / "a.txt", "".join(f"{n},{n},1,2,3,4,1,{kind}\n" for n, kind in enumerate(kinds, start=1)))
     labels = read_labels(path, "mot", "tracks", wanted=WantedClasses("all"))
-    assert labels.class_id.tolist() == [2**31 - 1, 1, 1, 3]
-    assert labels.classes == {1: "pedestrian", 3: "car"}
+    assert labels.class_id.tolist() == [2**31 - 1, 0, 0, 3]
+    assert [code for _, code in labels.doubts] == ["classes"] * 2
 
 
 @pytest.mark.parametrize(("text", "name", "role", "wanted"), FILES.values(), ids=FILES)
@@ -136,6 +137,8 @@ def written(path: Path, text: str) -> Path:
     return path
 
 
+#: All formats.
+FORMATS = ", ".join(BUILT_IN["label_format"])
 #: The first row of a file, and what it is taken for; None for no format.
 GUESSES = {
     "1,1,1,1,1": None,
@@ -166,10 +169,9 @@ def test_a_format_is_told_by_the_first_row(row, name, tmp_path):
         assert read_labels(path, role="detections").format == name
         return
     count = len(row.replace(",", " ").split())
-    formats = "mot, kitti, sdd, trajnet, obsmat, coco, cvat, yolo, supervision, csv"
     with pytest.raises(McaptrackError) as error:
         read_labels(path)
-    assert str(error.value) == f"{path}:3: a row of {count} columns fits no label format ({formats}): {row[:60]}"
+    assert str(error.value) == f"{path}:3: a row of {count} columns fits no label format ({FORMATS}): {row[:60]}"
 
 
 #: What is refused, with the text of the file and the words after its name.
@@ -181,16 +183,15 @@ REFUSED = {
     "another format": ("trajnet", "truth", ",".join("1" * 10), ":1: not TrajNet (frame id x y), 10 columns: 1,1,1,1,1,1,1,1,1,1"),
     "nothing": ("auto", "truth", "\n\n", None),
     "sixteen of kitti": ("kitti", "truth", "1 1 Car" + 13 * " 1", None),
-    "no class": ("mot", "truth", "1,1,1,1,1,1,1,0\n1,2,1,1,1,1,1,0\n", ": the class of all 2 boxes (column 8) is 0; pedestrians are 1 there since MOT16, and -1 or no column 8 means that there are no classes"),
-    "none count": ("mot", "truth", "1,1,1,1,1,1,1,3\n1,2,1,1,1,1,0,1\n", ": all 2 boxes are marked as not counting (score 0 or a class but 1)"),
+    "none count": ("mot", "truth", "1,1,1,1,1,1,1,3\n1,2,1,1,1,1,0,1\n", " holds no people, only 1 car and 1 boxes that don't count (score 0); `classes=` takes others"),
     "height": ("mot", "truth", "1,1,1,1,1,-3\n", ":1: a box can't be 1 wide and -3 high"),
-    "cars": ("kitti", "tracks", KITTI.splitlines()[4], " holds no pedestrians, only 1 Car"),
-    "regions": ("kitti", "detections", KITTI.splitlines()[5], " holds no boxes, only 1 DontCare"),
-    "bikers": ("sdd", "tracks", SDD.splitlines()[2] + "\n" + SDD.splitlines()[4], " holds no pedestrians, only 1 Biker, 1 Pedestrian"),
-    "lost": ("sdd", "detections", SDD.splitlines()[3], " holds no boxes in sight, only 1 Biker"),
-    "ids": ("trajnet", "tracks", "4 1 1 1\n2 7 1 1\n2 8 1 1\n2 7 1 1\n", ": id 7 appears twice in frame 2"),
-    "json": ("auto", "tracks", ' \n{"a": 1}', " is JSON (an object with a), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"),
-    "coco": ("auto", "tracks", '[{"image_id": 1}]', " is JSON (a list of image_id), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"),
+    "cars": ("kitti", "tracks", KITTI.splitlines()[4], " holds no people, only 1 Car; `classes=` takes others"),
+    "regions": ("kitti", "detections", KITTI.splitlines()[5], " holds no such boxes, only 1 regions (DontCare)"),
+    "bikers": ("sdd", "tracks", SDD.splitlines()[2], " holds no people, only 1 Biker; `classes=` takes others"),
+    "lost": ("sdd", "detections", SDD.splitlines()[3], " holds no boxes in sight, only 1 boxes out of sight (lost)"),
+    "ids": ("trajnet", "tracks", "4 1 1 1\n2 7 1 1\n2 8 1 1\n2 7 1 1\n", ":4: id 7 appears twice in frame 2"),
+    "json": ("auto", "tracks", ' \n{"a": 1}', f" is JSON (an object with a) of no label format ({FORMATS})"),
+    "coco": ("auto", "tracks", '[{"image_id": 1}]', f" is JSON (a list with image_id) of no label format ({FORMATS})"),
     "xml": ("auto", "tracks", '\ufeff<a "images">', ":1: not valid XML: not well-formed (invalid token)"),
     "a long line": ("mot", "tracks", "1,1,1,1,1,1\n" + "1," * 2048 + "1", ":2: a line of more than 4096 characters is no row"),
 }  # fmt: skip
@@ -212,7 +213,7 @@ def test_a_line_of_4096_characters_is_read_and_ids_may_repeat_in_detections(tmp_
 
 
 def test_a_table_is_no_longer_than_its_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(content, "_MAX_ROWS", 2)
+    monkeypatch.setattr(texts, "MAX_ROWS", 2)
     path = written(tmp_path / "a.txt", "1 1 1 1\n2 1 1 1\n")
     assert len(read_labels(path).frame) == 2
     with pytest.raises(McaptrackError, match="has more than 2 rows; give it in parts"):
@@ -225,8 +226,8 @@ def test_a_column_of_classes_has_a_limit_of_names(tmp_path, monkeypatch):
     path = written(tmp_path / "a.txt", "\n".join(rows))
     labels = read_labels(path, role="detections")
     assert sorted(labels.classes) == list(range(7, 263))
-    assert formats._MAX_NAMES >= 21_841
-    monkeypatch.setattr(formats, "_MAX_NAMES", 256)
+    assert texts._MAX_NAMES >= 21_841
+    monkeypatch.setattr(texts, "_MAX_NAMES", 256)
     assert len(read_labels(path, role="detections").classes) == 256
     with pytest.raises(McaptrackError, match=r":261: .*the column of classes has more than 256 names"):
         read_labels(written(path, "\n".join([*rows, '1 1 1 2 2 0 0 0 0 "another"'])), role="detections")
@@ -269,7 +270,7 @@ def test_a_homography_says_how_many_numbers_it_found(text, shape, tmp_path):
 # Frames and pictures
 
 
-def labels_of(frames: list[int], tmp_path: Path, first: int | None = None) -> tuple[Path, Labels]:
+def labels_of(frames: list[int], tmp_path: Path, first: int | None = None) -> tuple[Path, BoxTable]:
     path = written(tmp_path / "a.txt", "".join(f"{n},1,1,1,1,1\n" for n in frames))
     return path, read_labels(path, "mot", first_frame=first)
 
@@ -313,7 +314,7 @@ def test_labels_are_put_to_the_pictures_with_their_number(index, frames, first, 
     path, labels = labels_of(frames, tmp_path, first)
     lost: list[str] = []
     with notices.listening(lambda _: None), notices.collected() as warned:
-        placed = timeline(index, **more).place(labels, lost)
+        placed = timeline(index, **more).place(labels, "tracks", lost)
     assert list(zip(placed.index.tolist(), placed.number.tolist(), strict=True)) == wanted
     assert placed.t_ns.tolist() == [10 * at for at, _ in wanted]
     assert lost == [f"{path}: {words}" for words in said]
@@ -325,7 +326,7 @@ def test_labels_are_put_to_the_pictures_with_their_number(index, frames, first, 
 def test_one_label_of_the_first_picture_counts_in_no_way(tmp_path):
     _, labels = labels_of([1], tmp_path)
     with notices.listening(lambda _: None), notices.collected() as warned:
-        placed = timeline([0, 1], every=3).place(labels, [])
+        placed = timeline([0, 1], every=3).place(labels, "tracks", [])
     assert (placed.number.tolist(), warned) == ([1, 4], [])
 
 
@@ -346,7 +347,7 @@ NOT_PLACED: dict[str, tuple[list[int], int | None, dict[str, Any], str]] = {
 def test_labels_without_a_picture_say_what_to_do(frames, first, more, words, tmp_path):
     path, labels = labels_of(frames, tmp_path, first)
     with pytest.raises(McaptrackError) as error:
-        timeline([0, 1, 2], **more).place(labels, [])
+        timeline([0, 1, 2], **more).place(labels, "tracks", [])
     assert str(error.value) == f"{path}: {words}"
 
 

@@ -367,7 +367,7 @@ def test_boxes_of_argoverse_without_a_category_have_no_class(tmp_path):
     result, found, metadata = ingested(path)
     assert "None" not in metadata["mcaptrack.classes"]
     assert (found.rows["class_id"] == 0).tolist() == [False, True, False, True, False]
-    assert "2 of 5 boxes have no category: their class is unknown" in " ".join(one.message for one in result.warnings)
+    assert "2 boxes without a class have class_id 0" in " ".join(one.message for one in result.warnings)
     boxes["track_uuid"][3] = None
     feather.write_feather(pa.table(boxes), path)
     with pytest.raises(McaptrackError, match="row 4 has no track_uuid"):

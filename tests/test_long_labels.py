@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels import reading
-from mcaptrack.sources.ingest.labels.content import Labels
-from mcaptrack.sources.ingest.labels.reading import LongLabels, read_labels
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
 read_labels_of_any_length = partial(read_labels, in_parts=True)
 
@@ -42,7 +42,7 @@ def lines(frames: list[int], ids: list[int], kind: int = 1) -> str:
 @pytest.mark.parametrize("role", ["detections", "tracks"])
 def test_a_log_of_parts_is_that_of_the_whole_file(tmp_path, in_parts, rows, role):
     frames, ids = [2, 2, 3, 3, 3, 3, 3, 7, 8, 8], [4, 2, 3, 1, 2, 9, 4, 1, 2, 1]
-    (tmp_path / "a.txt").write_text(lines(frames, ids, kind=3))
+    (tmp_path / "a.txt").write_text(lines(frames, ids, kind=3 if role == "detections" else 1))
     given = {"role": role, "fps": 5, "frames": 12}
     whole = mcaptrack.ingest(tmp_path / "a.txt", tmp_path / "whole.mcap", **given)
     in_parts(rows)
@@ -74,7 +74,7 @@ def test_parts_together_are_the_whole_file(tmp_path_factory, frames, rows, name,
         patch.setattr(reading, "_LONG_BYTES", 0)
         patch.setattr(reading, "_PART_ROWS", rows)
         long = read_labels_of_any_length(path, role=role, first_frame=first_frame)
-    assert isinstance(long, LongLabels)
+    assert long.stored
     parts = [part() for part in long.parts]
     for column in ("frame", "id", "boxes_px", "xy_m", "score", "class_id"):
         wanted = getattr(whole, column)
@@ -85,26 +85,23 @@ def test_parts_together_are_the_whole_file(tmp_path_factory, frames, rows, name,
             np.testing.assert_array_equal(np.concatenate(found), wanted)
             assert found[0].dtype == wanted.dtype
     assert all(one.frame[-1] < other.frame[0] for one, other in pairwise(parts))
-    for counts in ("frame_counts", "class_counts"):
-        for one, other in zip(getattr(long, counts)(), getattr(whole, counts)(), strict=True):
-            np.testing.assert_array_equal(one, other)
-    for about in ("format", "first_frame", "has_ids", "has_boxes", "step", "left_out", "remarks", "doubts", "times_s"):
+    for one, other in zip(long.extent, whole.extent, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for about in ("format", "first_frame", "has_ids", "step", "left_out", "remarks", "doubts", "times_s"):
         assert getattr(long, about) == getattr(whole, about), about
     np.testing.assert_array_equal(long.labelled, whole.labelled)
-    if whole.has_boxes:
-        np.testing.assert_array_equal(long.corner_px(), whole.corner_px())
 
 
 def test_short_files_are_in_memory(tmp_path):
     (tmp_path / "a.txt").write_text(lines([1, 2], [1, 1]))
-    assert type(read_labels_of_any_length(tmp_path / "a.txt")) is Labels
+    assert not read_labels_of_any_length(tmp_path / "a.txt").stored
 
 
 def test_rows_that_are_not_in_the_order_of_frames_are_read_as_a_whole(tmp_path, in_parts):
     (tmp_path / "a.txt").write_text(lines([1, 2, 5, 6, 4, 7], [1] * 6))
     in_parts(2)
     labels = read_labels_of_any_length(tmp_path / "a.txt")
-    assert type(labels) is Labels
+    assert not labels.stored
     assert labels.frame.tolist() == [1, 2, 4, 5, 6, 7]
 
 
@@ -128,5 +125,5 @@ def test_errors_name_the_line_of_the_file(tmp_path, in_parts, text, words):
 def test_what_depends_on_all_rows_is_read_as_a_whole(tmp_path, in_parts, role, classes):
     (tmp_path / "a.txt").write_text(lines([1, 2, 3], [1, 1, 1]))
     in_parts(1)
-    wanted = reading.WantedClasses(classes)
-    assert type(read_labels_of_any_length(tmp_path / "a.txt", role=role, wanted=wanted)) is Labels
+    wanted = WantedClasses(classes)
+    assert not read_labels_of_any_length(tmp_path / "a.txt", role=role, wanted=wanted).stored

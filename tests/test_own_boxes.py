@@ -180,14 +180,14 @@ BAD = {
     "a decimal comma": (f'{HEAD}\n1,2,"3,5",3,4\n', "'3,5', which is no number; decimal commas are read"),
     "a header twice": ("frame,x,x,y,w,h\n1,1,1,2,3,4\n", "several columns are named x; its columns are frame, x, x, y"),
     "a header of blanks": ("frame x y w h\n1 1 2 3 4\n", "fits no label format|separated by commas, semicolons or tabs"),
-    "an empty object": ("{}", "an object with nothing"),
+    "an empty object": ("{}", "an object\\) of no label format"),
     "an image without a number": ('[{"image_id":"","bbox":[1,2,3,4]}]', "result 0 has a wrong image_id: .* without a num"),
     "not a number": (f"{HEAD}\n1,2,nan,3,4\n", "a:2: a number of the box is missing or not finite"),
     "infinite": (f"{HEAD}\n1,2,3,4,1e999\n", "a:2: a number of the box is missing"),
     "two sequences": (f"{HEAD}\na_1.jpg,2,3,4,1\nb_1.jpg,2,3,4,1\n", "names of several sequences"),
     "a header alone": (f"{HEAD}\n", "holds no boxes"),
     "one id twice": (f"{HEAD},track_id\n1,2,3,4,5,6\n1,2,3,4,5,6\n", "id 6 appears twice in frame 1"),
-    "other JSON": ('{"a": 1}', "neither annotations .* nor results"),
+    "other JSON": ('{"a": 1}', "an object with a\\) of no label format"),
     "broken JSON": ("[1,", "is not valid JSON"),
     "deep JSON": ("[" * 100_000, "is nested deeper|is not valid JSON"),
     "a number of 5000 digits": ('[{"image_id":1,"bbox":[1,1,1,' + "9" * 5000 + "]}]", "not valid JSON"),
@@ -225,7 +225,7 @@ def test_ids_that_are_texts_are_numbered_as_they_come(kind, tmp_path):
 
 
 def test_more_texts_than_ids_can_be_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("mcaptrack.sources.ingest.labels.content._MAX_TEXTS", 2)
+    monkeypatch.setattr("mcaptrack.sources.ingest.labels.text._MAX_TEXTS", 2)
     path = written(tmp_path, "i.csv", f"{HEAD},id\n" + "".join(f"{k},1,2,3,4,t{k}\n" for k in range(3)))
     with pytest.raises(McaptrackError, match=r"i\.csv:4: .*the column of ids has more than 2 texts"):
         read_labels(path)

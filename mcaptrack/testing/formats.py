@@ -24,8 +24,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.registry import Entry, Kind, in_words
 from mcaptrack.sources.foreign.boxes import checked_boxes, checked_message_3d
-from mcaptrack.sources.ingest.labels.content import WantedClasses
+from mcaptrack.sources.ingest.labels.format import LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage
+from mcaptrack.sources.ingest.labels.reading import read_by
+from mcaptrack.sources.ingest.labels.table import COLUMNS, Asked
 from mcaptrack.testing.transforms import LawError, same_process
 
 #: What a label format may raise for a file that isn't of it.
@@ -68,7 +70,8 @@ def check_label_format(label_format: LabelFormat, path: PathLike) -> None:
     >>> check_label_format(Corners(), "a.corners")
     """
     entry = _entry("label_format", label_format, "read")
-    made = FormatOfPackage(entry, label_format, _in_space(entry, label_format))
+    _in_space(entry, label_format)
+    made = FormatOfPackage(entry, label_format)
     file = as_path(path).absolute()
     with same_process(entry.name), TemporaryDirectory() as folder:
         before = _content(file)
@@ -94,14 +97,10 @@ def _labels(made: FormatOfPackage, path: Path, law: str) -> list[Any]:
     """The boxes of a file as labels, as values that can be compared."""
     try:
         with collected():
-            rows: Any = (
-                made.rows_3d(path, "detections")
-                if made.in_space
-                else made.labels(path, "detections", WantedClasses("all"))
-            )
+            rows = read_by(made, LabelFile(path), Asked(made.entry.name, "detections"))
     except McaptrackError as error:
         raise LawError(f"{law}: {error}") from None
-    columns = [getattr(rows, name) for name in rows.COLUMNS]
+    columns = [getattr(rows, name) for name in COLUMNS]
     return [None if column is None else np.asarray(column).tobytes() for column in (*columns, rows.labelled)]
 
 
@@ -121,10 +120,10 @@ def _damaged(path: Path, folder: Path) -> list[tuple[str, Path]]:
 
 
 def _check_recognition(made: FormatOfPackage, path: Path, others: Iterable[Path]) -> None:
-    if not hasattr(made.format, "recognises"):
+    if not made.recognises_any:
         return
     try:
-        answers = [made.recognises(file) for file in (path, *others, path)]
+        answers = [made.recognises(LabelFile(file)) for file in (path, *others, path)]
     except McaptrackError as error:
         raise LawError(f"recognises: {error}") from None
     if not (answers[0] and answers[-1]):

@@ -41,10 +41,9 @@ from mcaptrack.sources.ingest.job import (
     Progress,
 )
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
-from mcaptrack.sources.ingest.labels.content import Format
-from mcaptrack.sources.ingest.labels.cvat import is_cvat
-from mcaptrack.sources.ingest.labels.of_packages import format_of_package
-from mcaptrack.sources.ingest.labels.reading import chosen_format, is_3d
+from mcaptrack.sources.ingest.labels.format import LabelFile
+from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package
+from mcaptrack.sources.ingest.labels.reading import known_format
 from mcaptrack.sources.ingest.labels.timeline import (
     Timeline,
     boxes_extent,
@@ -55,12 +54,11 @@ from mcaptrack.sources.ingest.labels.timeline import (
     picture_size,
     timeline_of,
 )
-from mcaptrack.sources.ingest.labels.yolo import is_label_folder
 from mcaptrack.sources.pictures import size_of
 from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import IMAGE_SUFFIXES, EncodedPicture, Video, open_video
 
-__all__ = ["Format", "IngestOptions", "IngestReport", "ingest", "label_frames"]
+__all__ = ["IngestOptions", "IngestReport", "ingest", "label_frames"]
 
 VIDEO_SUFFIXES: Final = (
     ".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".ts", ".h264", ".264", ".mpg", ".mpeg", ".h265", ".265", ".hevc",
@@ -246,9 +244,9 @@ def _warn_unused(job: IngestJob, options: IngestOptions) -> None:
     is_calibrated = bool(options.calibration) or any(topic.endswith(f"/{CALIBRATION}") for topic in job.report.messages)
     is_sized = bool(job.options.calibration) and not job.pictures
     uses: dict[str, tuple[object, *tuple[str, ...]]] = {
-        "there is no label file": (job.has_labels, "label_format", "columns"),
-        "no label file is of a detector's format": (
-            is_sized or not all(labels.is_of_data_set for labels in job.labels.values()), "size",
+        "there is no label file": (job.has_labels, "label_format", "columns", "frame_ranges", "class_map"),
+        "no label file has boxes in pictures": (
+            is_sized or any(labels.boxes_px is not None for labels in job.labels.values()), "size",
         ),
         "there are no tracks and no ground truth": (job.roles - {"detections"}, "classes"),
         "there are no 3D boxes": (isinstance(job, Boxes3DJob), "frame_id"),
@@ -578,20 +576,19 @@ def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log
     role = options.role
     if role == "calibration" or (role is None and is_calibration(source)):
         return CalibrationJob(source, options, into)
-    label_format = chosen_format(source, options.label_format, options.columns)
-    if role != MOTION and is_3d(source, label_format, options.columns):
-        return Boxes3DJob([(role, source)], options, into)
-    of_package = format_of_package(label_format)
-    is_text = of_package is not None and not _is_video(source)  # or bytes, as its format has it
-    if role != MOTION and of_package and is_text and (not source.is_dir() or role or of_package.recognises(source)):
-        return LabelJob([(role, source)], options, into)
-    if source.is_dir() and role != MOTION and (role or is_label_folder(source)):
-        return LabelJob([(role, source)], options, into)
-    is_zip = role != MOTION and source.suffix.lower() == ".zip" and is_cvat(source)
-    if source.is_dir() or _is_video(source) or (not is_zip and _is_binary(source)):
-        return VideoJob(source, options, progress, into)
+    file, columns = LabelFile(source), options.columns or {}
     if role == MOTION:
-        return MotionJob(source, options, into)
+        is_text = not (file.is_folder or _is_video(source) or _is_binary(source))
+        return MotionJob(source, options, into) if is_text else VideoJob(source, options, progress, into)
+    form = known_format(file, options.label_format, columns)
+    if form is not None and form.holds_3d(file, columns):
+        return Boxes3DJob([(role, source)], options, into)
+    is_foreign = isinstance(form, FormatOfPackage) and not file.is_folder  # bytes may be labels, as its format has it
+    is_labels = form is not None and (is_foreign or form.recognises(file))
+    if (is_labels and not _is_video(source)) or (file.is_folder and role):
+        return LabelJob([(role, source)], options, into)
+    if file.is_folder or _is_video(source) or _is_binary(source):
+        return VideoJob(source, options, progress, into)
     return LabelJob([(role, source)], options, into)
 
 

@@ -5,9 +5,9 @@ Letters: N rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Set
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
@@ -21,10 +21,10 @@ from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.camera_path import Verdict, poses_of
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.notices import Notice, warn
+from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
 from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
-from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
+from mcaptrack.schema.classes import ClassMap, classes_beside_rows, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
@@ -32,17 +32,12 @@ from mcaptrack.sources.calibrations import is_rectified_topic
 from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
-from mcaptrack.sources.ingest.labels.content import (
-    ONLY_PEOPLE,
-    BoxTable,
-    Format,
-    Labels,
-    NumberTable,
-    WantedClasses,
-    describe_classes,
-    lines_of,
-)
-from mcaptrack.sources.ingest.labels.reading import chosen_format, is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.checks import find_outside
+from mcaptrack.sources.ingest.labels.frames import FrameRanges, share_numbers, warn_of_firsts
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE, WantedClasses, describe_classes
+from mcaptrack.sources.ingest.labels.table import BoxTable, refuse
+from mcaptrack.sources.ingest.labels.text import lines_of, read_numbers
 from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of_labels
 from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
@@ -66,14 +61,15 @@ MOTION: Final = "motion"
 
 #: Options that apply only to videos, and options that are written otherwise than they are named here.
 FOR_VIDEOS: Final = ("image_format", "quality", "keyframe_interval_s", "stream")
-_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "frame"}
+_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "frame", "frame_ranges": "frames"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
     """The parameters of ``mcaptrack.ingest``, which explains them, as values: paths, fractions, names of columns.
 
-    ``labels`` are label files by role; ``frame_id`` is its ``frame``.
+    ``labels`` are label files by role; ``frame_id`` is its ``frame``, and ``frame_ranges`` its ``frames`` if these are
+    no number.
     """
 
     camera: str = "camera"
@@ -89,14 +85,16 @@ class IngestOptions:
     calibration_unit: LengthUnit = "auto"
     point: Point = "foot"
     labels: Mapping[Role, Path] = field(default_factory=dict)
-    label_format: Format = "auto"
-    first_frame: int | None = None
+    label_format: str = "auto"
+    first_frame: int | Mapping[str, int] | None = None
     frames: int | None = None
+    frame_ranges: FrameRanges | None = None
     role: InputRole | None = None
     motion: Path | None = None
     columns: Mapping[str, str] | None = None
     size: tuple[int, int] | None = None
     classes: WantedClasses | None = None
+    class_map: ClassMap | None = None
     frame_id: str | None = None
     scene: str | None = None
 
@@ -111,6 +109,10 @@ class IngestOptions:
             stream=self.stream,
         )
 
+    def first_of(self, role: Role | None) -> int | None:
+        """The number of the first picture in files with this role; None if it wasn't given."""
+        return self.first_frame.get(role or "") if isinstance(self.first_frame, Mapping) else self.first_frame
+
     def given(self, *names: str) -> str:
         """The first of these options that was given, as a user writes it; "" if none was."""
         defaults = IngestOptions()
@@ -123,7 +125,7 @@ class IngestReport:
     """The result of ``ingest``: messages by topic, ``remarks``, details (``notes``), and what was lost.
 
     ``warnings`` report what was assumed, left out or looks unusual. ``has_labels``: there were label files.
-    ``uses_camera``: topics below the camera's name were written.
+    ``uses_camera``: topics below the camera's name were written. ``facts`` is what is known of label files, by role.
     """
 
     messages: dict[str, int] = field(default_factory=dict)
@@ -133,6 +135,23 @@ class IngestReport:
     warnings: list[Notice] = field(default_factory=list)
     has_labels: bool = False
     uses_camera: bool = False
+    facts: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def fitted(labels: BoxTable, size: tuple[int, int]) -> BoxTable:
+    """Labels of pictures of this width and height: boxes in shares of it become pixels, and those outside of it are
+    warned of.
+    """
+    facts = labels.facts
+    if labels.boxes_px is not None and facts.is_normalised:
+        facts = replace(facts, is_normalised=False, size=None)
+        labels = replace(labels, boxes_px=labels.boxes_px * np.array([*size, *size], float), facts=facts)
+    if facts.size not in (None, size):
+        text = f": its pictures are {facts.size[0]}x{facts.size[1]}, and those here {size[0]}x{size[1]}"
+        labels.find(f"{text}; boxes stay as they are", "outside")
+    if facts.size != size:
+        find_outside(labels, np.array(size, float))
+    return labels
 
 
 #: The last parts of the topics of the ground plane and the calibration that a user gave.
@@ -153,18 +172,20 @@ def read_motions(path: Path) -> Floats:
 
     Raises McaptrackError, with the line, for anything else.
     """
-    table = NumberTable(path, lines_of(path), _MOTION, _MOTION_COLUMNS)
-    if not len(table.values):
+    values, at = read_numbers(path, lines_of(path), _MOTION, _MOTION_COLUMNS)
+    if not len(values):
         raise McaptrackError(f"{path} holds no camera motion")
-    frame, motions = table.values[:, 0], table.values[:, 1:].reshape(-1, 2, 3)
-    table.refuse(
+    frame, motions = values[:, 0], values[:, 1:].reshape(-1, 2, 3)
+    refuse(
+        at,
         frame != np.arange(len(frame)),
         lambda row: f"frame {frame[row]:g} is not {row}: frames count from 0, without gaps",
     )
     wrong = np.array([not is_motion(motion) for motion in motions])
-    table.refuse(wrong, lambda row: "the motion is not finite, or can't be inverted")
+    refuse(at, wrong, lambda row: "the motion is not finite, or can't be inverted")
     scale = np.array([scale_of(motion) for motion in motions])
-    table.refuse(
+    refuse(
+        at,
         (scale > _MOST_ZOOM) | (scale < 1 / _MOST_ZOOM),
         lambda row: f"the motion enlarges the picture {scale[row]:.3g} times; no camera does that in a frame",
     )
@@ -220,22 +241,26 @@ class IngestJob:
         if self._homography and self.calibration and self.calibration.has_pose:
             names = ", ".join(map(str, self.calibration.paths))
             raise McaptrackError(f"{options.ground_plane} and {names} are both a ground plane; give one")
-        self.labels: dict[Role, Labels] = {role: self.read(path, role) for role, path in options.labels.items()}
+        self.labels: dict[Role, BoxTable] = {role: self.read(path, role) for role, path in options.labels.items()}
         self.motions = read_motions(options.motion) if options.motion else None
-        self.check_labels()
+        share_numbers(self.labels)
 
-    def read(self, path: Path, role: Role) -> Labels:
-        """Read a label file with the format options."""
+    def read(self, path: Path, role: Role | None) -> BoxTable:
+        """Read a label file with the format options. Without a role, it is that of tracks if the file has ids."""
         options = self.options
         wanted = options.classes or (WantedClasses("all") if role == "corrections" else ONLY_PEOPLE)
-        label_format = chosen_format(path, options.label_format, options.columns)
-        if is_3d(path, label_format, options.columns):
+        if is_3d(path, options.label_format, options.columns):
             raise McaptrackError(
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        given = (label_format, role, options.first_frame, options.columns, wanted)
-        return read_labels(path, *given, in_parts=True)
+        given = (options.label_format, role, options.first_of(role), options.columns, wanted)
+        labels = read_labels(path, *given, in_parts=True, class_map=options.class_map)
+        if role is None and isinstance(options.first_frame, Mapping):
+            return self.read(path, labels.role)
+        if labels.role == "detections" and labels.boxes_px is None:
+            raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
+        return labels
 
     @property
     def has_ground_given(self) -> bool:
@@ -263,51 +288,42 @@ class IngestJob:
         ``size`` returns width and height of the pictures; None if there are none. Raises McaptrackError if the size is
         not known, or isn't the given one.
         """
+        tables = {role: labels for role, labels in self.labels.items() if labels.boxes_px is not None}
         stated = self.options.size
-        paths = [labels.path for labels in self.labels.values() if labels.is_normalised]
-        if all(labels.is_of_data_set for labels in self.labels.values()):
+        if not tables:
             return
-        actual = size() if size else stated
+        try:
+            actual = size() if size else stated
+        except McaptrackError:  # pictures that can't be decoded can have labels
+            if stated or any(labels.is_normalised for labels in tables.values()):
+                raise
+            actual = None
         if stated and actual and actual != stated:
             raise McaptrackError(
                 f"{self.source}: the pictures are {actual[0]}x{actual[1]}, not {stated[0]}x{stated[1]}; "
                 "leave `size=` out"
             )
-        if paths and actual is None:
-            raise McaptrackError(
-                f"{paths[0]} has boxes in shares of the picture's size; give it with `size='WIDTHxHEIGHT'`, or add the "
-                "labels to a log with pictures with `into=`"
-            )
-        if actual is None:
-            return
-        for labels in self.labels.values():
-            if not labels.is_of_data_set:
-                labels.fit(actual)
-
-    def check_labels(self) -> None:
-        """Refuse labels that don't suit their role."""
-        for role, labels in self.labels.items():
-            if role == "detections" and not labels.has_boxes:
-                raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
-            if role != "detections" and not labels.has_ids:
-                raise McaptrackError(f"{labels.path} has no ids (all are -1); {role} need ids")
+        for role, labels in tables.items():
+            if actual is not None:
+                self.labels[role] = fitted(labels, actual)
+            elif labels.is_normalised:
+                raise McaptrackError(
+                    f"{labels.path} has boxes in shares of the picture's size; give it with `size='WIDTHxHEIGHT'`, or "
+                    "add the labels to a log with pictures with `into=`"
+                )
 
     def report_assumptions(self) -> None:
         """Report what is assumed about the labels, and what of them is left out."""
         all_labels = self.labels.values()
-        firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in all_labels}
-        if len(firsts) > 1:
-            warn(
-                f"{' and '.join(firsts.values())} are assumed to be the same picture; `first_frame=` sets the number",
-                "clock",
-            )
+        warn_of_firsts(all_labels)
         for role, labels in self.labels.items():
             path = labels.path
             self.report_table(role, labels)
+            self.report.facts[role] = labels.facts.to_json()
             if labels.step > 1:
                 text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{text}; the frames in between are left out")
-            kinds, counts = labels.class_counts()
+            kinds, counts = labels.extent.classes
             if len(kinds) > 1:
                 text = describe_classes(kinds, counts, labels.classes)
                 self.report.remarks.append(f"{path} has several classes; class_id is {text}")
@@ -420,12 +436,20 @@ class IngestJob:
     def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
         """Write the labels, each frame at the time of its picture."""
         for role, labels in self.labels.items():
-            placed = timeline.place(labels, self.report.lost)
-            if role == "corrections":  # frames beyond those that were looked at stay as they are
-                placed = placed.between(int(labels.labelled[0]), int(labels.labelled[-1]))
+            with collected() as warned:
+                placed = timeline.place(labels, role, self.report.lost, self.ranges_of(role))
             parameters = {"file": labels.path.name, "format": labels.format} | self.label_parameters(role, labels)
+            if placed.ranges is not None:
+                parameters |= {"frames": str(placed.ranges), "frames_by": placed.by}
             frames = self.frames(role, plane, placed)
-            self.write_rows(writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels)
+            self.write_rows(
+                writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels,
+                warnings=[(notice.code, notice.message) for notice in warned if notice.code == "labelled"],
+            )  # fmt: skip
+
+    def ranges_of(self, role: Role) -> FrameRanges | None:
+        """The frames that a user says were labelled: of the ground truth, if there is any."""
+        return self.options.frame_ranges if role == "truth" or "truth" not in self.roles else None
 
     def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
         """Write the motion of the camera, if it was given; pictures have this width and height."""
@@ -439,14 +463,17 @@ class IngestJob:
         frames = motion_frames(self.motions, timeline.index, timeline.t_ns, size)
         self.write_rows(writer, MOTION, CAMERA_MOTION, lambda: iter(frames), {"file": path.name})
 
-    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: BoxTable) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
-        out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
-        if self.options.columns and labels.format in ("csv", "supervision"):
+        is_stated = self.options.first_of(role) is not None or (labels.format, labels.first_frame) == ("mot", 0)
+        out: dict[str, Any] = {"first_frame": labels.first_frame} if is_stated else {}
+        if self.options.columns:
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
         if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
-        if self.options.size and not labels.is_of_data_set:
+        if self.options.class_map is not None:
+            out["class_map"] = str(self.options.class_map)
+        if self.options.size and labels.boxes_px is not None:
             out["size"] = "{}x{}".format(*self.options.size)
         return out
 
@@ -463,9 +490,10 @@ class IngestJob:
         parameters: Mapping[str, Any],
         labels: BoxTable | None = None,
         frame_id: str = "",
+        warnings: Sequence[Sequence[str]] = (),
     ) -> None:
         """Write a channel of the camera; ``parameters`` are those in its provenance, ``labels`` the file that it is of,
-        and ``frame_id`` the frame of reference of its positions.
+        ``frame_id`` the frame of reference of its positions, and ``warnings`` are kept with it.
 
         Frames are generated several times, for the digest and for the channel, so that they are never all in memory.
         """
@@ -477,11 +505,11 @@ class IngestJob:
 
         classes = {} if labels is None else labels.classes
         names, class_id = {str(number): name for number, name in sorted(classes.items())}, str(only) if only else ""
-        plugins = {"label_format": labels.plugin} if labels is not None and labels.plugin else {}
+        plugins = {"label_format": labels.facts.plugin} if labels is not None and labels.facts.plugin else {}
         of_rows = digest(messages(), classes_beside_rows(class_id, names))
         provenance = Provenance(
             INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id,
-            plugins=plugins,
+            plugins=plugins, warnings=warnings,
         )  # fmt: skip
         topic, record = f"{self.prefix}/{suffix}", record_of(schema, self.encoding)
         channel = writer.add_channel(topic, record, self.encoding, provenance.to_metadata())

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.choices import Point, Role
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
@@ -33,10 +33,11 @@ from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
 from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
-from mcaptrack.sources.ingest.labels.content import BoxRows3D, Format, Labels, WantedClasses, describe_classes
-from mcaptrack.sources.ingest.labels.reading import chosen_format, read_boxes_3d
+from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, described, share_numbers
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import describe_classes
+from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.timeline import (
-    MAX_FRAMES,
     ExistingLabels,
     Placed,
     Timeline,
@@ -51,16 +52,7 @@ from mcaptrack.sources.ingest.labels.timeline import (
 )
 from mcaptrack.sources.video import SEQINFO, find_seqinfo
 
-_SDD_FPS: Final = Fraction(30)
-#: Formats with a known frame rate, and its reason.
-_BY_FORMAT: Final[Mapping[Format, str]] = {
-    "sdd": "Stanford Drone",
-    "trajnet": "trajnet, a label every 0.4 s",
-    "obsmat": "obsmat, a label every 0.4 s",
-}
 _ASSUMED: Final = "assumption"
-#: The label interval of formats that are annotated at the sampling rate of prediction benchmarks.
-_LABEL_STEP_S: Final = Fraction(2, 5)
 
 
 class _Known(NamedTuple):
@@ -69,12 +61,13 @@ class _Known(NamedTuple):
     fps: Fraction | None
     frames: int | None
     of: str
+    is_assumed: bool = False
 
 
 # Compare corrections with the log that they go into: with the ids of its tracks, and with earlier corrections.
 
 
-def with_new_ids(into: log.Log, prefix: str, labels: Labels) -> Labels:
+def with_new_ids(into: log.Log, prefix: str, labels: BoxTable) -> BoxTable:
     """Give tracks without an id of their own ids that no track of the log has.
 
     Otherwise the half of a track that was split could get the id of a track that was removed.
@@ -84,12 +77,13 @@ def with_new_ids(into: log.Log, prefix: str, labels: Labels) -> Labels:
     used = [
         int(unique_values(TRACKS, into.frame_columns(topic, TRACKS), "track_id").max(initial=0)) for topic in written
     ]
-    if labels.made_ids is None or not used:
+    made = labels.facts.made_ids
+    if made is None or not used:
         return labels
     first = max(*used, int(labels.id.max())) + 1
-    is_made = np.isin(labels.id, labels.made_ids)
-    new = first + np.searchsorted(labels.made_ids, labels.id)
-    return replace(labels, id=np.where(is_made, new, labels.id), made_ids=first + np.arange(len(labels.made_ids)))
+    new = first + np.searchsorted(made, labels.id)
+    facts = replace(labels.facts, made_ids=first + np.arange(len(made)))
+    return replace(labels, id=np.where(np.isin(labels.id, made), new, labels.id), facts=facts)
 
 
 def warn_uncovered(into: log.Log, topic: str, placed: Placed) -> None:
@@ -124,7 +118,6 @@ class LabelJob(IngestJob):
         super().__init__(inputs[0][1], options, into)
         for role, path in reversed(inputs):
             self._add(role, path)
-        self.check_labels()
         if name := options.given(*FOR_VIDEOS):
             raise McaptrackError(f"{self.source} is a label file; {name} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
@@ -135,8 +128,16 @@ class LabelJob(IngestJob):
         self._clock = ("", False)  # remark on times that don't come from pictures, and whether they are assumed
         self._other_rates: list[str] = []
         self._start_ns = options.start_ns or 0
+        beside: list[Numbered] = []
         if into is not None:
             self.prefix, self.pictures = camera_of(into, options.camera)
+            existing = labels_of(into, self.prefix).items()
+            beside = [
+                Numbered(f"{topic} of {into.path}", "mot", 0, 0, labels.frames - 1)
+                for topic, labels in existing
+                if labels.counts_from_0
+            ]
+        share_numbers(self.labels, beside)
         if into is not None and "corrections" in self.labels:
             self.labels["corrections"] = with_new_ids(into, self.prefix, self.labels["corrections"])
             self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
@@ -156,19 +157,9 @@ class LabelJob(IngestJob):
             size, is_stated = options.size, True
         self.ground = self.plane(*size, is_stated) or self._measured_plane()
 
-    def _role_of(self, path: Path) -> Role:
-        """The role of a file: tracks if its rows have ids. Detections keep boxes that tracks leave out."""
-        try:
-            return "tracks" if self.read(path, "tracks").has_ids else "detections"
-        except McaptrackError:
-            if self.read(path, "detections").has_ids:
-                raise
-            return "detections"
-
     def _add(self, role: Role | None, path: Path) -> None:
-        if role is None:
-            role = self._role_of(path)
         labels = self.read(path, role)
+        role = labels.role
         if role in self.labels:
             raise McaptrackError(
                 f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
@@ -177,7 +168,7 @@ class LabelJob(IngestJob):
 
     def _boxes_extent(self) -> tuple[int, int]:
         """The image size that contains all boxes, (width, height) in pixels."""
-        corners = [labels.corner_px() for labels in self.labels.values() if labels.has_boxes]
+        corners = [labels.extent.high for labels in self.labels.values() if labels.boxes_px is not None]
         if not corners:
             return 0, 0
         x_px, y_px = np.ceil(np.max(corners, axis=0)).tolist()
@@ -241,7 +232,7 @@ class LabelJob(IngestJob):
         first = next(iter(self.labels.values())).first_frame
         self._clock = (
             f"{self.source}: {count} frames (by {counted_by}) from {first} on, {float(fps):g} a second (by {of})",
-            of in (*_BY_FORMAT.values(), _ASSUMED),
+            of == _ASSUMED or of in {clock.of for clock in counted if clock.is_assumed},
         )
         return timeline
 
@@ -285,7 +276,10 @@ class LabelJob(IngestJob):
         if frame_counts:
             return max(frame_counts), frame_counts[max(frame_counts)]
         counts = [count_frames(labels) for labels in self.labels.values()]
-        return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
+        last = max(*counts, *(label.frames for label in existing.values()), 1)
+        ends = [end for _, end in self.options.frame_ranges.ranges if end] if self.options.frame_ranges else []
+        stated = min(max(ends, default=0) - next(iter(self.labels.values())).first_frame, MAX_FRAMES)
+        return (stated, "`frames=`") if stated > last else (last, "the last label")
 
     def _check_overlap(self, into: log.Log, timeline: Timeline) -> None:
         """Check that labels without pictures overlap in time with the log."""
@@ -311,48 +305,45 @@ class LabelJob(IngestJob):
             writer.add_metadata(CLOCK, {"start_ns": str(self._start_ns)})
         self.write_plane(writer, self.ground, int(self.timeline.t_ns[0]))
         if self.into is not None and "corrections" in self.labels:
-            labels = self.labels["corrections"]
-            placed = self.timeline.place(labels, []).between(int(labels.labelled[0]), int(labels.labelled[-1]))
+            placed = self.timeline.place(self.labels["corrections"], "corrections", [])
             warn_uncovered(self.into, f"{self.prefix}/{CORRECTED}", placed)
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
 
-    def label_parameters(self, role: Role, labels: Labels) -> dict[str, Any]:
+    def label_parameters(self, role: Role, labels: BoxTable) -> dict[str, Any]:
         """The frame rate, if there were no pictures."""
         return super().label_parameters(role, labels) | ({} if self._fps is None else {"fps": str(self._fps)})
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The labels of a role as frames, including empty frames."""
-        return list(self.frames(role, self.ground, self.timeline.place(self.labels[role], self.report.lost))())
+        return self.placed_frames(role)[0]
+
+    def placed_frames(self, role: Role) -> tuple[list[Frame], Placed]:
+        """As ``all_frames``, and which frames these are."""
+        placed = self.timeline.place(self.labels[role], role, self.report.lost, self.ranges_of(role))
+        return list(self.frames(role, self.ground, placed)()), placed
 
 
 def _seconds(t_ns: int) -> str:
     return f"{t_ns / NS_PER_S:.3f} s"
 
 
-def _known(labels: Labels) -> _Known:
+def _known(labels: BoxTable) -> _Known:
     """Frame rate and number of frames by the format of a label file, or by seqinfo.ini."""
-    if labels.format == "sdd":
-        return _Known(_SDD_FPS, None, _BY_FORMAT[labels.format])
-    if labels.format in ("trajnet", "obsmat"):  # annotated at 2.5 Hz, whatever the video's rate
-        return _Known(labels.step / _LABEL_STEP_S, None, _BY_FORMAT[labels.format])
+    facts = labels.facts
+    fps = facts.fps or (labels.step / facts.interval_s if facts.interval_s else None)
+    if fps is not None:
+        return _Known(fps, None, facts.clock_of, is_assumed=True)
     info = find_seqinfo(labels.path.parent)
     return _Known(info.fps, info.frames, SEQINFO) if info else _Known(None, None, "")
 
 
-def label_frames(
-    files: Mapping[Role, Path],
-    fps: Fraction | None,
-    ground_plane: Path | None,
-    point: Point,
-    classes: WantedClasses | None = None,
-) -> dict[Role, list[Frame]]:
+def label_frames(files: Mapping[Role, Path], options: IngestOptions) -> dict[Role, list[Frame]]:
     """Read label files with a common clock as frames, without writing a log.
 
     Raises McaptrackError as ``ingest`` does. For comparisons only the order and intervals of times matter, so files
-    without a frame rate get one frame per second unless ``fps`` is given.
+    without a frame rate get one frame per second unless the options give one.
     """
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, classes=classes)
     job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
     job.report_assumptions()
     return {role: job.all_frames(role) for role in files}
@@ -442,15 +433,15 @@ class Boxes3DJob(IngestJob):
         super().__init__(inputs[0][1], replace(options, labels={}), into)
         if name := options.given(*FOR_VIDEOS, "ground_plane", "calibration", "motion", "size", "frames"):
             raise McaptrackError(f"{self.source} holds 3D boxes; {name} is for pictures and boxes in them")
-        self.boxes: dict[Role, BoxRows3D] = {}
+        self.boxes: dict[Role, BoxTable] = {}
         for stated, path in (*inputs, *options.labels.items()):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
-            label_format = chosen_format(path, options.label_format, options.columns)
-            rows = read_boxes_3d(path, stated or "detections", label_format, options.columns, options.scene)
-            role = stated or ("tracks" if rows.has_ids else "detections")
-            if role != "detections":
-                rows.check(role)
+            given = (options.label_format, stated, options.first_of(stated), options.columns, options.classes)
+            rows = read_labels(path, *given, scene=options.scene, class_map=options.class_map)
+            role = rows.role
+            if not rows.in_space:
+                raise McaptrackError(f"{path} holds boxes in pictures, and {self.source} holds 3D boxes")
             if role in self.boxes:
                 raise McaptrackError(
                     f"{path} and {self.boxes[role].path} are both {role}; give the role of {path} with `role=`"
@@ -459,31 +450,45 @@ class Boxes3DJob(IngestJob):
         self._topic = boxes_topic(into, options.camera) if into else ""
         if self._topic and options.camera == DEFAULT_CAMERA:
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
-        for rows in self.boxes.values():
-            rows.frame_id = self._frame_id(rows)
-        self.boxes = {role: self._at_times(role, rows) for role, rows in self.boxes.items()}
+        share_numbers(self.boxes)
+        self.boxes = {role: self._at_times(self._described(self._placed(rows))) for role, rows in self.boxes.items()}
 
     @property
     def roles(self) -> Set[Role]:
         """The roles of label files."""
         return self.boxes.keys()
 
-    def _frame_id(self, rows: BoxRows3D) -> str:
-        """The frame of reference of rows: as the user says, as the format says, or the root of the log's transforms."""
+    def _placed(self, rows: BoxTable) -> BoxTable:
+        """Rows in the frame of reference that the user says, or the format, or the root of the log's transforms."""
         if self.options.frame_id is not None:
             if self.into:
                 warn_of_frame(self.into, self.options.frame_id, rows.path)
-            return self.options.frame_id
-        root = root_frame(self.into) if self.into else ""
-        frame_id = rows.frame_id or root or FRAME
-        reason = "by its format" if rows.frame_id else "the root of the log's transforms" if root else "assumed"
+            return replace(rows, facts=replace(rows.facts, frame_id=self.options.frame_id))
+        root, stated = root_frame(self.into) if self.into else "", rows.facts.frame_id
+        frame_id = stated or root or FRAME
+        reason = "by its format" if stated else "the root of the log's transforms" if root else "assumed"
         text = f": boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
-        (rows.doubt if reason == "assumed" else rows.remark)(text)
-        return frame_id
+        (rows.find if reason == "assumed" else rows.remark)(text)
+        return replace(rows, facts=replace(rows.facts, frame_id=frame_id))
 
-    def _at_times(self, role: Role, rows: BoxRows3D) -> BoxRows3D:
+    def _described(self, rows: BoxTable) -> BoxTable:
+        """Rows of the frames that were labelled, which are also those without boxes between others."""
+        ranges = self.ranges_of(rows.role)
+        if rows.facts.is_timed:
+            if ranges is not None:
+                raise McaptrackError(f"{rows.path} has times, which say what it describes; leave `frames=` out")
+            return rows
+        at = rows.labelled
+        if rows.role == "truth" and not rows.facts.states_labelled and at[-1] - at[0] < MAX_FRAMES:
+            at = np.arange(at[0], at[-1] + 1, rows.step)
+        shown = described(rows, "tracks", at, rows.labelled, ranges, str(rows.path)) if ranges else None
+        at = at if shown is None else at[shown.pictures]
+        kept = np.isin(rows.frame, at)
+        return replace(rows if kept.all() else rows.take(kept), facts=replace(rows.facts, labelled=at))
+
+    def _at_times(self, rows: BoxTable) -> BoxTable:
         t_ns, labelled = self._times(rows, rows.frame, rows.labelled)
-        timed = rows.settled(t_ns, labelled, role, self.options.classes)
+        timed = replace(rows, frame=t_ns, facts=replace(rows.facts, labelled=labelled, is_timed=True))
         if self.into is not None and any(part.index.counts for part in self.into.parts):
             first, last = int(timed.labelled[0]), int(timed.labelled[-1])
             if first > self.into.end_ns + _MARGIN_NS or last < self.into.start_ns - _MARGIN_NS:
@@ -494,17 +499,15 @@ class Boxes3DJob(IngestJob):
                 )
         return timed
 
-    def _times(self, rows: BoxRows3D, number: Ints, labelled: Ints) -> tuple[Ints, Ints]:
+    def _times(self, rows: BoxTable, number: Ints, labelled: Ints) -> tuple[Ints, Ints]:
         """The times of rows (N,) and of labelled frames (F,), by their own times, a frame rate, or the log."""
         options = self.options
-        if rows.is_timed:
+        if rows.facts.is_timed:
             if name := options.given("fps", "first_frame"):
                 raise McaptrackError(f"{rows.path} has times; leave {name} out")
             shift = 0 if options.start_ns is None else options.start_ns - int(labelled[0])
             return number + shift, labelled + shift
-        first = options.first_frame
-        if first is None:
-            first = rows.assume_first(int(labelled[0])) if rows.format == "csv" else 0
+        first = rows.first_frame
         if int(labelled[0]) < first:
             raise McaptrackError(f"{rows.path}: its first frame is {labelled[0]}, before `first_frame={first}`")
         if options.fps is not None:
@@ -539,7 +542,8 @@ class Boxes3DJob(IngestJob):
         """Report how the boxes were understood, and what of them is left out."""
         for role, rows in self.boxes.items():
             self.report_table(role, rows)
-            text = describe_classes(*np.unique(rows.class_id, return_counts=True), rows.classes)
+            self.report.facts[role] = rows.facts.to_json()
+            text = describe_classes(*rows.extent.classes, rows.classes)
             self.report.remarks.append(f"{rows.path}: class_id is {text}")
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
@@ -550,14 +554,17 @@ class Boxes3DJob(IngestJob):
         for role, rows in self.boxes.items():
             parameters: dict[str, Any] = {"file": rows.path.name, "format": rows.format} | self._parameters(role)
             frames = partial(iter, self.all_frames(role))
-            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, rows, rows.frame_id)
+            self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, rows, rows.facts.frame_id)
 
     def _parameters(self, role: Role) -> dict[str, Any]:
         options = self.options
         parameters: Mapping[str, Any] = {
-            "first_frame": options.first_frame,
+            "first_frame": options.first_of(role),
+            "frames": str(ranges) if (ranges := self.ranges_of(role)) else None,
+            "frames_by": "frames" if ranges else None,
             "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
             "classes": options.classes.text if options.classes and role != "detections" else None,
+            "class_map": str(options.class_map) if options.class_map else None,
             "scene": options.scene,
             "fps": None if options.fps is None else str(options.fps),
         }
@@ -570,12 +577,13 @@ class Boxes3DJob(IngestJob):
         return split_rows(rows.labelled, range(len(ends)), label_rows_3d(rows, role), ends)
 
 
-def label_rows_3d(labels: BoxRows3D, role: Role) -> Rows:
+def label_rows_3d(labels: BoxTable, role: Role) -> Rows:
     """Convert the N rows of labels to rows of detections or tracks."""
-    columns = dict(zip(COLUMNS, labels.boxes.T, strict=True))
+    assert labels.boxes_m is not None
+    columns = dict(zip(COLUMNS, labels.boxes_m.T, strict=True))
     if labels.velocity is not None:
         columns |= dict(zip(("vx_m_per_s", "vy_m_per_s"), labels.velocity.T, strict=True))
-    columns |= {"score": labels.score, "class_id": labels.class_id, "source_id": np.full(len(labels.boxes), -1)}
+    columns |= {"score": labels.score, "class_id": labels.class_id, "source_id": np.full(len(labels.frame), -1)}
     if role == "detections":
         return DETECTIONS.rows(**columns)
-    return TRACKS.rows(track_id=labels.id, observed=np.ones(len(labels.boxes), bool), **columns)
+    return TRACKS.rows(track_id=labels.id, observed=np.ones(len(labels.frame), bool), **columns)

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.schema.classes import PERSON, is_person
-from mcaptrack.sources.ingest.labels.formats import MOT_CLASSES
+from mcaptrack.sources.ingest.labels.mot import MOT_CLASSES
 from mcaptrack.tables.exchange.boxes import ExportedBoxes
 
 _LINES: Final = 4096

@@ -9,8 +9,9 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.sources.ingest.labels.content import BoxRows3D, headings, numbered
-from mcaptrack.sources.ingest.labels.formats import ClassNames
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import ClassNames, headings, numbered
 
 BOXES: Final = "annotations.feather"
 POSES: Final = "city_SE3_egovehicle.feather"
@@ -21,16 +22,25 @@ _SIZE: Final = ("length_m", "width_m", "height_m")
 CITY, VEHICLE = "map", "base_link"
 
 
-def is_argoverse(path: Path) -> bool:
-    """Whether a path is a table of boxes, or the folder of a log, with or without one."""
-    return path.suffix == ".feather" or (path.is_dir() and any((path / name).is_file() for name in (BOXES, POSES)))
+class Argoverse(Format):
+    """A table of boxes, or the folder of a log with it."""
+
+    title = "Argoverse 2"
+    row = "`annotations.feather`, or a folder with it"
+    in_space = True
+    reads_folders = True
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether it is a table of boxes, or the folder of a log, with or without one."""
+        path = file.path
+        return path.suffix == ".feather" or (file.is_folder and any((path / name).is_file() for name in (BOXES, POSES)))
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The boxes of a log, in the city's frame if the poses are there."""
+        return _read(file.path)
 
 
-def read_argoverse(path: Path) -> BoxRows3D:
-    """Read the boxes of a log, in the city's frame if the poses are there.
-
-    Raises McaptrackError if a table can't be read, or if there is no pose at the time of a box.
-    """
+def _read(path: Path) -> BoxTable:
     if path.is_dir() and not (path / BOXES).is_file():
         raise McaptrackError(f"{path} has no {BOXES}: it is a log of Argoverse 2 without labels")
     path = path / BOXES if path.is_dir() else path
@@ -54,7 +64,7 @@ def read_argoverse(path: Path) -> BoxRows3D:
     heading = headings(quaternions, path, at)[0]
     if None in table["track_uuid"]:
         raise McaptrackError(f"{at(table['track_uuid'].index(None))} has no track_uuid")
-    names, unknown = ClassNames(), table["category"].count(None)
+    names = ClassNames()
     try:
         kind = np.array(
             [-1 if category is None else names.number(str(category)) for category in table["category"]], np.int64
@@ -62,13 +72,14 @@ def read_argoverse(path: Path) -> BoxRows3D:
     except ValueError as error:
         raise McaptrackError(f"{path}: {error}") from None
     remarks.append(f"{path}: tracks are numbered from 1 on, a number for each track_uuid")
-    boxes, none = np.column_stack([place, _floats(path, table, _SIZE), heading]), np.full(count, np.nan)
-    track_id, _ = numbered([f"#{track}" for track in table["track_uuid"]])
-    rows = BoxRows3D(path, "argoverse", at, t_ns, track_id, boxes, none, kind, remarks=remarks, frame_id=frame_id)
-    rows.names, rows.is_timed, rows.labelled = names.names, True, np.unique(t_ns)
-    if unknown:
-        rows.doubt(f": {unknown} of {count} boxes have no category: their class is unknown", "classes")
-    return rows
+    facts = LabelFacts(
+        path, "argoverse", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=frame_id
+    )
+    return BoxTable(
+        facts=facts, at=at, frame=t_ns, id=numbered([f"#{track}" for track in table["track_uuid"]])[0],
+        boxes_m=np.column_stack([place, _floats(path, table, _SIZE), heading]), score=np.full(count, np.nan),
+        class_id=kind, remarks=remarks,
+    )  # fmt: skip
 
 
 def _in_city(path: Path, t_ns: Ints, place: Floats, quaternions: Floats) -> tuple[Floats, Floats]:

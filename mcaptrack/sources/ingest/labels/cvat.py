@@ -22,13 +22,12 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
-from mcaptrack.sources.ingest.labels.content import NO_CLASS, NO_ID, Labels, WantedClasses, is_count
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import ClassNames, is_count
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
@@ -37,7 +36,6 @@ _MAX_FRAMES: Final = 10_000_000
 #: Files of CVAT have a depth of 8.
 _MAX_DEPTH: Final = 32
 _MAX_TEXT: Final = 65536
-_MAX_CLASSES: Final = 65536
 _BLOCK: Final = 2**16
 #: The element of a track.
 _TRACK: Final = "track"
@@ -72,12 +70,6 @@ _ZIP: Final = b"PK\x03\x04"
 _EMPTY_ZIP: Final = b"PK\x05\x06"
 _MEMBER: Final = "annotations.xml"
 _SHOWN: Final = 5
-
-
-def is_cvat(path: Path) -> bool:
-    """Whether a file is XML, or a zip file: of label files, only those of CVAT are."""
-    head = read_beginning(path, 4096)
-    return head.startswith((_ZIP, _EMPTY_ZIP)) or head.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"<"
 
 
 @contextmanager
@@ -120,7 +112,7 @@ class _Parser(XmlReader):
 
     path: Path
     values: array[float] = field(default_factory=lambda: array("d"))
-    labels: dict[str, int] = field(default_factory=dict)
+    labels: ClassNames = field(default_factory=ClassNames)
     meta: dict[str, str] = field(default_factory=dict)
     others: Counter[str] = field(default_factory=Counter)
     tracks: list[_Track] = field(default_factory=list)
@@ -221,10 +213,10 @@ class _Parser(XmlReader):
             self.values[_ID - _COLUMNS] = int(text)
 
     def _label(self, attributes: dict[str, str]) -> int:
-        name = " ".join(attributes.get("label", "").split())[:256]
-        if name not in self.labels and len(self.labels) >= _MAX_CLASSES:
-            self.fail(f"more than {_MAX_CLASSES} labels")
-        return self.labels.setdefault(name, len(self.labels))
+        try:
+            return self.labels.number(attributes.get("label", ""))
+        except ValueError as error:
+            self.fail(str(error))
 
     def _whole(self, text: str, what: str) -> int:
         if not is_count(text, 15):
@@ -291,73 +283,92 @@ def _is(attributes: dict[str, str], name: str) -> bool:
     return attributes.get(name, "").lower() in ("1", "true")
 
 
-def read_cvat(path: Path, role: Role, wanted: WantedClasses) -> Labels:
-    """Read annotations of CVAT. Raises McaptrackError, with the line, if they are damaged or hold no boxes."""
-    parser = _Parser(path)
-    parser.parse(parser.pieces())
-    if parser.tracks and parser.images:
-        raise McaptrackError(f"{path} holds both tracks and images; CVAT writes one of them")
-    if not parser.values:
-        others = _counted(parser.others)
-        raise McaptrackError(f"{path} holds no boxes{f', only {others}' if others else ''}")
+class Cvat(Format):
+    """Annotations for video and for images."""
+
+    title = "CVAT"
+    row = "XML of CVAT for video or for images, or a zip file with it"
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether a file is XML, or a zip file: of label files, only those of CVAT are."""
+        return file.head.startswith((_ZIP, _EMPTY_ZIP, b"<"))
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The rows of a file."""
+        path, parser = file.path, _Parser(file.path)
+        if not self.recognises(file):
+            raise McaptrackError(f"{path} is neither XML nor a zip file with annotations.xml, as CVAT writes them")
+        parser.parse(parser.pieces())
+        if parser.tracks and parser.images:
+            raise McaptrackError(f"{path} holds both tracks and images; CVAT writes one of them")
+        if not parser.values:
+            others = _counted(parser.others)
+            raise McaptrackError(f"{path} holds no boxes{f', only {others}' if others else ''}")
+        return _table(path, parser)
+
+
+def _table(path: Path, parser: _Parser) -> BoxTable:
     values: Floats = np.frombuffer(parser.values, np.float64).reshape(-1, _COLUMNS)
-    number, names = _classes(parser.labels)
-    none, kind, is_seen = np.full(len(values), np.nan), number[values[:, 6].astype(int)], values[:, 7] == 0
-
-    def at(row: int) -> str:
-        return f"{path}:{values[row, 8]:.0f}"
-
-    rows = Labels(path, "cvat", at, values[:, 0], values[:, _ID], values[:, 1:5], none, kind, observed=is_seen)
-    rows.labelled, doubt = _frames(parser, values[:, 0])
+    names = parser.labels.names
+    facts = LabelFacts(path, "cvat", first_frame=0, names=names or None, numbering={} if names else None)
+    facts.named_by, facts.size = "file" if names else "", _size(parser)
+    facts.labelled, facts.states_labelled, doubt = _frames(parser, values[:, 0])
+    rows = BoxTable(
+        facts=facts, at=lambda row: f"{path}:{values[row, 8]:.0f}", frame=values[:, 0], id=values[:, _ID],
+        boxes_px=values[:, 1:5], score=np.full(len(values), np.nan), class_id=values[:, 6], observed=values[:, 7] == 0,
+    )  # fmt: skip
     if doubt:
-        rows.doubt(f": {doubt}", "clock")
+        rows.find(f": {doubt}", "clock")
     if parser.tracks:
         own = values[:, _ID].astype(int)
-        ids, new_ids, remarks = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
-        rows.id, rows.made_ids = ids[own].astype(float), new_ids
+        ids, facts.made_ids, remarks = _ids(path, parser.tracks, np.bincount(own, minlength=len(parser.tracks)))
+        rows.id = ids[own].astype(float)
         rows.remarks += remarks
     if parser.unread:
         shown = ", ".join(repr(text) for text in list(parser.unread)[:3])
         unread = f": {parser.unread.total()} boxes have a track_id that is not a whole number ({shown})"
-        rows.doubt(f"{unread}; these are not read")
+        rows.find(f"{unread}; these are not read")
     if parser.interpolated:
         rows.remark(f": {parser.interpolated} boxes are interpolated between others of their tracks")
     if parser.rotated:
-        rows.doubt(f": {parser.rotated} boxes are rotated, and taken without their rotation")
+        rows.find(f": {parser.rotated} boxes are rotated, and taken without their rotation")
     if left := _counted(parser.others):
-        rows.doubt(f" also holds {left}; they are left out, because they are no boxes", "left-out")
-    return rows.settled(role, wanted, names)
+        rows.find(f" also holds {left}; they are left out, because they are no boxes", "left-out")
+    return rows
+
+
+def _size(parser: _Parser) -> tuple[int, int] | None:
+    """Width and height of the pictures, by the description of the task."""
+    width, height = (parser.meta.get(name, "") for name in ("width", "height"))
+    return (int(width), int(height)) if is_count(width, 6) and is_count(height, 6) and int(width) else None
 
 
 def _counted(others: Counter[str]) -> str:
     return ", ".join(f"{count} of <{name}>" for name, count in others.most_common())
 
 
-def _classes(labels: dict[str, int]) -> tuple[Floats, dict[int, str]]:
-    """The class number of each label, and names by number; those that aren't people follow in alphabetical order."""
-    others = sorted({name for name in labels if name and not is_person(name) and name.casefold() != "unknown"})
-    places = {name: place for place, name in enumerate(others, start=PERSON + 1)}
-    numbers = [PERSON if is_person(name) else places.get(name, NO_CLASS) for name in labels]
-    names = {number: name for name, number in zip(labels, numbers, strict=True) if number != NO_CLASS}
-    return np.array(numbers, float), names or {PERSON: "person"}
-
-
-def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, str]:
-    """The frames (F,) that were annotated, and what is odd: those of the images or the task, or up to the last box."""
+def _frames(parser: _Parser, frame: Floats) -> tuple[Ints, bool, str]:
+    """The frames (F,) that were annotated, whether the file states them, and what is odd: those of the images or the
+    task, or up to the last box.
+    """
     if parser.images:
-        return np.array(sorted(parser.images), np.int64), ""
+        return np.array(sorted(parser.images), np.int64), True, ""
     first, last, every = parser.span()
     if not first <= last < first + _MAX_FRAMES:
-        return np.arange(int(frame.min()), int(min(frame.max(), frame.min() + _MAX_FRAMES)) + 1), ""
+        return np.arange(int(frame.min()), int(min(frame.max(), frame.min() + _MAX_FRAMES)) + 1), False, ""
     frames = np.arange(first, last + 1, every)
     others = ~np.isin(frame, frames)
     if not others.any():
-        return frames, ""
+        return frames, True, ""
     listed = f"frames {first} to {last}" + (f" in steps of {every}" if every > 1 else "")
     text = (
         f"{int(others.sum())} boxes are in frames that its task doesn't have ({listed}), as in {frame[others][0]:.0f}"
     )
-    return np.unique(frame.astype(np.int64)), f"{text}; frames are taken as they are, and only those with boxes count"
+    return (
+        np.unique(frame.astype(np.int64)),
+        False,
+        f"{text}; frames are taken as they are, and only those with boxes count",
+    )
 
 
 def _ids(path: Path, tracks: list[_Track], counts: Any) -> tuple[Ints, Ints | None, list[str]]:

@@ -16,48 +16,39 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
-from mcaptrack.schema.classes import PERSON, is_person
-from mcaptrack.sources.ingest.labels.content import (
-    FRAME,
-    MAX_FRAME,
-    NO_CLASS,
-    NO_ID,
-    UNKNOWN_FIRST,
-    BoxRows3D,
-    Format,
+from mcaptrack.sources.ingest.labels.format import MAX_LINE, Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import (
+    ClassNames,
     FrameNames,
-    Labels,
     Lines,
-    NumberTable,
     TrackIds,
-    WantedClasses,
     headings,
     lines_of,
     numbered,
+    read_numbers,
 )
-from mcaptrack.sources.ingest.labels.formats import ClassNames
 
 #: Columns that supervision writes before those of the user.
 SUPERVISION: Final = ("x_min", "y_min", "x_max", "y_max", "class_id", "confidence", "tracker_id")
 _DELIMITERS: Final = ",;\t"
 #: Where one of these separates cells, a comma in a number is a decimal comma.
 _NOT_COMMAS: Final = (";", "\t")
-#: The largest number of characters of a row.
-MAX_LINE: Final = 65536
 _MAX_COLUMNS: Final = 1024
 _LEAST_COLUMNS: Final = 4
 #: Between cells of rows that come from JSON.
 _SEPARATOR: Final = "\x1f"
 #: The column that counts frames from 0, as examples of supervision add it.
 _FRAME_INDEX: Final = "frame_index"
+#: The columns of MOTChallenge, in which a comment may name them.
+_MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}
 #: Keys of columns that make a box.
 _OF_BOXES: Final = ("x", "y", "w", "h", "x2", "y2", "cx", "cy")
 #: Values of cells that state nothing.
@@ -134,9 +125,9 @@ class _Opened(NamedTuple):
         return math.nan if is_empty(text) else float(self.decimal(text))
 
 
-def _opened(path: Path) -> _Opened:
+def _opened(file: LabelFile) -> _Opened:
     """Read the header of a table. Raises McaptrackError if it has none."""
-    lines = lines_of(path, MAX_LINE)
+    path, lines = file.path, file.lines(MAX_LINE)
     number, first = next(lines, (0, ""))
     if not number:
         raise McaptrackError(f"{path} holds no labels")
@@ -152,14 +143,16 @@ def _opened(path: Path) -> _Opened:
     return _Opened(path, number, header, lines, partial(split_row, path, delimiter), delimiter)
 
 
-class _Cells(NumberTable):
+class _Cells:
     """The rows of a table as numbers: ``columns`` (N,) by what they hold, and the names that numbers of classes mean.
 
-    ``at`` are the columns that are read; ``readers`` make numbers of those that hold something else.
+    ``places`` are the columns that are read; ``readers`` make numbers of those that hold something else.
     """
 
-    def __init__(self, table: _Opened, at: Mapping[str, int], readers: Mapping[str, Callable[[str], float]]) -> None:
-        header, keys = table.header, sorted(at, key=at.__getitem__)
+    def __init__(
+        self, table: _Opened, places: Mapping[str, int], readers: Mapping[str, Callable[[str], float]]
+    ) -> None:
+        header, keys = table.header, sorted(places, key=places.__getitem__)
         if len(header) > _MAX_COLUMNS:
             raise McaptrackError(f"{table.where}: more than {_MAX_COLUMNS} columns")
         self.classes, self.names = ClassNames(), ClassNames()
@@ -172,7 +165,7 @@ class _Cells(NumberTable):
             except ValueError as error:
                 if "column" in str(error):
                     raise
-                problem = f"the column {header[at[key]]} holds {text.strip()[:40]!r}, which is no number"
+                problem = f"the column {header[places[key]]} holds {text.strip()[:40]!r}, which is no number"
                 if table.delimiter == "," in text:
                     problem += "; decimal commas are read where semicolons or tabs separate the columns"
                 raise ValueError(problem) from None
@@ -180,15 +173,15 @@ class _Cells(NumberTable):
         def parse(parts: list[str]) -> list[float]:
             if len(parts) != len(header):
                 raise ValueError(f"{len(parts)} columns, and the header has {len(header)}")
-            return [cell(key, parts[at[key]]) for key in keys]
+            return [cell(key, parts[places[key]]) for key in keys]
 
-        what = f"a row of {', '.join(header[at[key]] for key in keys)}"
-        super().__init__(table.path, table.lines, what, len(keys), parse, table.split)
-        self.columns = {key: self.values[:, place] for place, key in enumerate(keys)}
-        self.none = np.full(len(self.values), np.nan)
-        unit = f" in {unit_of(header[at['t']])[0]}" if "t" in at else ""
-        used = ", ".join(f"{key}={header[at[key]]}{unit * (key == 't')}" for key in keys)
-        unused = [name for place, name in enumerate(header) if name and place not in at.values()]
+        what = f"a row of {', '.join(header[places[key]] for key in keys)}"
+        values, self.at = read_numbers(table.path, table.lines, what, len(keys), parse, table.split)
+        self.columns = {key: values[:, place] for place, key in enumerate(keys)}
+        self.none = np.full(len(values), np.nan)
+        unit = f" in {unit_of(header[places['t']])[0]}" if "t" in places else ""
+        used = ", ".join(f"{key}={header[places[key]]}{unit * (key == 't')}" for key in keys)
+        unused = [name for place, name in enumerate(header) if name and place not in places.values()]
         more = f"; not read: {', '.join(unused)}"[:300] if unused else ""
         #: Which columns were read, as text.
         self.remark = f"{table.path}: columns {used}{more}"
@@ -201,33 +194,106 @@ class _Cells(NumberTable):
         """Columns (N, K) side by side."""
         return np.stack([self.column(key) for key in keys], axis=-1)
 
+    def name_classes(self, facts: LabelFacts) -> Floats:
+        """The classes of rows (N,), with their names in the facts: numbers, with the names beside them, or names."""
+        columns, texts = self.columns, self.classes.names
+        kind, name = columns.get("class"), columns.get("name")
+        facts.named_by = "file"
+        if kind is not None and texts and all(_is_number(text) for text in texts.values()):
+            stated = np.isfinite(kind)
+            number = np.full(len(kind), float(NO_CLASS))
+            number[stated] = np.array([float(text) for text in texts.values()])[kind[stated].astype(int)]
+            both = stated & np.isfinite(columns.get("name", self.none))
+            pairs = {} if name is None else dict(zip(number[both].tolist(), name[both].tolist(), strict=True))
+            is_unique = name is not None and len(set(zip(number[both], name[both], strict=True))) == len(pairs)
+            if name is None:
+                facts.named_by = ""
+            elif is_unique and all(own == int(own) for own in pairs):
+                facts.names = {int(own): self.names.names[int(other)] for own, other in pairs.items()}
+            if name is None or facts.names is not None:
+                return number
+        kind, facts.names = (kind, texts) if name is None else (name, self.names.names)
+        facts.numbering = {}
+        if kind is None or not facts.names:
+            facts.named_by, facts.names, facts.numbering = "", None, None
+        return np.nan_to_num(self.none if kind is None else kind, nan=NO_CLASS)
+
 
 def _number_of_name(numbers: ClassNames, text: str) -> float:
     return math.nan if is_empty(text) else numbers.number(text.strip())
 
 
-def read_csv(path: Path, role: Role, chosen: Mapping[str, str], name: Format, wanted: WantedClasses) -> Labels:
-    """Read a table with a header; ``chosen`` are names of columns by key, see ``KEYS``."""
-    return _read_table(_opened(path), role, chosen, name, wanted)
+def is_table(file: LabelFile) -> bool:
+    """Whether a text has a header, other than a comment with the columns of MOTChallenge."""
+    if not file.row:
+        return False
+    try:
+        if header_of(file.path, file.row):
+            return True
+        names = comment_header(file.path, file.row)
+        columns = choose_columns(str(file.path), names, {}) if names else _MOT_COLUMNS
+    except McaptrackError:
+        return False
+    return any(columns.get(key) != place for key, place in _MOT_COLUMNS.items())
 
 
-def read_rows(path: Path, content: list[Any], role: Role, chosen: Mapping[str, str], wanted: WantedClasses) -> Labels:
-    """Read rows of supervision's JSONSink: objects with the same keys."""
-    header = [str(key) for key in content[0]][: _MAX_COLUMNS + 1]
+class Csv(Format):
+    """Tables with a header, of boxes in pictures and in metres."""
 
-    def lines() -> Iterator[tuple[int, str]]:
-        for number, row in enumerate(content, start=1):
-            if not isinstance(row, dict) or list(row)[: len(header)] != header:
-                raise McaptrackError(f"{path}: row {number} has other keys than the first one: {str(row)[:60]}")
-            yield number, _SEPARATOR.join(str(value).replace(_SEPARATOR, " ")[:MAX_LINE] for value in row.values())
+    title = "tables with a header"
+    row = "columns by their names: `frame,x,y,w,h,score,class,id`"
+    takes = ("columns",)
 
-    table = _Opened(path, 1, header, lines(), lambda line: line.split(_SEPARATOR))
-    return _read_table(table, role, chosen, "supervision", wanted)
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether the first row names columns, or a comment before it."""
+        return is_table(file)
+
+    def holds_3d(self, file: LabelFile, columns: Mapping[str, str]) -> bool:
+        """Whether the columns are those of boxes in metres, by their names, or as the user has it."""
+        return holds_boxes_3d(file.path, file.row, columns)
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The rows of a table."""
+        if self.holds_3d(file, asked.columns):
+            return _read_table_3d(_opened(file), asked.columns)
+        return _read_table(_opened(file), "csv", asked.columns)
 
 
-def _read_table(table: _Opened, role: Role, chosen: Mapping[str, str], name: Format, wanted: WantedClasses) -> Labels:
+class Supervision(Format):
+    """Tables of the CSVSink of supervision, and JSON of its JSONSink."""
+
+    title = "supervision"
+    row = f"`{','.join(SUPERVISION)},...`, or JSON with these keys"
+    takes = ("columns",)
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether the columns, or the keys, are those of supervision."""
+        if file.is_json:
+            return isinstance(file.json, list) and "x_min" in file.keys if file.keys else False
+        return set(SUPERVISION) <= set(header_of(file.path, file.row)) if file.row else False
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The rows of a table, or of JSON: objects with the same keys."""
+        if not file.is_json:
+            return _read_table(_opened(file), "supervision", asked.columns)
+        path, content = file.path, file.json
+        if not isinstance(content, list) or not content or not isinstance(content[0], dict):
+            raise McaptrackError(f"{path} holds no rows of supervision: a list of objects with x_min, y_min, ...")
+        header = [str(key) for key in content[0]][: _MAX_COLUMNS + 1]
+
+        def lines() -> Iterator[tuple[int, str]]:
+            for number, row in enumerate(content, start=1):
+                if not isinstance(row, dict) or list(row)[: len(header)] != header:
+                    raise McaptrackError(f"{path}: row {number} has other keys than the first one: {str(row)[:60]}")
+                yield number, _SEPARATOR.join(str(value).replace(_SEPARATOR, " ")[:MAX_LINE] for value in row.values())
+
+        table = _Opened(path, 1, header, lines(), lambda line: line.split(_SEPARATOR))
+        return _read_table(table, "supervision", asked.columns)
+
+
+def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
     path, header = table.path, table.header
-    at = choose_columns(table.where, header, chosen)
+    places = choose_columns(table.where, header, chosen)
     frames, ids = FrameNames(), TrackIds()
 
     def id_of(text: str) -> float:
@@ -239,23 +305,19 @@ def _read_table(table: _Opened, role: Role, chosen: Mapping[str, str], name: For
     def frame_of(text: str) -> float:
         return float(text) if _is_number(text) else frames.number(text.strip())
 
-    cells = _Cells(table, at, {"frame": frame_of, "id": id_of})
-    remarks = [cells.remark]
+    cells = _Cells(table, places, {"frame": frame_of, "id": id_of})
     track_id, said = ids.of(path, cells.column("id"))
-    remarks += said
-    if (
-        "id" in at
-        and header[at["id"]].lower() == "id"
-        and "id" not in chosen
-        and len(np.unique(track_id)) == len(track_id) > 1
-    ):
-        remarks.append(f"{path}: every box has another {header[at['id']]}, so it numbers rows, not tracks")
+    remarks, facts = [cells.remark, *said], LabelFacts(path, name)
+    are_rows = "id" in places and header[places["id"]].lower() == "id" and "id" not in chosen
+    if are_rows and len(np.unique(track_id)) == len(track_id) > 1:
+        remarks.append(f"{path}: every box has another {header[places['id']]}, so it numbers rows, not tracks")
         track_id = np.full(len(track_id), float(NO_ID))
-    kind, class_names = _classes(cells)
-    boxes, frame, score = _boxes(cells.columns), cells.column("frame"), cells.column("score")
-    rows = Labels(path, name, cells.at, frame, track_id, boxes, score, kind, remarks=remarks, first_frame=UNKNOWN_FIRST)
-    if "t" in at:
-        seconds = cells.columns["t"] * unit_of(header[at["t"]])[1]
+    rows = BoxTable(
+        facts=facts, at=cells.at, frame=cells.column("frame"), id=track_id, boxes_px=_boxes(cells.columns),
+        score=cells.column("score"), class_id=cells.name_classes(facts), remarks=remarks,
+    )  # fmt: skip
+    if "t" in places:
+        seconds = cells.columns["t"] * unit_of(header[places["t"]])[1]
         rows.refuse(
             ~(np.isfinite(seconds) & (seconds >= 0) & (seconds < _MAX_SECONDS)),
             lambda row: (
@@ -263,15 +325,11 @@ def _read_table(table: _Opened, role: Role, chosen: Mapping[str, str], name: For
                 "may end with _ms, _us or _ns"
             ),
         )
-        rows.times_s, rows.frame = np.unique(seconds, return_inverse=True)
-        rows.first_frame = 0
-    rows.frame = rows.whole(rows.frame, FRAME, 0, MAX_FRAME)
-    rows = rows.with_boxes(cells.stacked(key for key in _OF_BOXES if key in at))
-    if name == "csv":
-        rows.take_shares()
-    if name == "supervision" and header[at.get("frame", 0)].lower() == _FRAME_INDEX:
-        rows.first_frame = 0
-    return rows.settled(role, wanted, class_names)
+        facts.times_s, rows.frame = np.unique(seconds, return_inverse=True)
+        facts.first_frame = 0
+    if name == "supervision" and header[places.get("frame", 0)].lower() == _FRAME_INDEX:
+        facts.first_frame = 0
+    return rows.with_boxes(cells.stacked(key for key in _OF_BOXES if key in places))
 
 
 def _boxes(columns: Mapping[str, Floats]) -> Floats:
@@ -289,32 +347,6 @@ def unit_of(header: str) -> tuple[str, float]:
     text = header.strip().lower()
     units = (unit for unit in _UNITS.items() if text.endswith((f"_{unit[0]}", f" {unit[0]}", f"({unit[0]})")))
     return next(units, ("s", 1.0))
-
-
-def _classes(cells: _Cells) -> tuple[Floats, dict[int, str] | None]:
-    """The classes of rows as numbers (N,), and their names by number, None if there are none."""
-    columns, classes, names = cells.columns, cells.classes, cells.names
-    none = np.full(len(cells.none), float(NO_CLASS))
-    number = columns.get("class")
-    if number is not None and classes.names and all(_is_number(name) for name in classes.names):
-        stated = np.isfinite(number)
-        values = np.array([float(name) for name in classes.names])
-        none[stated] = values[number[stated].astype(int)]
-        if "name" not in columns:
-            return none, None
-        both = stated & np.isfinite(columns["name"])
-        pairs = set(zip(none[both].tolist(), columns["name"][both].tolist(), strict=True))
-        if len({number for number, _ in pairs}) == len(pairs) and all(number == int(number) for number, _ in pairs):
-            return none, {int(number): names.names[int(other)] for number, other in pairs}
-    column, texts = (columns["name"], names.names) if "name" in columns else (number, classes.names)
-    if column is None or not texts:
-        return none, None
-    others = sorted({text.lower() for text in texts if not is_person(text)})
-    places = {text: place for place, text in enumerate(others, start=PERSON + 1)}
-    ids = [places.get(text.lower(), PERSON) for text in texts]
-    stated = np.isfinite(column)
-    none[stated] = np.array(ids, float)[column[stated].astype(int)]
-    return none, dict(reversed(list(zip(ids, texts, strict=True))))
 
 
 # Which columns hold what: as the user names them, or by common headers.
@@ -492,7 +524,7 @@ _HEADERS_3D: Final[Mapping[str, tuple[str, ...]]] = {
     "vy_m_per_s": ("vympers", "vyms", "vym/s", "vy", "velocityy"),
 }
 #: Headers that only tables of 3D boxes have.
-_ONLY_3D: Final = frozenset(("zm", "tzm", "lengthm", "headingrad", "headingdeg"))
+_ONLY_3D: Final = frozenset(("xm", "ym", "zm", "tzm", "lengthm", "headingrad", "headingdeg"))
 #: A length in another unit than metres, at the end of a header.
 _OTHER_UNIT: Final = re.compile(r"(?:^|[_ \[(])(mm|cm|km|ft|feet|inch|inches|px)[\])]?$", re.IGNORECASE)
 
@@ -505,50 +537,47 @@ def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
     if not header:
         return False
     plain = _plain(header)
-    if {"xm", "ym"} <= set(plain) or _ONLY_3D & set(plain):
+    if _ONLY_3D & set(plain):
         return True
     keys = {key for key, names in _HEADERS_3D.items() if set(names) & set(plain)}
     return set(_PLACE) <= keys and bool(keys & {*_HEADING, "qw"})
 
 
-def read_table_3d(path: Path, chosen: Mapping[str, str]) -> BoxRows3D:
-    """Read a table of 3D boxes; ``chosen`` are names of columns by key. Raises McaptrackError, with the line, if it is
-    invalid.
-    """
-    table = _opened(path)
-    at = _choose_columns_3d(table.where, table.header, chosen)
+def _read_table_3d(table: _Opened, chosen: Mapping[str, str]) -> BoxTable:
+    path, places = table.path, _choose_columns_3d(table.where, table.header, chosen)
     times, ids = list[int](), list[str]()
 
     def time_in(text: str) -> float:
-        times.append(_exact_ns(table.decimal(text), unit_of(table.header[at["t"]])[1]))
+        times.append(_exact_ns(table.decimal(text), unit_of(table.header[places["t"]])[1]))
         return 0.0
 
     def id_in(text: str) -> float:
         ids.append(text.strip())
         return 0.0
 
-    cells = _Cells(table, at, {"t": time_in, "id": id_in})
-    kind = cells.column("name" if "name" in at else "class")
-    remarks = [cells.remark]
-    heading = cells.columns.get("heading_rad", np.radians(cells.column("heading_deg")))
-    if "qw" in at:
+    cells = _Cells(table, places, {"t": time_in, "id": id_in})
+    remarks, heading = [cells.remark], cells.columns.get("heading_rad", np.radians(cells.column("heading_deg")))
+    if "qw" in places:
         has_box, heading = np.isfinite(cells.column("x_m")), cells.none.copy()
         kept = np.flatnonzero(has_box)
-        quaternions = cells.stacked(_QUATERNION)[has_box]
-        heading[has_box] = headings(quaternions, path, lambda row: cells.at(int(kept[row])))[0]
+        heading[has_box] = headings(cells.stacked(_QUATERNION)[has_box], path, lambda row: cells.at(int(kept[row])))[0]
     track_id = np.full(len(cells.none), NO_ID)
-    if "id" in at:
+    if "id" in places:
         is_known = np.array([not is_empty(text) and text not in _NO_IDS for text in ids], bool)
         track_id[is_known], are_numbers = numbered([ids[row] for row in np.flatnonzero(is_known)])
         if not are_numbers:
             remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
-    frame = np.array(times, np.int64) if "t" in at else cells.whole(cells.column("frame"), FRAME, 0, MAX_FRAME)
+    facts = LabelFacts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
+    facts.names = (cells.names if "name" in places else cells.classes).names
     boxes = np.column_stack([cells.stacked((*_PLACE, *_SIZE)), heading])
-    kind = np.where(np.isfinite(kind), kind, NO_CLASS).astype(np.int64)
-    rows = BoxRows3D(path, "csv", cells.at, frame, track_id, boxes, cells.column("score"), kind, remarks=remarks)
-    rows.names = (cells.names if "name" in at else cells.classes).names
-    rows.velocity, rows.is_timed = cells.stacked(_VELOCITY), "t" in at
-    rows.labelled = np.unique(frame)
+    kind = cells.column("name" if "name" in places else "class")
+    rows = BoxTable(
+        facts=facts, at=cells.at, frame=np.array(times, np.int64) if "t" in places else cells.column("frame"),
+        id=track_id, boxes_m=boxes, score=cells.column("score"), class_id=np.nan_to_num(kind, nan=NO_CLASS),
+        velocity=cells.stacked(_VELOCITY), remarks=remarks,
+    )  # fmt: skip
+    if not facts.names:
+        facts.names, facts.numbering, facts.named_by = None, None, ""
     return rows.with_boxes(boxes[:, :6])
 
 

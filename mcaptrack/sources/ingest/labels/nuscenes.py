@@ -10,8 +10,9 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.sources.ingest.labels.content import BoxRows3D, headings, numbered
-from mcaptrack.sources.ingest.labels.formats import ClassNames
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import ClassNames, headings, numbered
 
 TABLES: Final = ("scene", "sample", "sample_annotation", "instance", "category")
 #: The classes of the detection and tracking tasks, and the categories that they consist of.
@@ -54,8 +55,25 @@ def tables_folder(path: Path) -> Path | None:
     return complete[0] if complete else None
 
 
-def read_nuscenes(path: Path, scene: str | None) -> BoxRows3D:
-    """Read the boxes of a scene, at all of its samples. Raises McaptrackError, with the table, if they are invalid."""
+class NuScenes(Format):
+    """The folder of the tables of a set; of these, a scene."""
+
+    title = "nuScenes"
+    row = "a folder with `sample_annotation.json` and the tables beside it"
+    takes = ("scene",)
+    in_space = True
+    reads_folders = True
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether a folder has the tables of nuScenes."""
+        return tables_folder(file.path) is not None
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The boxes of a scene, at all of its samples."""
+        return _read(file.path, asked.scene)
+
+
+def _read(path: Path, scene: str | None) -> BoxTable:
     folder = tables_folder(path)
     if folder is None:
         raise McaptrackError(f"{path} holds no tables of nuScenes: sample_annotation.json and others")
@@ -103,12 +121,15 @@ def read_nuscenes(path: Path, scene: str | None) -> BoxRows3D:
     remarks = [f"{folder}: {len(samples)} samples; tracks are numbered from 1 on, a number for each instance"]
     if unseen:
         remarks.append(f"{folder}: {unseen} of {len(boxes)} boxes have no points of lidar or radar; they stay")
-    t_ns, track_id = np.array(times, np.int64), numbered([f"#{track}" for track in ids])[0]
-    none, kind = np.full(len(boxes), np.nan), np.array(kinds, np.int64)
-    rows = BoxRows3D(path, "nuscenes", at, t_ns, track_id, values, none, kind, remarks=remarks, frame_id=FRAME)
-    rows.names, rows.is_timed, rows.usual = names.names, True, frozenset(_CLASSES)
-    rows.labelled = np.unique(np.array(list(samples.values()), np.int64))
-    return rows
+    facts = LabelFacts(
+        path, "nuscenes", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=FRAME
+    )
+    facts.usual, facts.states_labelled = frozenset(_CLASSES), True
+    facts.labelled = np.unique(np.array(list(samples.values()), np.int64))
+    return BoxTable(
+        facts=facts, at=at, frame=np.array(times, np.int64), id=numbered([f"#{track}" for track in ids])[0],
+        boxes_m=values, score=np.full(len(boxes), np.nan), class_id=np.array(kinds, np.int64), remarks=remarks,
+    )  # fmt: skip
 
 
 def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> str:

@@ -1,17 +1,17 @@
-"""Label formats of other packages (``contracts.LabelFormat``): which file is of which, and their boxes, checked.
+"""Label formats of other packages (``contracts.Format``): which file is of which, and their boxes, checked.
 
 Letters: N rows, F frames.
 """
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.choices import Role
 from mcaptrack.contracts import LabelBoxes, is_in_space
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
@@ -19,111 +19,58 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
-from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.schema.provenance import Plugin
-from mcaptrack.sources.ingest.labels.content import (
-    MAX_FRAME,
-    NO_CLASS,
-    NO_ID,
-    BoxRows3D,
-    Labels,
-    WantedClasses,
-    numbered,
-)
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import ClassNames, numbered
 
 _KIND: Final = "label_format"
 
 
-class FormatOfPackage(NamedTuple):
-    """A format, as the registry found it, and its object."""
+class FormatOfPackage(Format):
+    """A format of another package, as the registry found it, and its object."""
 
-    entry: Entry
-    format: Any
-    in_space: bool
+    reads_folders = True
+
+    def __init__(self, entry: Entry, made: Any) -> None:
+        self.entry, self._made, self.in_space = entry, made, is_in_space(entry, made)
 
     @property
-    def plugin(self) -> Plugin:
-        """Its description in the provenance of a channel."""
-        return Plugin(self.entry.name, self.entry.implementation, self.entry.distribution, self.entry.version)
+    def recognises_any(self) -> bool:
+        """Whether it can tell its files from others."""
+        return hasattr(self._made, "recognises")
 
-    def recognises(self, path: Path) -> bool:
+    def recognises(self, file: LabelFile) -> bool:
         """Whether a file is of this format, as far as it can tell."""
-        if not hasattr(self.format, "recognises"):
+        if not self.recognises_any:
             return False
-        with blamed(self.entry, f"failed to look at {path}"):
-            return bool(self.format.recognises(path))
+        with blamed(self.entry, f"failed to look at {file.path}"):
+            return bool(self._made.recognises(file.path))
 
     def boxes(self, path: Path) -> LabelBoxes:
         """The boxes of a file. Raises McaptrackError, with the format, if it can't be read."""
         refuse_special(path)
         with blamed(self.entry, f"can't read {path}"):
-            boxes = self.format.read(path)
+            boxes = self._made.read(path)
         if not isinstance(boxes, LabelBoxes):
             raise McaptrackError(f"{self.entry} gave a {type(boxes).__name__} of {path}; read has to give LabelBoxes")
         return boxes
 
-    def labels(self, path: Path, role: Role, wanted: WantedClasses) -> Labels:
-        """The boxes of a file in pictures, checked as those of all formats are."""
-        given = self._columns(path)
-        rows = Labels(
-            path, self.entry.name, given.at, given.frame, given.id, given.boxes, given.score, given.kind,
-            labelled=given.labelled, first_frame=given.first_frame, plugin=self.plugin, times_s=given.times_s,
-        )  # fmt: skip
-        numbers = _numbers_of(given.names)
-        rows.class_id = np.array([*numbers, NO_CLASS])[given.kind]
-        with self._named():
-            settled = rows.settled(role, wanted, dict(zip(numbers, given.names, strict=True)) or None)
-            if role != "detections":
-                settled.refuse_repeated_ids()
-        return settled
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The boxes of a file."""
+        path, boxes = file.path, self.boxes(file.path)
+        with blamed(self.entry, f"gave what are no boxes of {path}"):
+            table = _table_of(path, self.entry.name, boxes, self.in_space)
+        entry = self.entry
+        table.facts.plugin = Plugin(entry.name, entry.implementation, entry.distribution, entry.version)
+        return table
 
-    def rows_3d(self, path: Path, role: Role) -> BoxRows3D:
-        """The boxes of a file in space, checked as those of all formats are."""
-        given = self._columns(path)
-        if given.times_s is not None:
-            times = np.rint(given.times_s * NS_PER_S).astype(np.int64)
-            given = given._replace(frame=times[given.frame], labelled=times[given.labelled])
-        rows = BoxRows3D(
-            path, self.entry.name, given.at, given.frame, given.id, given.boxes, given.score, given.kind,
-            labelled=np.union1d(given.labelled, given.frame), plugin=self.plugin, names=given.names,
-            is_timed=given.times_s is not None, frame_id=given.frame_id,
-        )  # fmt: skip
-        with self._named():
-            rows.check(role)
-        return rows
-
-    def _named(self) -> Any:
+    def checking(self) -> AbstractContextManager[None]:
+        """A block in which refusals are of this format."""
         return blamed(self.entry, "gave boxes that can't be labels")
 
-    def _columns(self, path: Path) -> _Columns:
-        given = self.boxes(path)
-        with blamed(self.entry, f"gave what are no boxes of {path}"):
-            return _columns_of(path, given, self.in_space)
 
-
-class _Columns(NamedTuple):
-    """``LabelBoxes`` as arrays. ``frame`` (N,) and ``labelled`` (F,) are numbers of frames, or places in ``times_s``.
-    ``kind`` (N,) are places in ``names``, or -1.
-    """
-
-    path: Path
-    boxes: Floats
-    frame: Ints
-    id: Ints
-    kind: Ints
-    names: list[str]
-    score: Floats
-    labelled: Ints
-    times_s: Floats | None
-    first_frame: int
-    frame_id: str
-
-    def at(self, row: int) -> str:
-        """The place of a row in messages."""
-        return f"{self.path}: box {row + 1}"
-
-
-def _columns_of(path: Path, given: LabelBoxes, in_space: bool) -> _Columns:
+def _table_of(path: Path, name: str, given: LabelBoxes, in_space: bool) -> BoxTable:
     """Raise ValueError for what has another type, shape or range."""
     width = 7 if in_space else 4
     boxes = np.asarray(given.boxes, np.float64)
@@ -139,9 +86,19 @@ def _columns_of(path: Path, given: LabelBoxes, in_space: bool) -> _Columns:
     first = given.first_frame
     if isinstance(first, bool) or not isinstance(first, int | np.integer):
         raise ValueError(f"first_frame={first!r:.40}, which is no whole number")
-    return _Columns(
-        path, boxes, frame, _ids(given, count), kind, names, score, labelled, times_s, int(first), str(given.frame_id)
-    )
+    facts = LabelFacts(
+        path, name, first_frame=int(first), times_s=times_s, labelled=labelled, frame_id=str(given.frame_id),
+        states_labelled=given.labelled is not None, names=names or None, numbering={} if names else None,
+        named_by="file" if names else "",
+    )  # fmt: skip
+    table = BoxTable(
+        facts=facts, at=lambda row: f"{path}: box {row + 1}", frame=frame, id=_ids(given, count), score=score,
+        class_id=kind, boxes_px=None if in_space else boxes, boxes_m=boxes if in_space else None,
+    )  # fmt: skip
+    if in_space and times_s is not None:
+        times = np.rint(times_s * NS_PER_S).astype(np.int64)
+        table.frame, facts.labelled, facts.times_s, facts.is_timed = times[frame], times[labelled], None, True
+    return table
 
 
 def _frames(given: LabelBoxes, count: int) -> tuple[Ints, Ints, None]:
@@ -194,22 +151,15 @@ def _ids(given: LabelBoxes, count: int) -> Ints:
     return out
 
 
-def _classes(given: LabelBoxes, count: int) -> tuple[Ints, list[str]]:
-    """The place of the class of each box (N,) among the names, or -1; and the names, in alphabetical order."""
+def _classes(given: LabelBoxes, count: int) -> tuple[Ints, dict[int, str]]:
+    """The class of each box (N,), as the number of a name, or ``NO_CLASS``; and the names."""
     if given.class_name is None:
-        return np.full(count, NO_CLASS), []
+        return np.full(count, NO_CLASS), {}
     texts = list(given.class_name)
     if isinstance(given.class_name, str) or len(texts) != count or not all(isinstance(text, str) for text in texts):
         raise ValueError(f"class_name that are not {count} texts")
-    names = sorted({text for text in texts if text.strip()})
-    places = {name: place for place, name in enumerate(names)}
-    return np.array([places.get(text, NO_CLASS) for text in texts], np.int64), names
-
-
-def _numbers_of(names: list[str]) -> list[int]:
-    """The class ids of names: people are 1, the others follow in their order."""
-    rest = iter(range(PERSON + 1, PERSON + 1 + len(names)))
-    return [PERSON if is_person(name) else next(rest) for name in names]
+    names = ClassNames()
+    return np.array([names.number(text) for text in texts], np.int64), names.names
 
 
 def format_of_package(name: str) -> FormatOfPackage | None:
@@ -222,23 +172,22 @@ def format_of_package(name: str) -> FormatOfPackage | None:
 
 @lru_cache(maxsize=16)
 def _made(entry: Entry) -> FormatOfPackage:
-    made = entry.made("read")
-    return FormatOfPackage(entry, made, is_in_space(entry, made))
+    return FormatOfPackage(entry, entry.made("read"))
 
 
-def recognised(path: Path) -> FormatOfPackage | None:
+def recognised(file: LabelFile) -> FormatOfPackage | None:
     """The format of another package that a file is of, by what these say; one that can't say is named in a warning.
 
     Raises McaptrackError if several say so.
     """
-    found: list[FormatOfPackage] = []
+    formats: list[FormatOfPackage] = []
     for name in others(_KIND):
         try:
             made = format_of_package(name)
-            found += [made] if made is not None and made.recognises(path) else []
+            formats += [made] if made is not None and made.recognises(file) else []
         except McaptrackError as error:
             warn(str(error), "other")
-    if len(found) > 1:
-        names = " and ".join(str(made.entry) for made in found)
-        raise McaptrackError(f"{path} is of the {names}; choose one with `label_format=`")
-    return found[0] if found else None
+    if len(formats) > 1:
+        names = " and ".join(str(made.entry) for made in formats)
+        raise McaptrackError(f"{file.path} is of the {names}; choose one with `label_format=`")
+    return formats[0] if formats else None

@@ -1,4 +1,4 @@
-"""Read boxes in JSON: annotations and results of COCO, and the JSONSink of supervision.
+"""COCO: annotations (images, annotations, categories), and results (image_id, category_id, bbox, score).
 
 Letters: N rows, F frames.
 """
@@ -14,26 +14,12 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
-from mcaptrack import files
-from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import read_beginning
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.content import (
-    NO_CLASS,
-    NO_ID,
-    UNKNOWN_FIRST,
-    Format,
-    FrameNames,
-    Labels,
-    TrackIds,
-    WantedClasses,
-    is_count,
-    numbers_of_names,
-)
-from mcaptrack.sources.ingest.labels.delimited import read_rows
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, NOTHING, REGION, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import FrameNames, TrackIds, is_count, is_number, numbers_of_names
 
-_MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
 _MAX_CLASSES: Final = 65536
 _MAX_NAME: Final = 256
@@ -46,52 +32,32 @@ _BY_LIST: Final = "the list `images`"
 _COLUMNS: Final = 10
 
 
-def is_json(path: Path) -> bool:
-    """Whether the first character of a file is that of a JSON list or object."""
-    return read_beginning(path, 4096).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] in (b"{", b"[")
+class Coco(Format):
+    """Annotations or results, as the content tells."""
 
+    title = "COCO"
+    row = "JSON with `images`, `annotations` and `categories`; or results: `image_id`, `category_id`, `bbox`, `score`"
 
-def read_json(path: Path, label_format: Format, role: Role, chosen: Mapping[str, str], wanted: WantedClasses) -> Labels:
-    """Read JSON of COCO or of supervision, as its content tells. Raises McaptrackError if it is neither."""
-    content = files.read_json(path, "JSON", _MAX_BYTES)
-    labels = _read_content(path, content, role, chosen, wanted)
-    if label_format not in ("auto", labels.format):
-        raise McaptrackError(f"{path} is of the format {labels.format}, not {label_format}")
-    return labels
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether JSON has the keys of annotations or of results."""
+        keys = file.keys
+        if isinstance(file.json if keys else [], dict):
+            return isinstance(file.json.get("annotations"), list)
+        return "bbox" in keys and "image_id" in keys
 
-
-def holds_boxes(path: Path) -> bool:
-    """Whether JSON is of COCO or of supervision, by its keys. Raises McaptrackError for what is no JSON."""
-    return bool(_kind_of(files.read_json(path, "JSON", _MAX_BYTES)))
-
-
-def _kind_of(content: Any) -> str:
-    """The content of JSON: annotations, results or rows; "" for anything else."""
-    if isinstance(content, dict):
-        return "annotations" if isinstance(content.get("annotations"), list) else ""
-    first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
-    return "results" if "bbox" in first and "image_id" in first else "rows" if "x_min" in first else ""
-
-
-def _read_content(path: Path, content: Any, role: Role, chosen: Mapping[str, str], wanted: WantedClasses) -> Labels:
-    if isinstance(content, list) and not content:
-        raise McaptrackError(f"{path} holds no boxes")
-    kind = _kind_of(content)
-    if chosen and kind != "rows":
-        raise McaptrackError(f"{path}: `columns=` is for tables with a header, not for COCO")
-    first = content[0] if isinstance(content, list) and isinstance(content[0], dict) else {}
-    if kind == "annotations":
-        return _annotations(path, content).settled(role, wanted, _categories(path, content.get("categories")))
-    if kind == "results":
-        return _results(path, content).settled(role, wanted)
-    if kind == "rows":
-        return read_rows(path, content, role, chosen, wanted)
-    text = f"an object with {', '.join(content) or 'nothing'}"[:100] if isinstance(content, dict) else "a list"
-    raise McaptrackError(
-        f"{path} is JSON ({text}{' of ' + ', '.join(first) if first else ''}"[:300]
-        + "), but neither annotations (images, annotations, categories) nor results (image_id, category_id, bbox, "
-        "score) of COCO, nor rows of supervision (x_min, y_min, x_max, y_max, ...)"
-    )
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The rows of a file."""
+        path, content = file.path, file.json if file.is_json else {}
+        if content == []:
+            raise McaptrackError(f"{path} holds no boxes")
+        if not self.recognises(file):
+            raise McaptrackError(f"{path} is neither annotations (images, annotations, categories) nor results of COCO")
+        if isinstance(content, list):
+            return _results(path, content)
+        table = _annotations(path, content)
+        table.facts.names = _categories(path, content.get("categories"))
+        table.facts.named_by = "file" if table.facts.names else ""
+        return table
 
 
 class _Rows:
@@ -109,7 +75,7 @@ class _Rows:
         box = entry.get("bbox")
         if box is None or box == []:
             box = self._around(number, entry.get("segmentation"))
-        if not isinstance(box, list) or len(box) != 4 or not all(map(_is_number, box)):
+        if not isinstance(box, list) or len(box) != 4 or not all(map(is_number, box)):
             self.refuse(number, "has no bbox of 4 numbers: left, top, width, height")
         inner = entry.get("attributes")
         track_id = next((d[key] for d in (entry, inner) if isinstance(d, dict) for key in _TRACK_IDS if key in d), None)
@@ -119,7 +85,7 @@ class _Rows:
             track_id = self._texts.number(track_id[:_MAX_NAME])
         values = [entry.get("score"), category_id, track_id, entry.get("iscrowd", 0)]
         for value, key in zip(values, ("score", "category_id", "track_id", "iscrowd"), strict=True):
-            if value is not None and not isinstance(value, bool) and not _is_number(value):
+            if value is not None and not isinstance(value, bool) and not is_number(value):
                 self.refuse(number, f"has a {key} that isn't a number, {value!r:.40}")
         score, category, track_id, crowd = values
         try:
@@ -137,7 +103,7 @@ class _Rows:
             self.refuse(number, "has a mask (RLE) and no bbox; boxes are read")
         flat = [part for part in outline if isinstance(part, list)] if isinstance(outline, list) else []
         points = [value for part in flat for value in part[: len(part) // 2 * 2]]
-        if not points or not all(map(_is_number, points)):
+        if not points or not all(map(is_number, points)):
             return None
         self.outlined += 1
         x, y = ([_float(value) for part in flat for value in part[axis : len(part) // 2 * 2 : 2]] for axis in (0, 1))
@@ -149,26 +115,24 @@ class _Rows:
     def at(self, number: int) -> str:
         return f"{self._path}: {self._kind} {number}"
 
-    def done(self) -> Labels:
+    def done(self) -> BoxTable:
         """All rows."""
         values: Floats = np.frombuffer(self._values, np.float64).reshape(-1, _COLUMNS)
         frame, score, number, track_id, crowd, unseen = (values[:, at] for at in (0, 5, 6, 7, 8, 9))
         track_id, said = self._texts.of(self._path, track_id)
-        rows = Labels(self._path, "coco", self.at, frame, track_id, values[:, 1:5], score, number, remarks=said)
-        rows.first_frame, rows.crowd, rows.observed = UNKNOWN_FIRST, crowd != 0, unseen == 0
+        rows = BoxTable(
+            facts=LabelFacts(self._path, "coco", region="iscrowd"), at=self.at, frame=frame, id=track_id,
+            boxes_px=values[:, 1:5], score=score, class_id=number, observed=unseen == 0, remarks=said,
+            aside=np.where(crowd != 0, REGION, NOTHING) if crowd.any() else None,
+        )  # fmt: skip
         if self.outlined:
             rows.remark(f": {self.outlined} boxes are those around polygons, which have no bbox")
-        rows.take_shares()
         return rows
 
 
 def _whole_of_text(value: Any) -> Any:
     """Return the whole number that a text holds; anything else as it is."""
     return int(value) if isinstance(value, str) and is_count(value, 15) else value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _float(value: Any, missing: float = math.nan) -> float:
@@ -178,7 +142,7 @@ def _float(value: Any, missing: float = math.nan) -> float:
         return math.inf
 
 
-def _results(path: Path, content: list[Any]) -> Labels:
+def _results(path: Path, content: list[Any]) -> BoxTable:
     """Results: a list of image_id, category_id, bbox, score. The number of an image is that of its frame."""
     _check_count(path, content)
     rows, names = _Rows(path, "result"), FrameNames()
@@ -186,7 +150,7 @@ def _results(path: Path, content: list[Any]) -> Labels:
     def frame_of(image: Any) -> float:
         if isinstance(image, str):
             return names.number(image)
-        if not _is_number(image):
+        if not is_number(image):
             raise ValueError("has no image_id")
         return _float(image)
 
@@ -197,7 +161,7 @@ def _results(path: Path, content: list[Any]) -> Labels:
     return out
 
 
-def _annotations(path: Path, content: Mapping[str, Any]) -> Labels:
+def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
     """Annotations: images, annotations and categories."""
     images, entries = content.get("images"), content["annotations"]
     if not isinstance(images, list) or not all(isinstance(image, dict) and "id" in image for image in images):
@@ -222,17 +186,27 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> Labels:
     for number, entry in enumerate(entries):
         rows.add(number, entry, frame_of)
     out = rows.done()
-    out.labelled = np.unique(np.array(frames, np.int64))
-    out.first_frame = int(out.labelled[0]) if len(frames) else 0
+    facts = out.facts
+    is_labelled = np.array([image.get("is_labeled") is not False for image in images], bool)  # PoseTrack
+    numbers = np.array(frames, np.int64)
+    facts.labelled, facts.states_labelled = np.unique(numbers[is_labelled]), True
+    facts.first_frame = int(numbers.min()) if len(numbers) else 0
+    facts.is_first_assumed = facts.first_frame > 0
+    facts.sizes = {
+        frame: (_float(image["width"]), _float(image["height"]))
+        for frame, image in zip(frames, images, strict=True)
+        if is_number(image.get("width")) and is_number(image.get("height"))
+    }
+    sizes = {size for size in facts.sizes.values() if all(map(math.isfinite, size))}
+    if len(sizes) == 1 and len(facts.sizes) == len(images):
+        ((width, height),) = sizes
+        facts.size = (int(width), int(height))
     out.remark(f": {len(images)} images, in order of {order}")
+    if not is_labelled.all():
+        out.remark(f": {int((~is_labelled).sum())} images are not labelled (is_labeled)")
     if order == _BY_LIST and len(images) > 1:
         text = ": its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
-        out.doubt(f"{text} is taken as that of the pictures", "clock")
-    if out.first_frame > 1:
-        text = f": its first image has the number {out.first_frame}, and is assumed to be the first picture"
-        out.doubt(f"{text}; `first_frame=` sets the number", "clock")
-    if not out.is_normalised:
-        _doubt_outside(out, images, frames)
+        out.find(f"{text} is taken as that of the pictures", "clock")
     return out
 
 
@@ -275,14 +249,3 @@ def _categories(path: Path, categories: Any) -> dict[int, str] | None:
             raise McaptrackError(f"{path}: {key} is the id of several categories, {out[key]} and {name[:_MAX_NAME]}")
         out[key] = " ".join(name.split())[:_MAX_NAME]
     return out
-
-
-def _doubt_outside(rows: Labels, images: list[dict[str, Any]], frames: list[int]) -> None:
-    """Count boxes that lie outside of their image."""
-    sizes = {
-        frame: (_float(image["width"]), _float(image["height"]))
-        for frame, image in zip(frames, images, strict=True)
-        if _is_number(image.get("width")) and _is_number(image.get("height"))
-    }
-    if sizes and len(rows.frame):
-        rows.doubt_outside(np.array([sizes.get(int(frame), (math.inf, math.inf)) for frame in rows.frame]))

@@ -1,0 +1,113 @@
+"""KITTI tracking: ``frame id type truncated occluded alpha left top right bottom height width length x y z rotation``,
+and a score in column 18, if any; blank separated, frames from 0.
+
+Letters: N rows.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.schema.classes import PERSON
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import ClassNames, Numbers, as_boxes, check_columns, read_numbers
+
+_COLUMNS: Final = (
+    "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
+)
+#: People that are occluded more than this, or truncated, are not scored; boxes up to this height are not counted as
+#: false positives.
+_OCCLUDED: Final = 2
+_HEIGHT_PX: Final = 25.0
+#: Class ids of the class names. Person in the tracking labels is Person_sitting in the detection labels.
+_NAMES: Final = ("pedestrian", "cyclist", "car", "van", "truck", "tram", "person_sitting", "misc")
+_CLASSES: Final = {name: number for number, name in enumerate(_NAMES, start=PERSON)} | {"person": 7}
+_SITTING: Final = ("person_sitting", "person")
+_REGION: Final = "dontcare"
+#: The frame of reference of boxes in space: of the camera, with z up.
+_FRAME_ID: Final = "camera_link"
+
+
+def _rows(file: LabelFile) -> tuple[Numbers, dict[int, str]]:
+    """Rows with the type as the number of a name, and the names in lower case."""
+    names = ClassNames()
+
+    def parse(parts: list[str]) -> list[float]:
+        check_columns(parts, 17, 18)
+        numbers = [float(part) if place != 2 else names.number(part) for place, part in enumerate(parts)]
+        return numbers + [np.nan] * (18 - len(parts))
+
+    return read_numbers(file.path, file.lines(), f"KITTI tracking ({_COLUMNS})", 18, parse), names.names
+
+
+def _named(
+    kind: np.typing.NDArray[np.int64], names: dict[int, str], wanted: tuple[str, ...]
+) -> np.typing.NDArray[np.bool_]:
+    return np.isin(kind, [number for number, name in names.items() if name.lower() in wanted])
+
+
+class Kitti(Format):
+    """Boxes in pictures."""
+
+    title = "KITTI tracking"
+    row = "`frame id type truncated occluded alpha left top right bottom ...`"
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether the first row has 17 or 18 columns, and a word in the third."""
+        cells = file.cells
+        return len(cells) in (17, 18) and cells[2][:1].isalpha() and cells[2].replace("_", "").isalnum()
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The rows of a file."""
+        (values, at), names = _rows(file)
+        kind = values[:, 2].astype(np.int64)
+        aside = np.where(_named(kind, names, (_REGION,)), REGION, NOTHING)
+        aside[_named(kind, names, _SITTING)] = FORGIVEN
+        facts = LabelFacts(file.path, "kitti", first_frame=0, names=names, numbering=_CLASSES, named_by="file")
+        facts.not_counting, facts.region, facts.least_height_px = "hidden or cut off", "DontCare", _HEIGHT_PX
+        return BoxTable(
+            facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=as_boxes(values[:, 6:10]),
+            score=values[:, 17], class_id=kind, counts=(values[:, 3] <= 0) & (values[:, 4] <= _OCCLUDED), aside=aside,
+        )  # fmt: skip
+
+
+class Kitti3d(Format):
+    """Boxes in space, of which files look the same.
+
+    In the file, x is right, y down and z forward, the position is the centre of the box's bottom, and the rotation
+    about y is 0 for an object that faces right. Here x is forward, y left and z up.
+    """
+
+    title = "KITTI tracking, boxes in space"
+    row = Kitti.row
+    in_space = True
+
+    def recognises(self, file: LabelFile) -> bool:
+        """No file: those with boxes in pictures look the same."""
+        return False
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The rows of a file of one sequence."""
+        (values, at), names = _rows(file)
+        kind = values[:, 2].astype(np.int64)
+        is_region = _named(kind, names, (_REGION,))
+        has_no_box = ~is_region & (values[:, 10:13] <= 0).any(axis=1)  # results of detectors in pictures
+        if (is_region | has_no_box).all():
+            raise McaptrackError(f"{file.path} holds no 3D boxes")
+        height, width, length, x, y, z, rotation = values[:, 10:17].T
+        left = [f"{int(is_region.sum())} regions (DontCare)"] if is_region.any() else []
+        left += [f"{int(has_no_box.sum())} rows without a 3D box"] if has_no_box.any() else []
+        facts = LabelFacts(file.path, "kitti-3d", first_frame=0, names=names, numbering={}, named_by="file")
+        facts.frame_id, facts.labelled = _FRAME_ID, np.unique(values[:, 0])
+        table = BoxTable(
+            facts=facts, at=at, frame=values[:, 0], id=values[:, 1], score=values[:, 17], class_id=kind,
+            boxes_m=np.stack([z, -x, -y + height / 2, length, width, height, -rotation - np.pi / 2], axis=-1),
+            left_out=" and ".join(left),
+        )  # fmt: skip
+        axes = "x is forward, y left, z up (in the file x is right, y down, z forward); positions are centres of boxes"
+        table.remark(f": {axes}")
+        return table.take(~(is_region | has_no_box))
