@@ -14,7 +14,7 @@ import mcaptrack
 from mcaptrack import foxglove, log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
-from mcaptrack.schema.classes import class_names
+from mcaptrack.schema.classes import COCO, ClassMap, class_names
 from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
 from mcaptrack.transforms.retrack.offline import settle_classes
 from tests.worlds import assert_same_rows, noisy_tracks, ns, table_to_frames
@@ -368,3 +368,38 @@ def test_a_thousand_classes_of_one_name_and_strange_metadata_are_read(tmp_path):
     assert class_names({"mcaptrack.classes": '{"2": "\\ud800"}'})[2].encode() == b"\\ud800"
     for text in ("[1]", "{", "[" * 100_000, "null"):
         assert class_names({"mcaptrack.classes": text}) == {1: "person"}
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("0=person,2=car", {0: "person", 2: "car", "2": "car", "002": "car", 1: None}),
+        ("ped = person, Auto=car,", {"ped": "person", "PED": "person", "auto": "car", "car": None}),
+        ('{"a,b": "car=s"}', {"a,b": "car=s"}),
+        ("coco", {0: "person", 2: "car", 79: "toothbrush", 80: None, 12: "parking meter", 58: "potted plant"}),
+        ("names.txt", {0: "person", 1: None, 2: "car", 3: None}),
+        ("names.txt@1", {0: None, 1: "person", 3: "car"}),
+        ("numbers.txt", {0: None, 7: "person", 9: "big car"}),
+    ],
+)
+def test_a_class_map_names_classes_and_its_text_names_the_same(tmp_path, monkeypatch, text, wanted):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "names.txt").write_bytes(b"\xef\xbb\xbfperson\r\n\r\n car \r\n\r\n")
+    (tmp_path / "numbers.txt").write_text("7: person\n9 big car\n")
+    read = ClassMap.parse(text)
+    assert {own: read.name(own) for own in wanted} == wanted
+    assert ClassMap.parse(str(read)) == read
+    assert "txt" not in str(read)
+    assert len(COCO) == len(set(COCO)) == 80
+
+
+@pytest.mark.parametrize("text", ["", " ", "person", "0=", "=car", "0=car,0=bus", "A=x,a=y", "{", "{}", "[1]", "a\0b",
+                                  "x" * 5000, "binary.txt", "zeros.txt", "empty.txt", ".", "twice.txt"])  # fmt: skip
+def test_what_is_no_class_map_is_refused_in_a_line(tmp_path, monkeypatch, text):
+    monkeypatch.chdir(tmp_path)
+    contents = {"binary": b"\xff\xfe\0", "zeros": bytes(99), "empty": b"\n \n", "twice": b"0=car\n0=bus\n"}
+    for name, content in contents.items():
+        (tmp_path / f"{name}.txt").write_bytes(content)
+    with pytest.raises(McaptrackError) as raised:
+        ClassMap.parse(text)
+    assert "\n" not in str(raised.value)
