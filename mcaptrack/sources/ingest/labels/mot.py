@@ -67,10 +67,11 @@ class Mot(Format):
         values, at = read_numbers(file.path, file.lines(), what, 8, parse, _split)
         score, kind = values[:, 6], values[:, 7]
         facts = LabelFacts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
+        facts.is_first_assumed = facts.first_frame == 1  # some programs number frames from 0 in this format, too
         facts.not_counting, facts.scores_truth = "score 0", False
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=values[:, 2:6], score=score,
-            class_id=np.full(len(values), PERSON), counts=score != 0,
+            class_id=np.full(len(values), NO_CLASS), counts=score != 0,
         )  # fmt: skip
         tens = np.array(sample).reshape(-1, 2)
         kind = np.where(np.isfinite(kind) & (kind < 2**31), kind, NO_CLASS)

@@ -84,6 +84,7 @@ class Yolo(Format):
         facts = LabelFacts(
             folder, "yolo", is_normalised=True, first_class=0, labelled=np.array(sorted(numbers), np.int64)
         )
+        facts.states_labelled = 0 in counts  # others write no files without boxes
         table = BoxTable(
             facts=facts, at=at, frame=frame, id=track_id, score=score, class_id=rows[:, 0], remarks=remarks,
             boxes_px=np.concatenate([rows[:, 1:3] - rows[:, 3:5] / 2, rows[:, 3:5]], axis=1),
