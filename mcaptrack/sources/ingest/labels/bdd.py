@@ -36,7 +36,8 @@ class Bdd(Format):
             raise McaptrackError(f"{file.path} is no JSON of frames with a name and labels, as BDD100K has")
         frames, facts = _of_video(file, asked.scene), LabelFacts(file.path, "bdd", states_labelled=True)
         numbers = _numbers(frames)
-        facts.labelled, facts.first_frame, facts.region = np.array(sorted(numbers), np.int64), min(numbers), "crowd"
+        facts.labelled, facts.region = np.array(sorted(numbers), np.int64), "crowd"
+        facts.first_frame, facts.is_first_assumed = min(numbers), min(numbers) > 0
         rows, others = GatheredRows(facts, "label"), 0
         for number, frame in zip(numbers, frames, strict=True):
             labels = frame["labels"] if isinstance(frame.get("labels"), list) else []

@@ -48,11 +48,11 @@ class TrajnetPP(Format):
                 tracks.append((number, content))
         chosen = _chosen(file, scenes, asked.scene)
         for number, content in tracks:
-            frame, track, x, y = rows.numbers(str(number), content, ("f", "p", "x", "y"))
+            frame, x, y = rows.numbers(str(number), content, ("f", "x", "y"))
             if content.get("prediction_number") or not _is_of(chosen, content, frame):
                 others += 1
                 continue
-            rows.add(str(number), frame, (x, y), track, "person")
+            rows.add(str(number), frame, (x, y), content.get("p"), "person")
         rates = {scene["fps"] for scene in scenes.values() if is_number(scene.get("fps")) and scene["fps"] > 0}
         table = rows.table()
         if len(rates) == 1:
