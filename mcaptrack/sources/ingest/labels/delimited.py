@@ -379,7 +379,8 @@ HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
     "name": ("classname", "categoryname", "labelname", "name"),
-    "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid"),
+    "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid", "pedid",
+           "pedestrianid", "personid", "agentid"),
 }  # fmt: skip
 #: Keys of which several columns may fit; the first header of the list above is read.
 _RANKED: Final = ("frame", "t", "class", "id")
@@ -458,9 +459,12 @@ def choose_columns(where: str, header: Sequence[str], chosen: Mapping[str, str])
         complete = [pair for pair in axis if all(key in out for key in pair)]
         complete.sort(key=lambda pair: -len(chosen.keys() & pair))
         if not complete:
+            places = {key: fits[0] for key in _PLACE[:2] if (fits := _fitting(_HEADERS_3D[key], plain, {}))}
+            hint = ",".join(f"{key}={header[place]}" for key, place in places.items())
+            positions = f"; positions in metres are read with `columns={hint!r}`" if len(places) == 2 else ""
             raise McaptrackError(
                 f"{where}: no columns for {' and '.join(axis[0])} (or {' and '.join(axis[1])}) of boxes; {shown}; name "
-                "them with `columns='x=left,y=top,w=width,h=height,frame=frame'`"
+                f"them with `columns='x=left,y=top,w=width,h=height,frame=frame'`{positions}"
             )
         for key in {key for pair in axis for key in pair} - set(complete[0]):
             out.pop(key, None)

@@ -110,6 +110,8 @@ def _name(table: BoxTable, kind: Ints, tens: Floats) -> None:
     if facts.names is None and np.isin(stated, [*names]).all():
         facts.names, facts.named_by = names, "format"
         table.class_id = np.where(kind == NO_CLASS, PERSON, kind)
+        if without := int((kind == NO_CLASS).sum()):
+            table.find(": {0} boxes without a class (-1 in column 8) are taken as people", "classes", without)
         table.aside[(kind == 0) if is_visdrone else np.isin(kind, _DISTRACTORS)] = REGION if is_visdrone else FORGIVEN
         facts.region = "ignored regions" if is_visdrone else ""
     people = [number for number, name in (facts.names or {}).items() if is_person(name)]

@@ -131,7 +131,7 @@ class LabelFacts:
 
     @property
     def meaning(self) -> tuple[Any, ...]:
-        """How classes were understood, which is the same in all parts of a file."""
+        """The meaning of classes, which is the same in all parts of a file."""
         return self.names, self.named_by, self.is_normalised
 
     def to_json(self) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 _READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
 _NOT_LABELS: Final = (*LISTS, *_READMES, "train.txt", "val.txt", "test.txt")
 _MAX_FILES: Final = 1_000_000
-_WHAT: Final = "YOLO (class x y width height [confidence] [id])"
+_ROW: Final = "YOLO (class x y width height [confidence] [id])"
 
 
 def _label_files(folder: Path) -> list[Path]:
@@ -67,7 +67,7 @@ class Yolo(Format):
         by = "their names" if numbers else "their order"
         remarks = [f"{folder}: {len(files)} files, frames are numbered by {by}"]
         numbers = numbers or list(range(len(files)))
-        parts = [read_numbers(path, lines_of(path), _WHAT, 7, _parse, str.split) for path in files]
+        parts = [read_numbers(path, lines_of(path), _ROW, 7, _parse, str.split) for path in files]
         counts = [len(part.values) for part in parts]
         ends = np.cumsum(counts)
         if ends[-1] > MAX_ROWS:
