@@ -475,7 +475,7 @@ def test_names_are_the_same_in_every_encoding(tmp_path, spelling):
 def test_a_hostile_definition_takes_one_pass(text):
     """A pass takes milliseconds, and one for each character would take hours."""
     before = time.process_time()
-    for pattern in (definitions._IDL, definitions._IDL_TEXT, definitions._IDL_ENUM, definitions._SEPARATOR):
-        pattern.match(text)
+    definitions._IDL.match(text)
+    for pattern in (definitions._IDL_TEXT, definitions._IDL_ENUM, definitions._SEPARATOR):
         pattern.sub("", text)
     assert time.process_time() - before < 20
