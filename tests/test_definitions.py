@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from mcaptrack.schema.names import plain_name
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, read_calibrations
 from mcaptrack.sources.fixed_frame import holds_transforms, read_frames
+from mcaptrack.sources.foreign import definitions
 from mcaptrack.sources.foreign.definitions import MessageType, defined, definitions_of
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from tests.bags import database
@@ -183,7 +185,10 @@ def test_what_idl_alone_has_is_read(tmp_path):
     """Enumerations are whole numbers of 32 bits, or of as many as they say; a schema may call its type otherwise."""
     idl = """
         module robot_msgs { module msg {
-          /* how it moves { } */
+          /* how it moves { } enum Gait { */
+          @verbatim (language="comment", text="as enum Gait { A };")
+          struct Unused { long x; // }
+          };
           enum Gait { STANDS, WALKS @default_literal };
           @bit_bound(8) enum Mood { GOOD, BAD };
           typedef double Row[3];
@@ -453,3 +458,24 @@ def test_names_are_the_same_in_every_encoding(tmp_path, spelling):
             writer.finish()
         with log.read(path) as opened:
             assert asked(opened) == ["png"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# " * 300_000 + "x",
+        "\n" * 600_000 + "x",
+        "/*" * 300_000,
+        '"\\' * 300_000,
+        "module a {" + "enum E {" * 100_000,
+        "=" * 900_000,
+    ],
+    ids=["comments", "lines", "open comments", "open texts", "open enumerations", "a rule"],
+)
+def test_a_hostile_definition_takes_one_pass(text):
+    """A pass takes milliseconds, and one for each character would take hours."""
+    before = time.process_time()
+    definitions._IDL.match(text)
+    for pattern in (definitions._IDL_TEXT, definitions._IDL_ENUM, definitions._SEPARATOR):
+        pattern.sub("", text)
+    assert time.process_time() - before < 20

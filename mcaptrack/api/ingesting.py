@@ -264,7 +264,7 @@ def ingest(
         scene=scene,
     )
     make = partial(make_log, path, options=options, progress=progress)
-    with definitions_of(definitions), warnings_about(path) as warnings:
+    with warnings_about(path) as warnings, definitions_of(definitions):
         if into is None:
             target = _new_log(path, output, force)
             report = make(target)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from copy import copy
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -23,6 +24,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning
+from mcaptrack.notices import warn
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.schema.encodings import CDR, ros_definition, schema_of_ros
 from mcaptrack.schema.names import plain_name, ros_type
@@ -43,11 +45,17 @@ _FILL: Final = 4
 #: Where metadata of a channel say which definition was taken for it.
 _METADATA: Final = "mcaptrack.definition"
 _ADVICE: Final = "`definitions=` names a folder with .msg or .idl files"
-#: Definitions in IDL: how they begin, the heads of files, directives of a preprocessor, and enumerations.
-_IDL: Final = re.compile(r"(?:\s+|//.*|/\*(?s:.*?)\*/|#.*)*(?:=+\s*IDL:|(?:module|struct|typedef|enum|const)\b|@)")
+#: Definitions in IDL: how they begin, the heads of files, texts, which stay, comments and directives, which go, and
+#: enumerations. What isn't closed ends with the definition, so that each takes one pass.
+_IDL: Final = re.compile(
+    r"(?>\s+|//.*|/\*(?s:.*?)(?:\*/|\Z)|#.*)*+(?:=+\s*IDL:|(?:module|struct|typedef|enum|const)\b)"
+)
 _IDL_HEAD: Final = re.compile(r"^=+\nIDL: .*\n", re.MULTILINE)
-_IDL_DIRECTIVE: Final = re.compile(r"^[ \t]*#.*$", re.MULTILINE)
-_IDL_ENUM: Final = re.compile(r"(?:@bit_bound\s*\(\s*(\d+)\s*\)\s*)?(?:@\w+\s*)?\benum\s+(\w+)\s*\{[^}]*\}")
+_TEXT: Final = r'"(?:\\(?s:.|\Z)|[^"\\])*+(?:"|\Z)'
+_IDL_TEXT: Final = re.compile(rf"({_TEXT})|//[^\n]*|/\*(?s:.*?)(?:\*/|\Z)|^[ \t]*#[^\n]*", re.MULTILINE)
+_IDL_ENUM: Final = re.compile(
+    rf"{_TEXT}|(?:@bit_bound\s*\(\s*(\d+)\s*\)\s*)?(?:@\w+\s*)?\benum\s+(\w+)\s*\{{[^}}]*+(?:\}}|\Z)"
+)
 #: What changes how messages in IDL are encoded, and isn't read.
 _IDL_UNREAD: Final = re.compile(r"@optional|@mutable|@extensibility\(\s*MUTABLE\s*\)|\bunion\b")
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*$", re.MULTILINE)
@@ -87,15 +95,16 @@ class _Candidate(NamedTuple):
 # The definitions of a folder that the user names.
 
 
-class _Chosen(NamedTuple):
-    """The folders of definitions that the user names, and the distribution of ROS."""
+@dataclass
+class _Chosen:
+    """The folders of definitions that the user names, the distribution of ROS, and whether they were looked at."""
 
     folders: tuple[Path, ...] = ()
     distribution: str = ""
+    is_used: bool = False
 
 
-_NONE: Final = _Chosen()
-_CHOSEN: Final[ContextVar[_Chosen]] = ContextVar("definitions", default=_NONE)
+_CHOSEN: Final[ContextVar[_Chosen | None]] = ContextVar("definitions", default=None)
 
 
 @contextmanager
@@ -103,19 +112,19 @@ def definitions_of(names: str | os.PathLike[str] | Sequence[str | os.PathLike[st
     """In this block, types that recordings don't define are looked up in these folders of .msg and .idl files first.
 
     A name may also be that of a distribution of ROS, such as humble: then only its definitions are tried. Raises
-    McaptrackError for what is neither.
+    McaptrackError for what is neither; a warning says so if no definition was needed.
     """
-    chosen = _NONE
+    chosen = _Chosen()
     for name in (names,) if isinstance(names, str | os.PathLike) else names or ():
         path = Path(os.path.abspath(name))
         distributions = [other[5:] for encoding in _ENCODING.values() for other in _distributions(encoding)]
         if str(name).lower() in distributions and not path.exists():
-            chosen = chosen._replace(distribution=str(name).lower())
+            chosen.distribution = str(name).lower()
         elif not path.is_dir():
             raise McaptrackError(f"`definitions=` names {name}: no folder, and not one of {', '.join(distributions)}")
         else:
-            chosen = chosen._replace(folders=(*chosen.folders, path))
-    if chosen != _NONE:
+            chosen.folders += (path,)
+    if chosen != _Chosen():
         for cached in (_files_in, _parsed_file, _typestore):
             cached.cache_clear()
     for path in chosen.folders:
@@ -126,6 +135,8 @@ def definitions_of(names: str | os.PathLike[str] | Sequence[str | os.PathLike[st
         yield
     finally:
         _CHOSEN.reset(token)
+    if chosen != _Chosen() and not chosen.is_used:
+        warn("`definitions=` changes nothing here: no messages without a definition were read", "option-not-used")
 
 
 @lru_cache(maxsize=8)
@@ -174,9 +185,10 @@ def parsed(name: str, schema_encoding: str, data: bytes) -> Types:
     try:
         if schema_encoding not in (SchemaEncoding.ROS2IDL, "omgidl") and not _IDL.match(text):
             return get_types_from_msg(_SEPARATOR.sub("=" * 80, text), name)
-        if unread := _IDL_UNREAD.search(text):
+        plain = _IDL_TEXT.sub(lambda part: part[1] or " ", text)
+        if unread := _IDL_UNREAD.search(plain):
             raise ValueError(f"{unread.group()} of IDL is not read")
-        plain = _IDL_ENUM.sub(lambda enum: f"typedef uint{enum[1] or 32} {enum[2]}", _IDL_DIRECTIVE.sub("", text))
+        plain = _IDL_ENUM.sub(lambda part: f"typedef uint{part[1] or 32} {part[2]}" if part[2] else part[0], plain)
         parts = [get_types_from_idl(part) for part in _IDL_HEAD.split(plain) if part.strip()]
     except Exception as error:  # third-party parsers, which raise various exceptions
         raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from None
@@ -256,7 +268,7 @@ def ros_types(kind: MessageType) -> tuple[Any, str]:
     if not name:
         raise McaptrackError(f"{kind.name!r} is not the name of a ROS message; those are like sensor_msgs/Image")
     # Each reader sets the longest sequence of its own store; what was compiled for the type is shared.
-    return copy(_typestore(name, kind, _CHOSEN.get().folders)), name
+    return copy(_typestore(name, kind, (_CHOSEN.get() or _Chosen()).folders)), name
 
 
 @lru_cache(maxsize=64)
@@ -367,10 +379,11 @@ def _candidates(name: str, kind: MessageType, distribution: str, digest: str) ->
 
     Raises McaptrackError if a folder defines the type, but not the types of its fields.
     """
-    folders, chosen = _CHOSEN.get()
+    chosen = _CHOSEN.get() or _Chosen()
+    folders, chosen.is_used = chosen.folders, True
     named = [folder for folder in folders if _look_up_file(folder, name) is not None]
     order = sorted(_distributions(kind.encoding), key=lambda other: other[5:] != distribution)
-    order = [other for other in order if other[5:] == chosen] or order
+    order = [other for other in order if other[5:] == chosen.distribution] or order
     candidates: list[_Candidate] = []
     for other in order:
         try:
