@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import recorded
-from mcaptrack.sources.foreign import Classes, MessageType, boxes_decoder
-from mcaptrack.sources.foreign.boxes import Message3d, boxes_3d_decoder
+from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.foreign.fields import Message3d
 from tests.ros_messages import BAR, Ros
 from tests.space_logs import (
     SEEN,
@@ -85,9 +85,9 @@ def plain(message) -> object:
 def read(writer: Ros, message, encoding: str) -> Message3d:
     """The boxes of a message; a writer of ROS 1 or ROS 2 made it."""
     if encoding != "json":
-        return boxes_3d_decoder(writer.kind)(writer.pack(message))
+        return boxes_decoder(writer.kind, in_space=True)(writer.pack(message))
     kind = MessageType(writer.kind.name, "jsonschema", b"{}", "json")
-    return boxes_3d_decoder(kind)(json.dumps(plain(message)).encode())
+    return boxes_decoder(kind, in_space=True)(json.dumps(plain(message)).encode())
 
 
 def twist(writer: Ros, velocity):
@@ -238,7 +238,7 @@ def test_detections_that_state_their_pose_in_a_result_alone():
     head = {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "lidar"}
     boxes = [one((0, 0, 0), (7, 8, 9)), one((1, 0, 0), (7, 8, 9)), one((0, 0, 0), (0, 0, 0))]
     kind = MessageType("vision_msgs/msg/Detection3DArray", "jsonschema", b"{}", "json")
-    found = boxes_3d_decoder(kind)(json.dumps({"header": head, "detections": boxes}).encode())
+    found = boxes_decoder(kind, in_space=True)(json.dumps({"header": head, "detections": boxes}).encode())
     assert [box.centre for box in found.boxes] == [(7, 8, 9), (1, 0, 0), (0, 0, 0)]
     assert [box.orientation for box in found.boxes] == [(0, 0, 0, 1), (0, 0, 0, 0), (0, 0, 0, 0)]
 
@@ -246,13 +246,13 @@ def test_detections_that_state_their_pose_in_a_result_alone():
 def test_a_field_that_is_missing_is_named():
     kind = MessageType("jsk_recognition_msgs/BoundingBoxArray", "jsonschema", b"{}", "json")
     with pytest.raises(McaptrackError, match=r"message \(it has no field 'stamp'\)$"):
-        boxes_3d_decoder(kind)(b'{"header": {"frame_id": "a"}, "boxes": []}')
+        boxes_decoder(kind, in_space=True)(b'{"header": {"frame_id": "a"}, "boxes": []}')
 
 
 def test_scenes_of_foxglove_are_the_same_in_all_encodings():
     protobuf = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
-    wanted = boxes_3d_decoder(protobuf)(scene_update(START_NS, [SEEN]).SerializeToString())
-    found = boxes_3d_decoder(protobuf._replace(encoding="json"))(scene_update_json(START_NS, [SEEN]))
+    wanted = boxes_decoder(protobuf, in_space=True)(scene_update(START_NS, [SEEN]).SerializeToString())
+    found = boxes_decoder(protobuf._replace(encoding="json"), in_space=True)(scene_update_json(START_NS, [SEEN]))
     assert found.boxes == wanted.boxes
     assert wanted.boxes[0].source_id == "12"
     for ros1 in (False, True):
@@ -396,7 +396,7 @@ def test_definitions_in_idl_have_their_constants_in_a_module_beside():
     text = BAR + IDL.format(package=package, bar=BAR, labels=labels)
     kind = made.writer.kind._replace(schema_encoding="ros2idl", schema=text.encode())
     objects = [made.one(labels=((number, 1.0),)) for number in (1, 3, 6)]
-    found = boxes_3d_decoder(kind)(made.writer.pack(made.message(*objects)))
+    found = boxes_decoder(kind, in_space=True)(made.writer.pack(made.message(*objects)))
     assert [box.class_name for box in found.boxes] == ["car", "trailer", "pedestrian"]
     assert found.boxes[0].velocity == pytest.approx((0, 3, 0))
 
@@ -445,7 +445,7 @@ PEOPLE = [
 @pytest.mark.parametrize(("name", "message", "stated"), PEOPLE, ids=[one[0] for one in PEOPLE])
 def test_people_of_other_packages_are_read(name, message, stated):
     kind = MessageType(name, "jsonschema", b"{}", "json")
-    found = boxes_3d_decoder(kind)(json.dumps({"header": HEAD, **message}).encode())
+    found = boxes_decoder(kind, in_space=True)(json.dumps({"header": HEAD, **message}).encode())
     assert (found.stamp_ns, found.frame_id) == (1_000_000_005, "odom")
     (box,) = found.boxes
     score, source_id, velocity = stated
@@ -478,10 +478,9 @@ def test_boxes_of_darknet_and_yolo_are_those_of_vision(class_field):
     }
     rows = []
     for name, message in said.items():
-        decode = boxes_decoder(MessageType(name, "jsonschema", b"{}", "json"), Classes())
-        rows.append(decode(json.dumps({"header": HEAD, **message}).encode()).tolist())
+        decode = boxes_decoder(MessageType(name, "jsonschema", b"{}", "json"))
+        rows.append(decode(json.dumps({"header": HEAD, **message}).encode()))
         turned = json.loads(json.dumps(message).replace("24", "-24").replace("44", "4"))
         with pytest.raises(McaptrackError):
             decode(json.dumps({"header": HEAD, **turned}).encode())
-    assert str(rows[0]) == str(rows[1]) == str(rows[2])
-    assert rows[0][0][:4] == (20.0, 80.0, 24.0, 70.0)
+    assert rows[0] == rows[1] == rows[2] == [(20.0, 80.0, 24.0, 70.0, 0.9, "person")]

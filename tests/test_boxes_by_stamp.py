@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import Writer
 
 from mcaptrack import log, notices
-from mcaptrack.sources.foreign import named_detections
+from mcaptrack.sources.fixed_frame import named_detections
 from tests.worlds import ns
 
 COUNT = 20

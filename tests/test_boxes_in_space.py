@@ -20,8 +20,8 @@ from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources import camera_motion
 from mcaptrack.sources.fixed_frame import named_detections, recorded, rows_of_boxes
-from mcaptrack.sources.foreign import MessageType
-from mcaptrack.sources.foreign.boxes import Message3d, boxes_3d_decoder
+from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.foreign.fields import Message3d
 from tests.ros_messages import Ros
 from tests.space_logs import (
     NAMES,
@@ -68,7 +68,7 @@ def test_the_same_log_gives_the_same_detections_in_every_form(way, tmp_path):
         assert rows["class_id"].tolist() == [1 + NAMES.index(row["class"]) for row in wanted]
         assert set(rows["source_id"].tolist()) == {-1}
         listed = ", ".join(map(str, sorted(set(rows["class_id"].tolist()))))
-        words = "1 counts as people, and others move as objects of unknown class do"
+        words = "1 counts as people, and others move as objects of unknown class do; `class_map=` names them"
         assert said == [f"classes of /lidar/boxes are numbers without names ({listed}): {words}"]
     else:
         names = {1: "pedestrian"} | found.classes
@@ -90,7 +90,9 @@ def test_any_pose_of_sensor_and_box_gives_the_numbers_of_scipy(angles, shifts, l
     upright = Rotation.from_euler("zyx", [angles[6], angles[7] / 60, angles[8] / 60]) * on_side
     back, at = (robot * sensor).inv(), np.array([START_NS])
     box = Seen(back.apply(centre - base - robot.apply(mount)), (back * upright).as_quat(), np.array([4.0, 2.0, 1.5]))
-    found = recorded([(START_NS, boxes_3d_decoder(_KIND)(scene_update(START_NS, [box]).SerializeToString()))])
+    found = recorded(
+        [(START_NS, boxes_decoder(_KIND, in_space=True)(scene_update(START_NS, [box]).SerializeToString()))]
+    )
     ways = (("map", "base", robot, base), ("base", "lidar", sensor, mount))
     links = [
         Recorded(parent, child, True, PoseSamples(at, at, shift[None], turn.as_quat()[None]))
@@ -147,7 +149,7 @@ _KIND = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
 
 
 def boxes_of(writer: Ros, message) -> Message3d:
-    return boxes_3d_decoder(writer.kind)(writer.pack(message))
+    return boxes_decoder(writer.kind, in_space=True)(writer.pack(message))
 
 
 def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
@@ -170,7 +172,7 @@ def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
     np.testing.assert_allclose([box.score for box in found.boxes], [0.87, 0.87, 0.25, np.nan, np.nan, 0.5, 0.5])
     assert [box.source_id for box in found.boxes] == [None, None, *[12] * 5]
     assert found.boxes[2].stamp_ns == START_NS + 4
-    assert found.ignored == {"markers that are no cubes": 1}
+    assert found.ignored == {"markers that are no solids": 1}
     one = ros("visualization_msgs/Marker")
     assert boxes_of(one, marker(one, START_NS, SEEN)).boxes[0].source_id == 12
 
@@ -191,7 +193,7 @@ def test_texts_beside_cubes_say_what_these_do_not():
     found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", markers))
     assert [box.class_name for box in found.boxes] == ["van", "truck", ""]
     np.testing.assert_array_equal([box.score for box in found.boxes], [0.75, 0.25, np.nan])
-    assert found.ignored == {"markers that are no cubes": 3}
+    assert found.ignored == {"markers that are no solids": 3}
 
 
 def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():
@@ -204,16 +206,16 @@ def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():
         other.cubes.add()
         other.metadata.add(key=key, value=value)
     message.entities.add(id="text alone").texts.add(text="car")
-    found = boxes_3d_decoder(_KIND)(message.SerializeToString())
+    found = boxes_decoder(_KIND, in_space=True)(message.SerializeToString())
     assert [box.source_id for box in found.boxes] == [None, None, "12", "77", "no number", "no number"]
     assert [box.class_name for box in found.boxes] == ["car", "car", "van", "", "", "bus"]
     np.testing.assert_array_equal([box.score for box in found.boxes], [0.5, 0.5, 0.25, np.nan, 0.5, np.nan])
-    assert found.ignored == {"entities without cubes": 1}
+    assert found.ignored == {"entities without solids": 1}
     arrays = recorded([(START_NS, found)])
     assert arrays.names == ["lidar", "roof"]
     assert arrays.source_id.tolist() == [-1, -1, 12, 77, 78, 78]
     assert arrays.remarks == {
-        "entities without cubes are left out": 1,
+        "entities without solids are left out": 1,
         "boxes have a size of 0: it is unknown": 3,
         "boxes have an orientation of zeros: they count as not turned": 3,
     }
@@ -223,7 +225,7 @@ def test_ids_and_values_of_metadata_may_be_numbers_in_json():
     update = json.loads(scene_update_json(START_NS, [SEEN]))
     (entity,) = update["entities"]
     entity["id"], entity["metadata"] = 42, [{"key": "score", "value": 0.25}, {"key": "class", "value": 3}]
-    decode = boxes_3d_decoder(MessageType("foxglove.SceneUpdate", "jsonschema", b"{}", "json"))
+    decode = boxes_decoder(MessageType("foxglove.SceneUpdate", "jsonschema", b"{}", "json"), in_space=True)
     (box,) = decode(json.dumps(update).encode()).boxes
     assert (box.source_id, box.score, box.class_name) == ("42", 0.25, "3")
     entity["id"] = [42]

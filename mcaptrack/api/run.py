@@ -11,7 +11,9 @@ from mcaptrack.api.common import as_location, split_names
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
 from mcaptrack.api.options import (
     FILES,
+    ClassNames,
     EachLog,
+    FieldMap,
     Force,
     Frame,
     Output,
@@ -51,6 +53,8 @@ def run(
     topic: Topic = None,
     camera: Annotated[str | Sequence[str] | None, Option(FILES, metavar="A,B", commas=True, shown="all")] = None,
     frame: Frame = None,
+    map: FieldMap = None,  # noqa: A002  # the name of the option
+    class_map: ClassNames = None,
     output: Output = None,
     sidecar: Sidecar = None,
     events: Annotated[bool | EventOptions, Option(_AFTER)] = True,
@@ -172,6 +176,7 @@ def run(
     from mcaptrack.evaluation.zones import ZoneOptions
     from mcaptrack.pipeline import PlaneChoice, Watch, ZoneWatch, plan_all
     from mcaptrack.pipeline.several import unfitting
+    from mcaptrack.sources.foreign.boxes import choosing
 
     names = tuple(dict.fromkeys(split_names("camera", camera)))
     if len(names) > 1 and topic is not None:
@@ -207,9 +212,10 @@ def run(
     earlier = _log_before(as_location(log), follows)
     finishing = (watch, counted) if watch else (counted,)
     fuses = Fusing(names, fuse, joins)
-    return work(
-        where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier
-    )
+    with choosing(topic, map, class_map):
+        return work(
+            where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier
+        )
 
 
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:

@@ -10,7 +10,9 @@ import mcaptrack
 from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, checked, declared
 from mcaptrack.api.options import (
     Camera,
+    ClassNames,
     EachLog,
+    FieldMap,
     Force,
     Frame,
     Output,
@@ -155,6 +157,8 @@ def track(
     to: To = None,
     camera: Camera = None,
     frame: Frame = None,
+    map: FieldMap = None,  # noqa: A002  # the name of the option
+    class_map: ClassNames = None,
     output: Output = None,
     sidecar: Sidecar = None,
     views: Views = False,
@@ -213,6 +217,8 @@ def track(
         stages,
         progress,
         frame=frame,
+        fields=map,
+        class_map=class_map,
         make=make,
         views=views,
     )

@@ -396,6 +396,7 @@ def _provenance_of(work: Work, warnings: Sequence[Notice]) -> Provenance:
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
         continued=work.continued,
+        boxes=source.boxes,
     )
 
 
@@ -433,14 +434,15 @@ def _input(
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
         return Input(each, [], digest, lambda: len(seen), damaged=damaged, unreadable=unreadable)
     if job.source in results:
-        frames, how = results[job.source].frames, results[job.source].provenance
+        frames, how, facts = results[job.source].frames, results[job.source].provenance, dict[str, str]()
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
-        frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
+        read = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
+        frames, names, frame_id, facts = read
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
     stream = _Repeatable(lambda: _counted(frames, count(1), len(frames), job.stage, progress))
-    return Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id)
+    return Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id, boxes=facts)
 
 
 def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:

@@ -55,7 +55,8 @@ class Provenance:
     out to be. ``warnings`` are the warnings when it was made, with code and message. ``continued`` says from which
     channel of the log before its ids go on (``after``, a digest), and the largest id so far (``last_id``).
     ``output`` is the end of the topic of an output that only the class of another package has, below its main output.
-    ``columns`` are those of a schema of a user's own (see ``schema.own``).
+    ``columns`` are those of a schema of a user's own (see ``schema.own``). ``boxes`` say how boxes of other software in
+    its input were read: their clock, classes, scale and fields, and what a user chose.
     """
 
     transform: str
@@ -76,6 +77,7 @@ class Provenance:
     continued: Mapping[str, str] = field(default_factory=dict)
     output: str = ""
     columns: str = ""
+    boxes: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def written_by(self) -> str:
@@ -117,8 +119,9 @@ class Provenance:
             "model": json.dumps(dict(self.model), sort_keys=True),
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
             "continued": json.dumps(dict(self.continued), sort_keys=True),
+            "boxes": json.dumps(dict(self.boxes), sort_keys=True),
         }
-        for name in ("continued", "warnings", "references", "plugins", "classes", "zones", "model"):
+        for name in ("boxes", "continued", "warnings", "references", "plugins", "classes", "zones", "model"):
             if not getattr(self, name):
                 del values[name]
         return {_PREFIX + key: value for key, value in values.items() if value}
@@ -130,13 +133,13 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        names = ("classes", "zones", "model", "continued")
-        classes, zones, model, continued = (read_texts(values.pop(key, "")) for key in names)
+        names = ("classes", "zones", "model", "continued", "boxes")
+        classes, zones, model, continued, boxes = (read_texts(values.pop(key, "")) for key in names)
         plugins = _plugins(values)
         warnings = [warning for warning in _read(values.pop("warnings", ""), list) if _is_warning(warning)]
         fields: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
         fields |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
-        fields |= {"zones": zones, "continued": continued}
+        fields |= {"zones": zones, "continued": continued, "boxes": boxes}
         return cls(parameters=parameters, model=model, **fields)
 
 
@@ -148,6 +151,11 @@ def input_of(metadata: Mapping[str, str]) -> str:
 def frame_id_of(metadata: Mapping[str, str]) -> str:
     """Return the frame that the metres of a channel are in, by its metadata; "" where it names none."""
     return metadata.get(f"{_PREFIX}frame_id", "")
+
+
+def boxes_of(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return how boxes of other software that a channel was made from were read, by its metadata; empty for others."""
+    return read_texts(metadata.get(f"{_PREFIX}boxes", ""))
 
 
 def _read(text: str, kind: type[T]) -> T:
