@@ -219,7 +219,7 @@ def _reading(opened: log.Log, channel: log.Channel, choice: Choice) -> Reading |
         reader.in_space = not centres or any(any(centre) for centre in centres)
     known = KNOWN.get(name)
     is_certain = known is not None or reader.fields.is_certain or bool(choice.fields or person)
-    return Reading(reader.in_space, reader.read, reader.fields, is_certain, "" if known else person, known)
+    return Reading(reader.in_space, reader.read, reader.fields, is_certain, person, known)
 
 
 def _of_drawings(special: Reading, messages: Sequence[Any], words: Sequence[str], person: str) -> Reading | None:
@@ -411,8 +411,8 @@ def read_classes(
         names = ClassMap.parse(class_map or "coco")
         source = f"class map {names}" if class_map else "COCO's numbers"
         named = {text: names.name(text) or (f"class {text}" if _WHOLE_NUMBER.fullmatch(text) else text) for text in own}
-        if class_map and (missing := [text for text in own if names.name(text) is None]):
-            remarks.append(f"are not all in the class map: not {list_names(sorted(missing), _LISTED)}")
+        if missing := [str(number) for number in numbers if names.name(number) is None]:
+            remarks.append(f"are numbers that are not in the class map: {list_names(missing, _LISTED)}")
         if is_coco:
             listed = list_names([f"{number} is {COCO[number]}" for number in numbers], _LISTED)
             remarks.append(f"are numbers: those of COCO are taken ({listed}); `class_map=` names others")

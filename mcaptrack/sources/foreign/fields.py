@@ -293,13 +293,14 @@ def _thing(things: Path, each: Shape, words: Sequence[str]) -> Fields | None:
     is_other = any(_OTHERS.fullmatch(word) for word in words)
     picture = _picture(each)
     inside = next((path for paths in picture.values() for path in paths), ())[:1]
+    sizes = [word for word in _SIZES if word not in [name.replace("_", "").lower() for name in inside]]
     paths = {key: [path] for key, path in _position(each, inside).items()} | picture
     if not paths:
         return None
     guess = _guess(each)
     facts = {
         "velocity": _vector_at(each, _VELOCITIES),
-        "size": _vector_at(each, _SIZES),
+        "size": _vector_at(each, sizes),
         "id": _fact(each, _IDS, is_id=True),
         "class": _fact(each, _CLASSES, "text") or guess.get("class") or _fact(each, _CLASSES, "number"),
         "score": _fact(each, _SCORES, "number"),
@@ -322,8 +323,8 @@ def _thing(things: Path, each: Shape, words: Sequence[str]) -> Fields | None:
     paths |= {key: [path] for key, path in facts.items() if path is not None}
     said = sum(key in paths for key in ("id", "class", "score", "velocity", "vx", "size", "length"))
     is_named = any(THINGS.fullmatch(word) for word in words)
-    enough = 1 if things else 2
-    is_certain = not is_other and is_named and said >= enough - ("left" in paths and bool(things))
+    enough = (1 if things else 2) - bool(picture)
+    is_certain = not is_other and is_named and said >= enough
     if not things and not is_certain:
         return None
     part = next((word.rstrip("s") for word in words if _PARTS.fullmatch(word)), "")
@@ -430,7 +431,7 @@ def _vector_at(shape: Shape, words: Sequence[str], depth: int = 0) -> Path | Non
             if _point(inner) and (inner.is_struct or inner.kind == "number"):
                 return (name,)
             if inner.is_struct:
-                if words is _SIZES and len(_flat(inner, _FLAT_SIZE[:1])) == 3:
+                if "size" in words and len(_flat(inner, _FLAT_SIZE[:1])) == 3:
                     return (name,)
                 if path := _vector_at(inner, words, depth + 1):
                     return (name, *path)
@@ -451,16 +452,16 @@ def _fact(shape: Shape, words: Sequence[str], kind: str = "", is_id: bool = Fals
                     if not is_id and inner.kind == kind and inner.count is None:
                         return (*path, name)
         levels = [
-            ((*path, name), inner)
-            for path, owner in levels
-            for name, inner in owner.fields
-            if inner.is_struct and name.replace("_", "").lower() not in (*_PLACES, *_VELOCITIES, "header")
-        ] + [((*path, name), inner) for path, owner in levels for name, inner in owner.fields if _is_box(name, inner)]
+            ((*path, name), inner) for path, owner in levels for name, inner in owner.fields if _may_say(name, inner)
+        ]
     return None
 
 
-def _is_box(name: str, inner: Shape) -> bool:
-    return inner.is_struct and name.replace("_", "").lower() in _PICTURED
+def _may_say(name: str, inner: Shape) -> bool:
+    """Whether a struct may say what a thing is, and not only where."""
+    word = name.replace("_", "").lower()
+    is_place = word in (*_PLACES, *_VELOCITIES) and word not in (*_SIZES, *_PICTURED)
+    return inner.is_struct and not is_place and word != "header"
 
 
 def _id_below(shape: Shape) -> Path | None:
@@ -746,7 +747,7 @@ class Reader:
             name,
             score,
             _identity(self._value(thing, "id")),
-            self._vector(thing, "velocity", ("vx", "vy", "vz")),
+            _flat_if_2d(self._vector(thing, "velocity", ("vx", "vy", "vz"))),
             has_heading,
         )
 
@@ -843,6 +844,12 @@ def _getter(path: Path) -> Callable[[Any], Any]:
         return message
 
     return walk
+
+
+def _flat_if_2d(velocity: Vector) -> Vector:
+    """A velocity in space of one along the ground, which states no z."""
+    x, y, z = velocity
+    return (x, y, 0.0) if isfinite(x) and isfinite(y) and not isfinite(z) else velocity
 
 
 def _identity(value: Any) -> int | str | None:
