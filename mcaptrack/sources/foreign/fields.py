@@ -54,7 +54,7 @@ class Shape(NamedTuple):
     kind: str
     name: str = ""
     fields: tuple[tuple[str, Any], ...] = ()
-    count: int | None = None
+    count: int | None = None  # type: ignore[assignment]  # tuples have a method of this name
     constants: tuple[tuple[str, int], ...] = ()
 
     @property
@@ -157,7 +157,7 @@ def _together(one: Shape, other: Shape) -> Shape:
     return one._replace(fields=tuple(fields.items()))
 
 
-_NOTHING: Final = Shape("other")
+_NOTHING, _NUMBER = Shape("other"), Shape("number")
 #: Members of lists of JSON that are looked at.
 _JUDGED: Final = 50
 
@@ -165,39 +165,45 @@ _JUDGED: Final = 50
 # Recognise: which field is what, by its name and type. Names count in lower case and without "_".
 
 
-#: Structs that a position may be in, the usual ones first.
-_PLACES: Final = (
-    "pose", "position", "center", "centre", "posewithcovariance", "initialposewithcovariance", "pos", "centroid",
-    "location", "point", "kinematics", "state", "bbox", "bbox3d", "boundingbox", "boundingbox3d", "box", "bodypose",
+#: Names of fields, the usual ones first.
+_PLACES, _VELOCITIES, _SIZES, _PICTURED, _HEADINGS, _IDS, _CLASSES, _SCORES = (
+    words.split()
+    for words in (
+        "pose position center centre posewithcovariance initialposewithcovariance pos centroid location point "
+        "kinematics state bbox bbox3d boundingbox boundingbox3d box bodypose",
+        "velocity vel twist twistwithcovariance initialtwistwithcovariance linear linearvelocity kinematics state",
+        "size dimensions dimension extent extents scale bbox bbox3d boundingbox boundingbox3d box shape",
+        "bbox boundingbox boundingbox2d bbox2d box box2d roi rect region regionofinterest face body",
+        "heading yaw theta orientation rotationy",
+        "trackid trackingid objectid personid instanceid uuid uid id",
+        "classname classlabel class label category objectclass objectname objectlabel classification objecttype "
+        "classid labelid type",
+        "score confidence existenceprobability probability reliability likelihood conf c",
+    )
+)
+#: Numbers that are a box in a picture together, those that are a position, and those that are a velocity.
+_BOXES: Final = (
+    *(f"left={left} top={top} right={right} bottom={bottom}" for left, top, right, bottom in (
+        ("xmin", "ymin", "xmax", "ymax"), ("minx", "miny", "maxx", "maxy"), ("left", "top", "right", "bottom"),
+        ("x1", "y1", "x2", "y2"), ("x0", "y0", "x1", "y1"))),
+    *(f"left={left} top={top} w={w} h={h}" for left, top, w, h in (
+        ("xoffset", "yoffset", "width", "height"), ("x", "y", "width", "height"), ("x", "y", "w", "h"),
+        ("left", "top", "width", "height"))),
+    *(f"cx={middle}.x cy={middle}.y w={w} h={h}"
+      for middle in ("center", "center.position", "centre") for w, h in (
+        ("sizex", "sizey"), ("size.x", "size.y"), ("width", "height"))),
 )  # fmt: skip
-_VELOCITIES: Final = (
-    "velocity", "vel", "twist", "twistwithcovariance", "initialtwistwithcovariance", "linear", "linearvelocity",
-    "kinematics", "state",
-)  # fmt: skip
-_SIZES: Final = (
-    "size", "dimensions", "dimension", "extent", "extents", "scale", "bbox", "bbox3d", "boundingbox", "boundingbox3d",
-    "box", "shape",
-)  # fmt: skip
-_PICTURED: Final = (
-    "bbox", "boundingbox", "boundingbox2d", "bbox2d", "box", "box2d", "roi", "rect", "region", "regionofinterest",
-    "face", "body",
-)  # fmt: skip
-_IDS: Final = ("trackid", "trackingid", "objectid", "personid", "instanceid", "uuid", "uid", "id")
-_CLASSES: Final = (
-    "classname", "classlabel", "class", "label", "category", "objectclass", "objectname", "objectlabel",
-    "classification", "objecttype", "classid", "labelid", "type",
-)  # fmt: skip
-_SCORES: Final = (
-    "score", "confidence", "existenceprobability", "probability", "reliability", "likelihood", "conf", "c",
-)  # fmt: skip
-#: Left, top, right and bottom; or left, top, width and height.
-_CORNERS: Final = (
-    ("xmin", "ymin", "xmax", "ymax"), ("x1", "y1", "x2", "y2"), ("left", "top", "right", "bottom"),
-    ("minx", "miny", "maxx", "maxy"), ("x0", "y0", "x1", "y1"),
-)  # fmt: skip
-_SPANS: Final = (
-    ("xoffset", "yoffset", "width", "height"), ("x", "y", "width", "height"), ("x", "y", "w", "h"),
-    ("left", "top", "width", "height"),
+_FLAT_PLACES: Final = [
+    " ".join(f"{axis}={form.format(axis)}" for axis in "xy")
+    for form in ("pos{}", "position{}", "center{}", "centre{}", "p{}", "{}pos", "{}position", "{}m", "{}center")
+]
+_FLAT_VELOCITIES: Final = [
+    " ".join(f"v{axis}={form.format(axis)}" for axis in "xy")
+    for form in ("v{}", "vel{}", "velocity{}", "{}vel", "{}velocity")
+]
+_FLAT_SIZES: Final = (
+    *(f"length={at}length width={at}width height={at}height" for at in ("", "dimensions.", "dimension.", "size.")),
+    "length=sizex width=sizey height=sizez", "radius=radius", "width=width height=height",
 )  # fmt: skip
 #: Words in the names of types and lists of people and other things that move; and of what isn't.
 PEOPLE: Final = re.compile(r"people|persons?|pedestrians?|humans?|bod(y|ies)|walkers?")
@@ -207,16 +213,18 @@ THINGS: Final = re.compile(
     r"|clusters?|vehicles?|agents?|cars?|yolo|roi|region|circles?|rects?|predicted"
 )
 _OTHERS: Final = re.compile(
-    r"tags?|apriltags?|fiducials?|waypoints?|paths?|trajector(y|ies)|joints?|landmarks?|lanes?|keypoints?|skeletons?|particles?"
-    r"|grids?|maps?|signals?|traffic|signs?|markers?|goals?|plans?|grasps?|wheels?|motors?|features?|gps|satellites?"
-    r"|calibration|clouds?|points|lines?|segments?|polygons?|links?|models?|contacts?|wrench(es)?|transforms?|images?"
+    r"(april)?tags?|fiducials?|waypoints?|paths?|trajector(y|ies)|joints?|landmarks?|lanes?|keypoints?|skeletons?"
+    r"|particles?|grids?|maps?|signals?|traffic|signs?|markers?|goals?|plans?|grasps?|wheels?|motors?|features?|gps"
+    r"|satellites?|calibration|clouds?|points|lines?|segments?|polygons?|links?|models?|contacts?|wrench(es)?"
+    r"|transforms?|images?"
 )
 #: Parts of people: what their type is called is their class.
 _PARTS: Final = re.compile(r"legs?|faces?")
-#: Types that hold no things, or whose lists are something else.
-_NO_THINGS: Final = re.compile(
-    r"(sensor|std|nav|tf2?|diagnostic|trajectory|actionlib|action|stereo|shape|map|octomap|control|lifecycle|rosgraph|bond|"
-    r"statistics|builtin|controller|moveit|ublox|novatel_gps|velodyne|gazebo|rosapi|dynamic_reconfigure)\w*/.*|rcl_interfaces/.*"
+#: Packages whose messages hold no things.
+NO_THINGS: Final = re.compile(
+    r"(action|actionlib|bond|builtin|control|controller|diagnostic|dynamic_reconfigure|gazebo|lifecycle|map|moveit|nav"
+    r"|novatel_gps|octomap|rcl|rosapi|rosgraph|sensor|shape|statistics|std|stereo|tf|tf2|trajectory|ublox|velodyne)"
+    r"(_msgs|_interfaces)?/.*"
 )
 
 
@@ -268,68 +276,72 @@ _PICTURED_KEYS: Final = frozenset({"left", "top", "right", "bottom", "w", "h", "
 
 def recognised(shape: Shape, type_name: str) -> Fields | None:
     """The things of a type of messages; None if it has none, that is no position and no box."""
-    if _NO_THINGS.fullmatch(type_name):
-        return None
     out = [fields for things, each, names in _lists(shape, type_name) if (fields := _thing(things, each, names))]
     return max(out, key=lambda fields: (fields.is_certain, len(fields.paths)), default=None)
 
 
 def _lists(shape: Shape, type_name: str) -> Iterator[tuple[Path, Shape, list[str]]]:
-    """The lists of messages in a message, and in those that it consists of, and the message itself."""
+    """The lists of messages in a message, and in those that it consists of, and the message itself; with the words in
+    their names.
+    """
     own = _words_in(type_name)
-    for name, inner in shape.fields:
+    insides = [((name,), inner) for name, inner in shape.fields]
+    insides += [
+        ((name, below), last) for name, inner in shape.fields if inner.is_struct for below, last in inner.fields
+    ]
+    for path, inner in insides:
         if inner.kind == "struct" and inner.count is not None:
-            yield (name, _EACH), inner._replace(count=None), [*own, *_words_in(name), *_words_in(inner.name)]
-        elif inner.is_struct:
-            for below, last in inner.fields:
-                if last.kind == "struct" and last.count is not None:
-                    names = [*own, *_words_in(name), *_words_in(below), *_words_in(last.name)]
-                    yield (name, below, _EACH), last._replace(count=None), names
+            words = [*own, *(word for name in (*path, inner.name) for word in _words_in(name))]
+            yield (*path, _EACH), inner._replace(count=None), words
     yield (), shape, own
+
+
+def _words_in(name: str) -> list[str]:
+    """The words of a name: geometry_msgs/msg/PoseArray -> pose, array."""
+    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", re.split(r"[/.]", name)[-1])]
 
 
 def _thing(things: Path, each: Shape, words: Sequence[str]) -> Fields | None:
     """The fields of a thing; None if it has neither a position nor a box."""
-    is_other = any(_OTHERS.fullmatch(word) for word in words)
     picture = _picture(each)
-    inside = next((path for paths in picture.values() for path in paths), ())[:1]
-    sizes = [word for word in _SIZES if word not in [name.replace("_", "").lower() for name in inside]]
-    paths = {key: [path] for key, path in _position(each, inside).items()} | picture
-    if not paths:
+    inside = next(iter(picture.values()), ())[:1]
+    found: dict[str, Path | None] = {**_position(each, inside), **picture}
+    if not found:
         return None
     guess = _guess(each)
-    facts = {
-        "velocity": _vector_at(each, _VELOCITIES),
-        "size": _vector_at(each, sizes),
-        "id": _fact(each, _IDS, is_id=True),
+    sizes = [word for word in _SIZES if word not in map(_word, inside)]
+    found |= {
+        "velocity": next(filter(None, _vectors(each, _VELOCITIES)), None),
+        "size": next((path for path in _vectors(each, sizes) if path and _axes(each.at(path)) == 3), None),
+        "id": _fact(each, _IDS, "id"),
         "class": _fact(each, _CLASSES, "text") or guess.get("class") or _fact(each, _CLASSES, "number"),
         "score": _fact(each, _SCORES, "number"),
         "guess": guess.get("score"),
-        "frame": _fact(each, ("frameid",), "text", deepest=1),
+        "frame": _fact(each, ["frameid"], "text", deepest=1),
     }
-    for key, keys, names in (("velocity", _FLAT_V, "vx vy vz"), ("size", _FLAT_SIZE, "length width height")):
-        if facts[key] is None:
-            paths |= {name: [path] for name, path in zip(names.split(), _flat(each, keys), strict=False)}
-    if guess and "position" in paths and (pose := _position(guess_shape(each, guess), ())):
-        prefix = guess["class"][: guess["class"].index(_EACH) + 1]
-        for key in ("position", "orientation"):
-            if key in paths and key in pose:
-                paths[key] = [*paths[key], (*prefix, *pose[key])]
-    if (radius := _flat(each, (("radius",),))) and "size" not in paths:
-        facts["radius"] = radius[0] if facts["size"] is None else None
-    is_person = any(PEOPLE.fullmatch(word) for word in words)
-    if is_person and facts["class"] is None and facts["id"] is None:
-        facts["id"] = _fact(each, ("name",), "text", deepest=0)
-    paths |= {key: [path] for key, path in facts.items() if path is not None}
+    found |= {} if found["velocity"] else _form(each, _FLAT_VELOCITIES)
+    found |= {} if found["size"] or inside else _form(each, _FLAT_SIZES)
+    is_person = any(map(PEOPLE.fullmatch, words))
+    if is_person and not found["class"] and not found["id"]:
+        found["id"] = _fact(each, ["name"], "text", deepest=0)
+    paths = {key: [path] for key, path in found.items() if path is not None}
+    _add_posed_guess(each, guess, paths)
     said = sum(key in paths for key in ("id", "class", "score", "velocity", "vx", "size", "length"))
-    is_named = any(THINGS.fullmatch(word) for word in words)
-    enough = (1 if things else 2) - bool(picture)
-    is_certain = not is_other and is_named and said >= enough
+    is_named = any(map(THINGS.fullmatch, words)) and not any(map(_OTHERS.fullmatch, words))
+    is_certain = is_named and said >= (1 if things else 2) - bool(picture)
     if not things and not is_certain:
         return None
     part = next((word.rstrip("s") for word in words if _PARTS.fullmatch(word)), "")
     class_name = "" if "class" in paths else part or ("person" if is_person else "")
     return _with_classes(each, Fields(things, paths, {}, class_name, is_certain))
+
+
+def _add_posed_guess(each: Shape, guess: Mapping[str, Path], paths: dict[str, list[Path]]) -> None:
+    """Add the pose in a guess of what a thing is, for things that state no other."""
+    prefix = guess["class"][: guess["class"].index(_EACH) + 1] if guess and "position" in paths else ()
+    for key, path in _position(each.at(prefix) or _NOTHING, ()).items() if prefix else ():
+        if key in paths:
+            paths[key].append((*prefix, *path))
 
 
 def _with_classes(each: Shape, fields: Fields) -> Fields:
@@ -341,116 +353,78 @@ def _with_classes(each: Shape, fields: Fields) -> Fields:
     return replace(fields, names=_names_of(each, path), has_zero=_EACH in path or kind.kind == "text")
 
 
-def guess_shape(each: Shape, guess: Mapping[str, Path]) -> Shape:
-    """The type of a guess of the class of a thing."""
-    inner = each.at(guess["class"][: guess["class"].index(_EACH) + 1])
-    return inner or Shape("other")
-
-
-def _words_in(name: str) -> list[str]:
-    """The words of a name: geometry_msgs/msg/PoseArray -> pose, array."""
-    return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", re.split(r"[/.]", name)[-1])]
+def _word(name: str) -> str:
+    return name.replace("_", "").lower()
 
 
 @lru_cache(maxsize=1024)
 def _members(shape: Shape) -> Mapping[str, tuple[str, Shape]]:
-    """The fields of a struct by their name in lower case and without "_"."""
-    return {name.replace("_", "").lower(): (name, inner) for name, inner in reversed(shape.fields)}
+    """The fields of a message by their name in lower case and without "_"."""
+    return {_word(name): (name, inner) for name, inner in reversed(shape.fields)} if shape.is_struct else {}
 
 
-def _point(shape: Shape) -> int:
+def _member(shape: Shape, words: str) -> tuple[Path, Shape]:
+    """The path of a field by words with dots between them, and its type."""
+    path: Path = ()
+    for word in words.split("."):
+        name, shape = _members(shape).get(word, ("", _NOTHING))
+        path = (*path, name)
+    return path, shape
+
+
+def _form(shape: Shape, forms: Sequence[str]) -> dict[str, Path]:
+    """The paths of numbers that stand together in one of several forms; empty if there is none of these."""
+    for form in forms:
+        members = {key: _member(shape, words) for key, _, words in (pair.partition("=") for pair in form.split())}
+        if all(inner == _NUMBER for _, inner in members.values()):
+            return {key: path for key, (path, _) in members.items()}
+    return {}
+
+
+def _axes(shape: Shape | None) -> int:
     """The number of axes of a point; 0 if a type isn't one."""
-    if shape.kind == "number":
-        return shape.count if shape.count in (2, 3) else 0
-    members = _members(shape) if shape.is_struct else {}
-    is_axis = [axis in members and members[axis][1] == Shape("number") for axis in "xyzw"]
-    return 0 if is_axis[3] or not all(is_axis[:2]) else 2 + is_axis[2]
+    if shape is None or shape.kind == "number":
+        return shape.count if shape is not None and shape.count in (2, 3) else 0
+    x, y, z, w = (_members(shape).get(axis, ("", _NOTHING))[1] == _NUMBER for axis in "xyzw")
+    return 0 if w or not (x and y) else 2 + z
+
+
+def _vectors(shape: Shape, words: Sequence[str], depth: int = 0) -> Iterator[Path]:
+    """The paths of points: the type itself, and in fields with such names, the likeliest first."""
+    if _axes(shape):
+        yield ()
+    for word in words if depth < 4 else ():
+        name, inner = _members(shape).get(word, ("", _NOTHING))
+        yield from ((name, *path) for path in _vectors(inner, words, depth + 1))
 
 
 def _position(shape: Shape, inside: Path) -> dict[str, Path]:
     """The paths of the position of a thing, and of its orientation. Fields of its box in a picture don't count."""
-    for path in _places(shape, 0):
-        if not (inside and path[:1] == inside) and not (not path and inside == ("x",)):
-            at = path[:-1] if path and path[-1].lower() == "position" else path
-            out = {"position": path}
-            owner = shape.at(at)
-            turn = _members(owner).get("orientation") if owner else None
-            if turn and turn[1].is_struct:
-                return out | {"orientation": (*at, turn[0])}
-            heading = _fact(owner, _HEADINGS, "number", deepest=0) if owner and owner.is_struct else None
+    for path in _vectors(shape, _PLACES):
+        if not inside or (path and path[:1] != inside) or (not path and _axes(shape) == 3):
+            at = path[:-1] if path and _word(path[-1]) == "position" else path
+            owner = shape.at(at) or _NOTHING
+            turn, heading = _member(owner, "orientation"), _fact(owner, _HEADINGS, "number", deepest=0)
+            if turn[1].is_struct:
+                return {"position": path, "orientation": (*at, *turn[0])}
             heading = (*at, *heading) if heading else _fact(shape, _HEADINGS, "number", deepest=0)
-            return out | ({"heading": heading} if heading else {})
-    flat = [] if inside else _flat(shape, _FLAT_PLACE)
-    heading = _fact(shape, _HEADINGS, "number", deepest=0)
-    out = dict(zip("xyz", flat, strict=False))
-    return out | ({"heading": heading} if heading and out else {})
+            return {"position": path} | ({"heading": heading} if heading else {})
+    flat = {} if inside else _form(shape, _FLAT_PLACES)
+    heading = _fact(shape, _HEADINGS, "number", deepest=0) if flat else None
+    return flat | ({"heading": heading} if heading else {})
 
 
-_HEADINGS: Final = ("heading", "yaw", "theta", "orientation", "rotationy")
-_FLAT_PLACE: Final = tuple(
-    tuple(form.format(axis) for axis in "xyz")
-    for form in ("pos{}", "position{}", "center{}", "centre{}", "p{}", "{}pos", "{}position", "{}m", "{}center")
-)
-_FLAT_V: Final = tuple(
-    tuple(form.format(axis) for axis in "xyz") for form in ("v{}", "vel{}", "velocity{}", "{}vel", "{}velocity")
-)
-_FLAT_SIZE: Final = (("length", "width", "height"), ("sizex", "sizey", "sizez"), ("l", "w", "h"), ("width", "height"))
-
-
-def _flat(shape: Shape, choices: Sequence[Sequence[str]]) -> list[Path]:
-    """The paths of numbers that stand beside each other, by their names; of the first choice that is there."""
-    members = _members(shape)
-    for names in choices:
-        stated = [(members[name][0],) for name in names if name in members and members[name][1] == Shape("number")]
-        if len(stated) >= min(2, len(names)):
-            return stated
-    return []
-
-
-def _places(shape: Shape, depth: int) -> Iterator[Path]:
-    """The paths of points in a thing, the likeliest first."""
-    members = _members(shape)
-    if _point(shape):
-        yield ()
-    for word in _PLACES if depth < 4 else ():
-        if word not in members:
-            continue
-        name, inner = members[word]
-        if inner.kind == "number" and _point(inner):
-            yield (name,)
-        elif inner.is_struct:
-            yield from ((name, *path) for path in _places(inner, depth + 1))
-
-
-def _vector_at(shape: Shape, words: Sequence[str], depth: int = 0) -> Path | None:
-    """The path of a vector in fields with such names."""
-    members = _members(shape)
-    for word in words if depth < 4 else ():
-        if word in members:
-            name, inner = members[word]
-            if _point(inner) and (inner.is_struct or inner.kind == "number"):
-                return (name,)
-            if inner.is_struct:
-                if "size" in words and len(_flat(inner, _FLAT_SIZE[:1])) == 3:
-                    return (name,)
-                if path := _vector_at(inner, words, depth + 1):
-                    return (name, *path)
-    return None
-
-
-def _fact(shape: Shape, words: Sequence[str], kind: str = "", is_id: bool = False, deepest: int = 2) -> Path | None:
+def _fact(shape: Shape, words: Sequence[str], kind: str, deepest: int = 2) -> Path | None:
     """The path of a field with such a name; those that are least deep count first."""
     levels: list[tuple[Path, Shape]] = [((), shape)]
     for _ in range(deepest + 1):
         for path, owner in levels:
-            members = _members(owner)
             for word in words:
-                if word in members:
-                    name, inner = members[word]
-                    if is_id and (below := _id_below(inner)) is not None:
-                        return (*path, name, *below)
-                    if not is_id and inner.kind == kind and inner.count is None:
-                        return (*path, name)
+                name, inner = _members(owner).get(word, ("", _NOTHING))
+                if kind == "id" and name and (below := _id_below(inner)) is not None:
+                    return (*path, name, *below)
+                if inner.kind == kind and inner.count is None:
+                    return (*path, name)
         levels = [
             ((*path, name), inner) for path, owner in levels for name, inner in owner.fields if _may_say(name, inner)
         ]
@@ -459,26 +433,24 @@ def _fact(shape: Shape, words: Sequence[str], kind: str = "", is_id: bool = Fals
 
 def _may_say(name: str, inner: Shape) -> bool:
     """Whether a struct may say what a thing is, and not only where."""
-    word = name.replace("_", "").lower()
-    is_place = word in (*_PLACES, *_VELOCITIES) and word not in (*_SIZES, *_PICTURED)
-    return inner.is_struct and not is_place and word != "header"
+    is_place = _word(name) in (*_PLACES, *_VELOCITIES) and _word(name) not in (*_SIZES, *_PICTURED)
+    return inner.is_struct and not is_place and _word(name) != "header"
 
 
 def _id_below(shape: Shape) -> Path | None:
     """The path of an id in the field of an id: number, text, or the bytes of a UUID; None if there is none."""
-    if shape.kind in ("number", "text") and (shape.count is None or (shape.kind == "number" and shape.count == 16)):
+    if shape.kind in ("number", "text") and shape.count in (None, 16):
         return ()
-    inner = _members(shape).get("uuid") if shape.is_struct else None
-    return (inner[0],) if inner else None
+    return _member(shape, "uuid")[0] if "uuid" in _members(shape) else None
 
 
 def _guess(shape: Shape) -> dict[str, Path]:
-    """The paths of class and score in a list of guesses of a thing; empty if it has no such list."""
+    """The paths of class and score in a list of guesses of what a thing is; empty if it has no such list."""
     for name, inner in shape.fields:
         if inner.kind == "struct" and inner.count is not None:
-            each = inner._replace(count=None)
+            each, words = inner._replace(count=None), [*_CLASSES, "id"]
             score = _fact(each, _SCORES, "number")
-            own = _fact(each, (*_CLASSES, "id"), "text") or _fact(each, (*_CLASSES, "id"), "number")
+            own = _fact(each, words, "text") or _fact(each, words, "number")
             if score and own:
                 return {"class": (name, _EACH, *own), "score": (name, _EACH, *score)}
     return {}
@@ -486,70 +458,33 @@ def _guess(shape: Shape) -> dict[str, Path]:
 
 def _names_of(each: Shape, path: Path) -> dict[int, str]:
     """The names of classes that are numbers, by the constants beside their field."""
-    owner, kind = each.at(path[:-1]), each.at(path)
-    if owner is None or kind is None or kind.kind != "number":
+    owner, kind = each.at(path[:-1]) or _NOTHING, each.at(path) or _NOTHING
+    if kind.kind != "number":
         return {}
-    prefixes = [path[-1].upper() + "_", *(f"{word}_" for word in ("CLASSIFICATION", "CLASS", "LABEL", "TYPE"))]
-    for prefix in prefixes:
-        if names := {value: name.removeprefix(prefix) for name, value in owner.constants if name.startswith(prefix)}:
-            return _lower(names)
-    integers = [name for name, inner in owner.fields if inner == Shape("number") and name.lower() not in _SCORES]
-    return (
-        _lower({value: name for name, value in owner.constants})
-        if integers == [path[-1]]
-        else _lower({value: name for name, value in kind.constants})
-    )
+    named = kind.constants
+    for prefix in (f"{path[-1].upper()}_", "CLASSIFICATION_", "CLASS_", "LABEL_", "TYPE_"):
+        named = named or tuple((name[len(prefix) :], own) for name, own in owner.constants if name.startswith(prefix))
+    numbers = [name for name, inner in owner.fields if inner == _NUMBER and _word(name) not in _SCORES]
+    named = named or (owner.constants if numbers == [path[-1]] else ())
+    return {own: "" if name.lower() == "unknown" else name.lower() for name, own in named}
 
 
-def _lower(names: Mapping[int, str]) -> dict[int, str]:
-    return {value: "" if name.lower() == "unknown" else name.lower() for value, name in names.items()}
-
-
-def _picture(shape: Shape, depth: int = 0) -> dict[str, list[Path]]:
+def _picture(shape: Shape, depth: int = 0) -> dict[str, Path]:
     """The paths of a box in a picture: of a thing, or of its field with such a name; empty if there is none."""
-    if out := _box_in(shape):
-        return out
-    members = _members(shape)
-    for word in _PICTURED if depth < 2 else ():
-        if word in members and members[word][1].is_struct:
-            name, inner = members[word]
-            if out := _picture(inner, depth + 1):
-                return {key: [(name, *path) for path in paths] for key, paths in out.items()}
-    return {}
-
-
-def _box_in(shape: Shape) -> dict[str, list[Path]]:
-    members = _members(shape)
-    numbers = {word: (name,) for word, (name, inner) in members.items() if inner == Shape("number")}
-    for keys, forms in ((("left", "top", "right", "bottom"), _CORNERS), (("left", "top", "w", "h"), _SPANS)):
-        for form in forms:
-            if all(word in numbers for word in form) and "z" not in numbers:
-                return {key: [numbers[word]] for key, word in zip(keys, form, strict=True)}
-    corners = members.get("corners")
-    if corners and corners[1].kind == "struct" and corners[1].count is not None:
-        each = corners[1]._replace(count=None)
-        if path := next((path for path in ((), ("kp",)) if (at := each.at(path)) and _point(at) == 2), None):
-            return {"corners": [(corners[0], _EACH, *path)]}
-    return _centred(members, numbers)
-
-
-def _centred(members: Mapping[str, tuple[str, Shape]], numbers: Mapping[str, Path]) -> dict[str, list[Path]]:
-    """The paths of a box by its centre and size, which has no third axis."""
-    name, centre = members.get("center", members.get("centre", ("", Shape("other"))))
-    inner = _members(centre)["position"][0:2] if centre.is_struct and "position" in _members(centre) else None
-    at, place = ((name, inner[0]), inner[1]) if inner else ((name,), centre)
-    if _point(place) != 2 or not place.is_struct:
-        return {}
-    size_name, size = members.get("size", ("", Shape("other")))
-    if size.is_struct and _point(size) == 2:
-        sides = [(size_name, "x"), (size_name, "y")]
-    else:
-        sides = [numbers[word] for word in ("sizex", "sizey", "width", "height") if word in numbers][:2]
-    if len(sides) != 2:
-        return {}
-    out = dict(zip(("cx", "cy", "w", "h"), ((*at, "x"), (*at, "y"), *sides), strict=True))
-    theta = _members(centre).get("theta")
-    return {key: [path] for key, path in (out | ({"theta": (name, theta[0])} if theta else {})).items()}
+    out = {} if _axes(shape) == 3 or _axes(_member(shape, "center.position")[1]) == 3 else _form(shape, _BOXES)
+    if _axes(_member(shape, "center")[1]) == 3:
+        out = {}
+    if "cx" in out and (theta := _member(shape, "center.theta"))[1] == _NUMBER:
+        out["theta"] = theta[0]
+    name, corners = _members(shape).get("corners", ("", _NOTHING))
+    for path in ((), ("kp",)) if corners.kind == "struct" and not out else ():
+        if _axes(corners._replace(count=None).at(path)) == 2:
+            return {"corners": (name, _EACH, *path)}
+    for word in _PICTURED if depth < 2 and not out else ():
+        name, inner = _members(shape).get(word, ("", _NOTHING))
+        if below := _picture(inner, depth + 1) if inner.is_struct else {}:
+            return {key: (name, *path) for key, path in below.items()}
+    return out
 
 
 # Paths that a user gives
@@ -573,8 +508,8 @@ def parse_map(written: str) -> dict[str, Path]:
         if key not in KEYS:
             raise McaptrackError(f"`map=` names {key!r}; {did_you_mean(key, KEYS)}there are {', '.join(KEYS)}")
         if not (_SIZE if key == "picture" else _PATH).fullmatch(path):
-            form = "a size, as 1280x720," if key == "picture" else "a path of fields, as people[].pose.position.x,"
-            raise McaptrackError(f"`map=`: {key}={path} is no {form.removeprefix('a ')} but {form} is wanted")
+            form = "1280x720 is a size" if key == "picture" else "people[].pose.position.x is one"
+            raise McaptrackError(f"`map=`: {key}={path} is no path of fields; {form}")
         if key in out:
             raise McaptrackError(f"`map=` names {key} twice")
         out[key] = (path,) if key == "picture" else _tokens(path)
@@ -611,16 +546,11 @@ def mapped(shape: Shape, type_name: str, chosen: Mapping[str, Path]) -> Fields:
     things = places.pop() if places else base.things if base else ()
     kept = dict(base.paths) if base and base.things == things else {}
     own = {key: [begin[1]] for key, begin in begins.items() if begin is not None}
-    for group in (("position", "x", "y", "z"), ("velocity", "vx", "vy"), ("orientation", "heading"), _PICTURED_KEYS,
-                  ("size", "length", "width", "height", "radius"), ("class", "guess")):  # fmt: skip
+    for group in _GROUPS:
         if not own.keys().isdisjoint(group):
             kept = {key: paths for key, paths in kept.items() if key not in group}
-    if own.keys() & {"position", "x"}:
-        kept = {key: paths for key, paths in kept.items() if key not in _PICTURED_KEYS}
-    elif own.keys() & _PICTURED_KEYS:
-        kept = {key: paths for key, paths in kept.items() if key not in ("position", "x", "y", "z")}
     paths = kept | own
-    if not ({"position"} <= paths.keys() or {"x", "y"} <= paths.keys() or _is_boxed(paths)):
+    if not any(form <= paths.keys() for form in _ENOUGH):
         raise McaptrackError(
             "`map=` has to name position, or x and y, or left, top, right and bottom, or left, top, w and h"
         )
@@ -628,9 +558,19 @@ def mapped(shape: Shape, type_name: str, chosen: Mapping[str, Path]) -> Fields:
     return _with_classes(shape.at(things) or shape, Fields(things, paths, {}, class_name))
 
 
-def _is_boxed(paths: Mapping[str, Any]) -> bool:
-    forms = ({"left", "top", "right", "bottom"}, {"left", "top", "w", "h"}, {"cx", "cy", "w", "h"}, {"corners"})
-    return any(form <= paths.keys() for form in forms)
+#: Paths that stand for the same thing: those that a user gives replace all that are recognised.
+_GROUPS: Final = (
+    {"position", "x", "y", "z", *_PICTURED_KEYS},
+    {"velocity", "vx", "vy"},
+    {"orientation", "heading"},
+    {"size", "length", "width", "height", "radius"},
+    {"class", "guess"},
+)
+#: What has to be known of a thing: one of these.
+_ENOUGH: Final = (
+    {"position"}, {"x", "y"}, {"left", "top", "right", "bottom"}, {"left", "top", "w", "h"}, {"cx", "cy", "w", "h"},
+    {"corners"},
+)  # fmt: skip
 
 
 def _begin(shape: Shape, path: Path, lists: Sequence[Path]) -> tuple[Path, Path] | None:
@@ -698,63 +638,62 @@ class Reader:
     def _number(self, thing: Any, key: str) -> float:
         return number(self._value(thing, key))
 
-    def _needed(self, thing: Any, key: str) -> float:
-        value = self._value(thing, key)
-        if value is None:
-            raise AttributeError(name=_joined(self.fields.paths[key][0]))
-        return number(value)
+    def _numbers(self, thing: Any, keys: str) -> list[float]:
+        """Numbers that a thing has to have. Raises AttributeError for one that JSON leaves out."""
+        values = [self._value(thing, key) for key in keys.split()]
+        if None in values:
+            raise AttributeError(name=_joined(self.fields.paths[keys.split()[values.index(None)]][0]))
+        return [number(value) for value in values]
 
     def _box(self, thing: Any) -> Box:
+        """A box in a picture: upright around what the message states."""
         name, score = self._class(thing)
         if "corners" in self._get:
             path = self.fields.paths["corners"][0]
-            points = [vector(at) for at in _each(thing, path)]
-            x, y = ([point[axis] for point in points] or [nan] for axis in (0, 1))
-            left, top, w, h = min(x), min(y), max(x) - min(x), max(y) - min(y)
+            rest = _getter(path[path.index(_EACH) + 1 :])
+            points = [vector(rest(corner)) for corner in things_of(thing, path[: path.index(_EACH) + 1])]
+            (x, y, _), (w, h, _) = around(points or [UNKNOWN_VECTOR])
+            left, top = x - w / 2, y - h / 2
         elif "cx" in self._get:
-            cx, cy, w, h = (self._needed(thing, key) for key in ("cx", "cy", "w", "h"))
-            if theta := number(self._value(thing, "theta") or 0.0):
-                check_box(cx, cy, w, h, theta)
-                w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
-            left, top = cx - w / 2, cy - h / 2
+            x, y, w, h = self._numbers(thing, "cx cy w h")
+            theta = number(self._value(thing, "theta") or 0.0)
+            check_box(x, y, w, h, theta)
+            w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
+            left, top = x - w / 2, y - h / 2
+        elif "right" in self._get:
+            left, top, right, bottom = self._numbers(thing, "left top right bottom")
+            w, h = right - left, bottom - top
         else:
-            left, top = self._needed(thing, "left"), self._needed(thing, "top")
-            if "right" in self._get:
-                w, h = self._needed(thing, "right") - left, self._needed(thing, "bottom") - top
-            else:
-                w, h = self._needed(thing, "w"), self._needed(thing, "h")
+            left, top, w, h = self._numbers(thing, "left top w h")
         check_box(left, top, w, h)
         return Box(left, top, w, h, score, name)
 
     def _box_3d(self, thing: Any, head: tuple[int, str]) -> Box3d:
         name, score = self._class(thing)
         centre, orientation = self._pose(thing)
-        size = self._vector(thing, "size", ("length", "width", "height"))
-        if "radius" in self._get:
-            size = (2 * self._number(thing, "radius"),) * 2 + (nan,)
-        has_heading = "orientation" in self._get or "heading" in self._get
-        if "heading" in self._get:
-            half = self._number(thing, "heading") / 2
-            orientation = (0.0, 0.0, sin(half), cos(half)) if isfinite(half) else UNSTATED
-            has_heading = isfinite(half)
+        has_heading = "orientation" in self._get
+        if "heading" in self._get and isfinite(heading := self._number(thing, "heading")):
+            orientation, has_heading = (0.0, 0.0, sin(heading / 2), cos(heading / 2)), True
         stamp_ns, frame_id = own_head(thing, head)
+        diameter = 2 * self._number(thing, "radius")
+        x, y, z = self._vector(thing, "velocity", "vx vy vz")
         return Box3d(
             stamp_ns,
             text(self._value(thing, "frame") or "") or frame_id,
             centre,
             orientation,
-            size,
+            (diameter, diameter, nan) if "radius" in self._get else self._vector(thing, "size", "length width height"),
             name,
             score,
             _identity(self._value(thing, "id")),
-            _flat_if_2d(self._vector(thing, "velocity", ("vx", "vy", "vz"))),
+            (x, y, 0.0 if isfinite(x + y) and not isfinite(z) else z),  # along the ground where there is no z
             has_heading,
         )
 
     def _pose(self, thing: Any) -> tuple[Vector, Quaternion]:
         """Position and orientation of a thing; those of its first guess where only these are filled in."""
         if "position" not in self._get:
-            x, y = self._needed(thing, "x"), self._needed(thing, "y")
+            x, y = self._numbers(thing, "x y")
             return (x, y, self._number(thing, "z")), UNSTATED
         turns = self._get.get("orientation", [])
         out: list[tuple[Vector, Quaternion]] = []
@@ -767,11 +706,11 @@ class Reader:
             raise AttributeError(name=_joined(self.fields.paths["position"][0]) or "x")
         return out[0]
 
-    def _vector(self, thing: Any, key: str, flat: Sequence[str]) -> Vector:
+    def _vector(self, thing: Any, key: str, flat: str) -> Vector:
         if key in self._get:
             value = self._value(thing, key)
             return UNKNOWN_VECTOR if value is None else vector(value)
-        x, y, z = (self._number(thing, name) for name in flat)
+        x, y, z = (self._number(thing, name) for name in flat.split())
         return x, y, z
 
     def _class(self, thing: Any) -> tuple[str, float]:
@@ -806,13 +745,6 @@ def things_of(message: Any, path: Path) -> Sequence[Any]:
     return _getter(path[:-1])(message) or ()
 
 
-def _each(thing: Any, path: Path) -> list[Any]:
-    """The values at a path for all members of its list."""
-    end = path.index(_EACH)
-    rest = _getter(path[end + 1 :])
-    return [rest(member) for member in things_of(thing, path[: end + 1])]
-
-
 @lru_cache(maxsize=1024)
 def _getter(path: Path) -> Callable[[Any], Any]:
     """A function that takes a message to the value at a path; None where JSON leaves it out.
@@ -821,35 +753,19 @@ def _getter(path: Path) -> Callable[[Any], Any]:
     """
     if not path:
         return lambda message: message
-    if not any(token.startswith("[") for token in path):
-        get = attrgetter(".".join(path))
+    steps = [int(token[1:-1] or 0) if token.startswith("[") else attrgetter(token) for token in path]
+    if all(map(callable, steps)):
+        steps = [attrgetter(".".join(path))]
 
-        def quick(message: Any) -> Any:
-            try:
-                return get(message)
-            except AttributeError:
-                return None
-
-        return quick
-
-    def walk(message: Any) -> Any:
-        for token in path:
-            if message is None:
-                return None
-            if token.startswith("["):
-                index = int(token[1:-1] or 0)
-                message = message[index] if index < len(message) else None
-            else:
-                message = getattr(message, token, None)
+    def get(message: Any) -> Any:
+        try:
+            for step in steps:
+                message = step(message) if callable(step) else message[step]
+        except (AttributeError, IndexError, TypeError):
+            return None
         return message
 
-    return walk
-
-
-def _flat_if_2d(velocity: Vector) -> Vector:
-    """A velocity in space of one along the ground, which states no z."""
-    x, y, z = velocity
-    return (x, y, 0.0) if isfinite(x) and isfinite(y) and not isfinite(z) else velocity
+    return get
 
 
 def _identity(value: Any) -> int | str | None:
@@ -893,8 +809,6 @@ def vector(value: Any) -> Vector:
     if isinstance(value, np.ndarray | list | tuple):
         x, y, z = (*map(float, value[:3]), nan, nan, nan)[:3]
         return x, y, z
-    if hasattr(value, "length") and not hasattr(value, "x"):
-        return number(value.length), number(value.width), number(value.height)
     return number(value.x), number(value.y), number(value.z) if hasattr(value, "z") else nan
 
 
@@ -906,6 +820,35 @@ def quaternion(value: Any) -> Quaternion:
 def part(message: Any, name: str) -> Any:
     """A field of a message; None where it is missing, as optional fields of JSON are."""
     return getattr(message, name, None)
+
+
+def rotated(orientation: Quaternion, point: Vector) -> Vector:
+    """A point turned by a quaternion; as it is by one of zeros."""
+    x, y, z, w = orientation
+    norm = x * x + y * y + z * z + w * w
+    if not norm or not isfinite(norm):
+        return point
+    a, b, c = point
+    # p + 2 w (q x p) + 2 q x (q x p), for a quaternion that need not have length 1
+    u, v, t = y * c - z * b, z * a - x * c, x * b - y * a
+    return (
+        a + 2 * (w * u + y * t - z * v) / norm,
+        b + 2 * (w * v + z * u - x * t) / norm,
+        c + 2 * (w * t + x * v - y * u) / norm,
+    )
+
+
+def moved(centre: Vector, orientation: Quaternion, point: Vector) -> Vector:
+    """A point of a box or group, given along its axes, in the frame of the box."""
+    x, y, z = rotated(orientation, point)
+    return centre[0] + x, centre[1] + y, centre[2] + z
+
+
+def around(points: Sequence[Vector]) -> tuple[Vector, Vector]:
+    """Middle and size of the box around points, along their axes. There has to be one at least."""
+    low, high = (tuple(pick(point[axis] for point in points) for axis in range(3)) for pick in (min, max))
+    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2)
+    return middle, (high[0] - low[0], high[1] - low[1], high[2] - low[2])
 
 
 def check_box(x: float, y: float, w: float, h: float, theta: float = 0.0) -> None:

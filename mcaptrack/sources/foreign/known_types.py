@@ -12,8 +12,8 @@ from math import isnan, nan
 from typing import Any, Final, NamedTuple
 
 from mcaptrack.contracts import UNKNOWN_VECTOR, Box3d, Vector
-from mcaptrack.sources.foreign.fields import Adjust, integer, number, part, vector
-from mcaptrack.sources.foreign.solids import around, moved, rotated
+from mcaptrack.sources.foreign.decoding import integer, number
+from mcaptrack.sources.foreign.fields import Adjust, around, moved, part, rotated, vector
 
 
 class Known(NamedTuple):

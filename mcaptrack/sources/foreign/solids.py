@@ -16,41 +16,12 @@ import numpy as np
 
 from mcaptrack.contracts import Box3d, Quaternion, Vector
 from mcaptrack.sources.foreign.decoding import integer, number, stamp_of, text
-from mcaptrack.sources.foreign.fields import Message3d, head_of, part, quaternion, vector
+from mcaptrack.sources.foreign.fields import Message3d, head_of, moved, part, quaternion, vector
 
 _WORD: Final = re.compile(r"[^\W\d_][\w-]*")
 _PERCENT: Final = re.compile(r"(?<![\w.])(\d{1,3}(?:\.\d+)?)\s*%")
 #: A number from 0 to 1 that isn't a distance, speed or angle.
 _SHARE: Final = re.compile(r"(?<![\w.-])(?:0?\.\d+|1\.0+|[01]\.)(?![\w.])(?!\s*(?:c?m|km|m?s|deg|rad|kph)\b|\s*°)")
-
-
-def rotated(orientation: Quaternion, point: Vector) -> Vector:
-    """A point turned by a quaternion; as it is by one of zeros."""
-    x, y, z, w = orientation
-    norm = x * x + y * y + z * z + w * w
-    if not norm or not isfinite(norm):
-        return point
-    a, b, c = point
-    # p + 2 w (q x p) + 2 q x (q x p), for a quaternion that need not have length 1
-    u, v, t = y * c - z * b, z * a - x * c, x * b - y * a
-    return (
-        a + 2 * (w * u + y * t - z * v) / norm,
-        b + 2 * (w * v + z * u - x * t) / norm,
-        c + 2 * (w * t + x * v - y * u) / norm,
-    )
-
-
-def moved(centre: Vector, orientation: Quaternion, point: Vector) -> Vector:
-    """A point of a box or group, given along its axes, in the frame of the box."""
-    x, y, z = rotated(orientation, point)
-    return centre[0] + x, centre[1] + y, centre[2] + z
-
-
-def around(points: Sequence[Vector]) -> tuple[Vector, Vector]:
-    """Middle and size of the box around points, along their axes. There has to be one at least."""
-    low, high = (tuple(pick(point[axis] for point in points) for axis in range(3)) for pick in (min, max))
-    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2)
-    return middle, (high[0] - low[0], high[1] - low[1], high[2] - low[2])
 
 
 class Solid(NamedTuple):
