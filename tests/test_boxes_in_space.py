@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import log
@@ -18,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.sources import camera_motion
+from mcaptrack.sources import camera_motion, foreign
 from mcaptrack.sources.fixed_frame import named_detections, recorded, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType, boxes_decoder
 from mcaptrack.sources.foreign.fields import Message3d
@@ -423,3 +424,87 @@ def test_boxes_in_a_root_are_told_why_nothing_is_above_it(tmp_path, monkeypatch)
     assert found.frame_id == "lidar"
     words = "transforms: base_link -> lidar: 1 pose without a rotation or a position are left out"
     assert warnings.count(words) == 1
+
+
+# Drawings that are no cubes
+
+
+def wires(centre, turn: Rotation, size) -> list[np.ndarray]:
+    """The ends of the twelve edges of a box."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2 * size
+    pairs = [(a, b) for a in range(8) for b in range(a) if (np.abs(corners[a] - corners[b]) > 1e-9).sum() == 1]
+    return [turn.apply(corners[number]) + centre for pair in pairs for number in pair]
+
+
+@given(
+    st.lists(st.floats(-50, 50), min_size=3, max_size=3),
+    st.lists(st.floats(0.3, 4), min_size=3, max_size=3),
+    st.floats(-3, 3),
+    st.integers(0, 9),
+)
+def test_boxes_of_lines_are_boxes(centre, size, yaw, seed):
+    """The longer side on the ground is the length; which end is the front, lines don't say."""
+    points = wires(np.array(centre), Rotation.from_euler("z", yaw), np.array(size))
+    order = np.random.default_rng(seed).permutation(12)
+    shuffled = [points[2 * edge + end] for edge in order for end in (0, 1)]
+    writer = ros("visualization_msgs/MarkerArray")
+    lines = marker(writer, START_NS, Seen(np.zeros(3), np.array([0, 0, 0, 1.0]), np.ones(3)), 5, points=shuffled)
+    (box,) = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", [lines])).boxes
+    np.testing.assert_allclose(box.centre, centre, atol=1e-6)
+    np.testing.assert_allclose(box.size, [*sorted(size[:2], reverse=True), size[2]], atol=1e-6)
+    ahead = Rotation.from_quat(box.orientation).apply([1, 0, 0])
+    along = Rotation.from_euler("z", yaw).apply([1, 0, 0] if size[0] >= size[1] else [0, 1, 0])
+    assert abs(size[0] - size[1]) < 1e-6 or abs(ahead @ along) > 1 - 1e-6
+    cut = marker(writer, START_NS, SEEN, 5, points=shuffled[:-2])
+    assert not boxes_of(writer, writer.new("visualization_msgs/MarkerArray", [cut])).boxes
+
+
+@pytest.mark.parametrize("kind", [2, 3, 7])
+def test_markers_that_are_round_have_a_size_and_no_heading(kind):
+    writer = ros("visualization_msgs/MarkerArray")
+    points = [(0, 0, 0)] if kind == 7 else ()
+    lines = marker(writer, START_NS, SEEN, 5, points=wires(SEEN.centre, Rotation.identity(), SEEN.size))
+    drawn = [marker(writer, START_NS, SEEN, kind, points=points, space="people"), lines]
+    found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", drawn))
+    (box,) = found.boxes  # lines count only where there is nothing else
+    assert (box.centre, box.size, box.class_name) == ((1, 2, 3), (4, 2, 1.5), "people")
+    assert not box.has_heading
+    assert found.ignored == {"markers that are no solids": 1}
+
+
+@pytest.mark.parametrize("kind", ["spheres", "cylinders", "lines"])
+def test_entities_may_be_drawn_by_other_solids(kind):
+    message = scene_update(START_NS, [replace(SEEN, turn=np.array([0, 0, 0, 1.0]))])
+    (entity,) = message.entities
+    cube = entity.cubes.pop()
+    if kind == "lines":
+        line = entity.lines.add(type=2)
+        for x, y, z in wires(SEEN.centre, Rotation.identity(), SEEN.size):
+            line.points.add(x=x, y=y, z=z)
+    else:
+        solid = getattr(entity, kind).add()
+        solid.pose.CopyFrom(cube.pose)
+        solid.size.CopyFrom(cube.size)
+    (box,) = boxes_decoder(_KIND, in_space=True)(message.SerializeToString()).boxes
+    np.testing.assert_allclose([*box.centre, *box.size], [1, 2, 3, 4, 2, 1.5], atol=1e-9)
+    assert (box.class_name, box.source_id, box.has_heading) == ("car", "12", kind == "lines")
+
+
+@pytest.mark.parametrize(
+    ("topic", "space", "is_read"), [("/goal", "", 0), ("/goal", "person", 1), ("/people/now", "", 1)]
+)
+def test_what_is_round_is_a_thing_where_a_name_says_so(topic, space, is_read, tmp_path):
+    writer = ros("visualization_msgs/MarkerArray")
+    ball = writer.new("visualization_msgs/MarkerArray", [marker(writer, START_NS, SEEN, 2, space=space)])
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        out = Writer(stream)
+        out.start()
+        schema = out.register_schema(writer.kind.name, writer.kind.schema_encoding, writer.kind.schema)
+        out.add_message(out.register_channel(topic, "cdr", schema), START_NS, writer.pack(ball), START_NS)
+        out.finish()
+    with log.read(path) as opened:
+        assert foreign.holds_boxes(opened, topic) == bool(is_read)
+        assert list(foreign.uncertain_boxes(opened)) == [topic] * (not is_read)
+    found, _ = read(path, topic=topic)
+    assert found.frames[0].rows["class_id"].tolist() == [1 if is_read else 0]

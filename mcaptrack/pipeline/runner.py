@@ -434,11 +434,12 @@ def _input(
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
         return Input(each, [], digest, lambda: len(seen), damaged=damaged, unreadable=unreadable)
     if job.source in results:
-        frames, how, facts = results[job.source].frames, results[job.source].provenance, dict[str, str]()
+        facts: Mapping[str, str] = {}
+        frames, how = results[job.source].frames, results[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
-        read = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
-        frames, names, frame_id, facts = read
+        named = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
+        frames, names, frame_id, facts = named
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
     stream = _Repeatable(lambda: _counted(frames, count(1), len(frames), job.stage, progress))
@@ -472,7 +473,7 @@ def input_of(
     topic = source or f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
-    frames, names, _ = read_named_frames(opened, topic, transform.reads)
+    frames, names, *_ = read_named_frames(opened, topic, transform.reads)
     classes = {str(number): name for number, name in names.items()}
     source_of_job = Input(frames, frames, lambda: "", lambda: len(frames), classes)
     work = Work(RunState(opened, prefix, {}), job, source_of_job, read_planes(opened, prefix))

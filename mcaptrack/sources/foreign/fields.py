@@ -285,7 +285,7 @@ def _lists(shape: Shape, type_name: str) -> Iterator[tuple[Path, Shape, list[str
     their names.
     """
     own = _words_in(type_name)
-    insides = [((name,), inner) for name, inner in shape.fields]
+    insides: list[tuple[Path, Shape]] = [((name,), inner) for name, inner in shape.fields]
     insides += [
         ((name, below), last) for name, inner in shape.fields if inner.is_struct for below, last in inner.fields
     ]

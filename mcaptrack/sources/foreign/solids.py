@@ -217,7 +217,8 @@ def _of_solid(marker: Any, solid: Solid, labels: dict[int, str]) -> Box3d:
         source_id = integer(marker.id)
         label, share = words_of(labels.get(source_id, ""))
         name, score = name or label, share if isnan(score) else score
-    return Box3d(*head_of(marker), *solid[:3], name, score, source_id, has_heading=solid.has_heading)
+    head, (centre, orientation, size, has_heading) = head_of(marker), solid
+    return Box3d(*head, centre, orientation, size, name, score, source_id, has_heading=has_heading)
 
 
 def _labels(markers: list[Any]) -> dict[int, str]:
