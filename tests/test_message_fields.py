@@ -181,6 +181,20 @@ DEFINITIONS = {
     "opencv_apps/RectArrayStamped": RECTS,
     "yolo_msgs/DetectionArray": YOLO["yolo_msgs"],
     "yolov8_msgs/DetectionArray": YOLO["yolov8_msgs"],
+    "autoware_perception_msgs/PredictedObjects": package(
+        "autoware_perception_msgs",
+        PredictedObjects="std_msgs/Header header; PredictedObject[] objects",
+        PredictedObject="unique_identifier_msgs/UUID object_id; float32 existence_probability; "
+        "ObjectClassification[] classification; PredictedObjectKinematics kinematics; Shape shape",
+        ObjectClassification="uint8 UNKNOWN=0; uint8 CAR=1; uint8 PEDESTRIAN=7; uint8 label; float32 probability",
+        PredictedObjectKinematics="geometry_msgs/PoseWithCovariance initial_pose_with_covariance; "
+        "geometry_msgs/TwistWithCovariance initial_twist_with_covariance; "
+        "geometry_msgs/AccelWithCovariance initial_acceleration_with_covariance; PredictedPath[] predicted_paths",
+        PredictedPath="geometry_msgs/Pose[] path; float32 confidence",
+        Shape="uint8 type; geometry_msgs/Polygon footprint; geometry_msgs/Vector3 dimensions",
+    )
+    + BAR
+    + "MSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n",
     # Not known by name: nobody published it.
     "lab_msgs/WalkerList": package(
         "lab_msgs",
@@ -228,6 +242,18 @@ IN_SPACE = {
     "radar_msgs/RadarTracks": (
         "tracks", {"track_id": 7, "position": AT, "velocity": FAST, "size": SIZE, "classification": "Person"},
         "id v size",
+    ),
+    "autoware_perception_msgs/PredictedObjects": (
+        "objects",
+        {
+            "object_id": {"uuid": [1] * 16}, "existence_probability": 0.75,
+            "classification": [{"label": 7, "probability": 1.0}], "shape": {"dimensions": SIZE},
+            "kinematics": {
+                "initial_pose_with_covariance": {"pose": POSE},
+                "initial_twist_with_covariance": {"twist": {"linear": {"x": 0.25, "y": -0.5}}},  # of the object's axes
+            },
+        },
+        "uuid score v size heading",
     ),
     "obstacle_detector/Obstacles": ("circles", {"center": AT, "velocity": FAST, "radius": 0.25}, "v round nothing"),
     **dict.fromkeys(
@@ -392,11 +418,11 @@ def test_positions_ids_classes_and_scores_are_as_the_message_states_them(name, e
         **dict(zip(("length_m", "width_m", "height_m"), size, strict=True)),
         "heading_rad": np.pi / 2 if "heading" in has else nan,
         "score": 0.75 if "score" in has else nan,
-        "source_id": 7 if "id" in has else -1,
+        "source_id": 7 if "id" in has else 0 if "uuid" in has else -1,
     }
     np.testing.assert_allclose([row[key] for key in wanted], list(wanted.values()), atol=1e-6)
     assert found.frame_id == ("odom" if "odom" in has else "map")
-    name_of_class = "leg" if "leg" in has else "" if "nothing" in has else "person"
+    name_of_class = "pedestrian" if "uuid" in has else "leg" if "leg" in has else "" if "nothing" in has else "person"
     assert ({0: "", 1: "person"} | found.classes)[row["class_id"]].lower() == name_of_class
     with log.read(path) as opened:
         assert foreign.holds_boxes(opened, "/seen", in_space=True)
@@ -474,6 +500,7 @@ def test_what_does_not_move_is_not_taken_for_people(name, encoding, tmp_path):
     path = write(tmp_path / "a.mcap", {"/a": (name, [{"header": HEAD, **NO_THINGS[name]}])}, encoding)
     with log.read(path) as opened:
         assert not foreign.holds_boxes(opened, "/a")
+        assert not foreign.uncertain_boxes(opened)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

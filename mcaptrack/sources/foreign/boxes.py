@@ -43,12 +43,13 @@ from mcaptrack.sources.foreign.decoding import (
     text,
 )
 from mcaptrack.sources.foreign.fields import (
+    NO_THINGS,
     PEOPLE,
     THINGS,
-    Fields,
+    FieldReader,
+    FieldShape,
     Message3d,
-    Reader,
-    Shape,
+    ThingFields,
     check_box,
     head_of,
     mapped,
@@ -83,9 +84,9 @@ _PERSON: Final = "person"
 # What a user chooses
 
 
-class Choice(NamedTuple):
-    """How boxes of other software are read: the channel that is named, paths of its fields as ``map=`` has them, and
-    the text of a class map; "" for what isn't chosen.
+class BoxesChoice(NamedTuple):
+    """A choice of how boxes of other software are read: the channel that is named, paths of its fields as ``map=`` has
+    them, and the text of a class map; "" for what isn't chosen.
     """
 
     topic: str = ""
@@ -93,7 +94,7 @@ class Choice(NamedTuple):
     class_map: str = ""
 
 
-_CHOICE: ContextVar[Choice] = ContextVar("choice of boxes", default=Choice())  # noqa: B039  # it is immutable
+_CHOICE: ContextVar[BoxesChoice] = ContextVar("choice of boxes", default=BoxesChoice())  # noqa: B039  # it is immutable
 
 
 @contextmanager
@@ -103,7 +104,7 @@ def choosing(topic: str | None, fields: str | None, class_map: str | None) -> It
         raise McaptrackError("`map=` says how the messages of one channel are read; name it with `topic=`")
     if fields:
         parse_map(fields)
-    chosen = Choice(topic or "", fields or "", str(ClassMap.parse(class_map)) if class_map is not None else "")
+    chosen = BoxesChoice(topic or "", fields or "", str(ClassMap.parse(class_map)) if class_map is not None else "")
     token = _CHOICE.set(chosen)
     try:
         yield
@@ -111,11 +112,11 @@ def choosing(topic: str | None, fields: str | None, class_map: str | None) -> It
         _CHOICE.reset(token)
 
 
-def choice_for(opened: log.Log, topic: str) -> Choice:
-    """How a channel is to be read: as is chosen now, or else as what was made of it was read."""
+def choice_for(opened: log.Log, topic: str) -> BoxesChoice:
+    """The way a channel is to be read: as is chosen now, or else as what was made of it was read."""
     now = _CHOICE.get()
     before = next((facts for facts in _facts_before(opened, topic) if facts), {})
-    return Choice(
+    return BoxesChoice(
         now.topic if now.topic == topic else "",
         (now.fields if now.topic == topic else "") or before.get("map", ""),
         now.class_map or before.get("class_map", ""),
@@ -134,7 +135,7 @@ _FACTS: Final[WeakKeyDictionary[log.Log, dict[str, list[Mapping[str, str]]]]] = 
 
 
 def _facts_before(opened: log.Log, topic: str) -> list[Mapping[str, str]]:
-    """What is recorded of how a channel was read, by each channel that was made of it."""
+    """The record of how a channel was read, by each channel that was made of it."""
     if opened not in _FACTS:
         _FACTS[opened] = {}
         for channel in opened.channels.values():
@@ -147,7 +148,7 @@ def _facts_before(opened: log.Log, topic: str) -> list[Mapping[str, str]]:
 
 
 class Reading(NamedTuple):
-    """How the messages of a channel are read.
+    """The way the messages of a channel are read.
 
     Attributes
     ----------
@@ -155,7 +156,7 @@ class Reading(NamedTuple):
         Whether boxes are in metres.
     read : callable
         From a message to a list of ``Box``, or of boxes in space a ``Message3d``.
-    fields : Fields or None
+    fields : ThingFields or None
         What its fields are; None for drawings, and readers of packages.
     is_certain : bool
         Whether it holds boxes of what moves, or only may.
@@ -167,17 +168,17 @@ class Reading(NamedTuple):
 
     in_space: bool
     read: Callable[[Any], Any]
-    fields: Fields | None = None
+    fields: ThingFields | None = None
     is_certain: bool = True
     class_name: str = ""
     known: Known | None = None
 
 
-_READINGS: Final[WeakKeyDictionary[log.Log, dict[tuple[str, Choice], Reading | None]]] = WeakKeyDictionary()
+_READINGS: Final[WeakKeyDictionary[log.Log, dict[tuple[str, BoxesChoice], Reading | None]]] = WeakKeyDictionary()
 
 
 def reading_of(opened: log.Log, topic: str) -> Reading | None:
-    """How a channel is read; None if its messages hold neither boxes nor positions.
+    """The way a channel is read; None if its messages hold neither boxes nor positions.
 
     A warning names a package with its reader that can't be imported. Raises McaptrackError for paths of a user that its
     type doesn't have.
@@ -189,7 +190,7 @@ def reading_of(opened: log.Log, topic: str) -> Reading | None:
     return kept[topic, choice]
 
 
-def _reading(opened: log.Log, channel: log.Channel, choice: Choice) -> Reading | None:
+def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Reading | None:
     if not channel.schema_name or Provenance.from_metadata(channel.metadata):  # views of mcaptrack are drawings, too
         return None
     kind, words = message_type_of(opened, channel.topic), re.findall("[a-z]+", channel.topic.lower())
@@ -202,6 +203,8 @@ def _reading(opened: log.Log, channel: log.Channel, choice: Choice) -> Reading |
             return special
     except McaptrackError as error:
         warn(f"{error}; messages of {channel.topic} are not read", "other")
+        return None
+    if NO_THINGS.fullmatch(name) and not choice.fields:
         return None
     try:
         shape = shape_of_type(kind) or _shape_of(_samples(opened, channel.topic, kind))
@@ -223,7 +226,7 @@ def _reading(opened: log.Log, channel: log.Channel, choice: Choice) -> Reading |
 
 
 def _of_drawings(special: Reading, messages: Sequence[Any], words: Sequence[str], person: str) -> Reading | None:
-    """How drawings are read; None if there is no box among the first ones.
+    """The way drawings are read; None if there is no box among the first ones.
 
     What is round may be a mark of anything, where nothing names it.
     """
@@ -233,7 +236,7 @@ def _of_drawings(special: Reading, messages: Sequence[Any], words: Sequence[str]
     return special._replace(is_certain=is_certain, class_name=person) if boxes else None
 
 
-def _shape_of(messages: Sequence[Any]) -> Shape:
+def _shape_of(messages: Sequence[Any]) -> FieldShape:
     """The fields of messages in JSON, of all together."""
     return shape_of_message(list(messages))._replace(count=None)
 
@@ -248,7 +251,7 @@ def _samples(opened: log.Log, topic: str, kind: MessageType, most: int = _TRIED)
 
 
 @lru_cache(maxsize=256)
-def fields_reader(name: str, shape: Shape, chosen: str = "") -> Reader | None:
+def fields_reader(name: str, shape: FieldShape, chosen: str = "") -> FieldReader | None:
     """The reader of a type by its fields: those that a user chose, those of ``known_types``, and by their names.
 
     None if there are neither boxes nor positions. Raises McaptrackError for chosen paths that the type doesn't have.
@@ -262,11 +265,11 @@ def fields_reader(name: str, shape: Shape, chosen: str = "") -> Reader | None:
         fields = replace(fields, names=dict(enumerate(known.classes.split(","))))
     if chosen:
         fields = mapped(shape, name, parse_map(chosen))
-    return None if fields is None else Reader(fields, fields.in_space, None if chosen else known.adjust)
+    return None if fields is None else FieldReader(fields, fields.in_space, None if chosen else known.adjust)
 
 
 def _special(name: str) -> Reading | None:
-    """How messages of a type are read if not by their fields: drawings, and types that a package reads.
+    """The way messages of a type are read if not by their fields: drawings, and types that a package reads.
 
     Raises McaptrackError if the reader of a package can't be imported. Packages that aren't needed are not imported.
     """
@@ -508,8 +511,8 @@ def classes_of(opened: log.Log, topic: str, reading: Reading, texts: Sequence[st
     return classes
 
 
-def facts_of(choice: Choice, reading: Reading, **facts: str) -> dict[str, str]:
-    """What is recorded of how a channel was read, with what was chosen."""
+def facts_of(choice: BoxesChoice, reading: Reading, **facts: str) -> dict[str, str]:
+    """The record of how a channel was read, with what was chosen."""
     chosen = {"fields": str(reading.fields or ""), "map": choice.fields, "class_map": choice.class_map}
     return {key: value for key, value in (facts | chosen).items() if value}
 
@@ -517,7 +520,7 @@ def facts_of(choice: Choice, reading: Reading, **facts: str) -> dict[str, str]:
 def scale_boxes(where: str, boxes: Floats, size: tuple[int, int] | None) -> str:
     """Scale boxes (N, 4) that are in shares of a picture to its size, in place; returns their scale.
 
-    Warns of boxes outside of their pictures. Raises McaptrackError for shares of a picture whose size isn't known.
+    Warns of boxes outside of their pictures. Raises McaptrackError for shares of a picture of unknown size.
     """
     ends = boxes[:, :2] + boxes[:, 2:]
     if not len(boxes):
@@ -547,7 +550,7 @@ def scale_boxes(where: str, boxes: Floats, size: tuple[int, int] | None) -> str:
 _MARGIN: Final = 0.1
 
 
-def _size_stated(choice: Choice) -> tuple[int, int] | None:
+def _size_stated(choice: BoxesChoice) -> tuple[int, int] | None:
     stated = parse_map(choice.fields).get("picture") if choice.fields else None
     width, height = stated[0].split("x") if stated else ("0", "0")
     return (int(width), int(height)) if stated else None

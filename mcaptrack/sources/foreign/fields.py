@@ -5,7 +5,7 @@ Where the things of a message are, and which of their fields is what, is written
     position=people[].pose.pose.position,id=people[].track_id,score=people[].confidence
 
 ``recognised`` finds these paths in the definition of a type; a user may give them; ``known_types`` has those of types
-whose names mislead. ``Reader`` then takes messages to boxes, whatever the paths are from.
+with misleading names. ``FieldReader`` then takes messages to boxes, whatever the paths are from.
 
 Letters: N boxes.
 """
@@ -46,7 +46,7 @@ UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
 _DEEPEST, _MOST_FIELDS = 9, 2_000
 
 
-class Shape(NamedTuple):
+class FieldShape(NamedTuple):
     """The type of a field: "number", "text", "struct" or "other". ``count`` is None for one value, 0 for a list, and
     the length of an array. ``constants`` are those of a struct: name and value.
     """
@@ -62,7 +62,7 @@ class Shape(NamedTuple):
         """Whether it is one message."""
         return self.kind == "struct" and self.count is None
 
-    def at(self, path: Path) -> Shape | None:
+    def at(self, path: Path) -> FieldShape | None:
         """The type at the end of a path; None if there is no such field."""
         here = self
         for token in path:
@@ -78,9 +78,9 @@ class Shape(NamedTuple):
         return here
 
 
-def shape_of_type(kind: MessageType) -> Shape | None:
+def shape_of_type(kind: MessageType) -> FieldShape | None:
     """The fields of a type by its definition in the log; None for JSON. Raises McaptrackError as ``unpacker`` does."""
-    fields = count(1)  # a type whose definition is made to be endless is cut
+    fields = count(1)  # a definition that is made to be endless is cut
     if kind.encoding == MessageEncoding.Protobuf:
         from_string: Any = protobuf_unpacker(kind)
         return _of_descriptor(from_string.__self__.DESCRIPTOR, 0, fields)
@@ -90,16 +90,16 @@ def shape_of_type(kind: MessageType) -> Shape | None:
     return None
 
 
-def _of_ros(store: Any, name: str, depth: int, count_fields: Iterator[int]) -> Shape:
+def _of_ros(store: Any, name: str, depth: int, count_fields: Iterator[int]) -> FieldShape:
     constants, fields = store.fielddefs[name]
     stated = tuple((key, int(value)) for key, _, value in constants if isinstance(value, int))
     if depth >= _DEEPEST or next(count_fields) > _MOST_FIELDS:
         fields = ()
     inner = ((key, _of_ros_field(store, kind, depth + 1, count_fields)) for key, kind in fields)
-    return Shape("struct", name, tuple(inner), None, stated)
+    return FieldShape("struct", name, tuple(inner), None, stated)
 
 
-def _of_ros_field(store: Any, kind: Any, depth: int, count_fields: Iterator[int]) -> Shape:
+def _of_ros_field(store: Any, kind: Any, depth: int, count_fields: Iterator[int]) -> FieldShape:
     from rosbags.interfaces import Nodetype
 
     node, inner = kind
@@ -109,43 +109,43 @@ def _of_ros_field(store: Any, kind: Any, depth: int, count_fields: Iterator[int]
         of_each = _of_ros_field(store, inner[0], depth, count_fields)
         return of_each._replace(count=int(inner[1]) if node == Nodetype.ARRAY else 0)
     of = str(inner[0])
-    return Shape("text" if "string" in of else "number" if re.match(r"u?int|float|octet|byte", of) else "other")
+    return FieldShape("text" if "string" in of else "number" if re.match(r"u?int|float|octet|byte", of) else "other")
 
 
-def _of_descriptor(descriptor: Any, depth: int, count_fields: Iterator[int]) -> Shape:
-    def shape(inner: Any) -> Shape:
+def _of_descriptor(descriptor: Any, depth: int, count_fields: Iterator[int]) -> FieldShape:
+    def shape(inner: Any) -> FieldShape:
         if inner.message_type is not None:
             out = _of_descriptor(inner.message_type, depth + 1, count_fields)
         else:
             kinds = {inner.CPPTYPE_STRING: "text", inner.CPPTYPE_BOOL: "other"}
             values = inner.enum_type.values if inner.enum_type is not None else ()
-            out = Shape(kinds.get(inner.cpp_type, "number"), constants=tuple((v.name, v.number) for v in values))
+            out = FieldShape(kinds.get(inner.cpp_type, "number"), constants=tuple((v.name, v.number) for v in values))
         # Before version 6 of protobuf there is only the label.
         is_list = inner.is_repeated if hasattr(inner, "is_repeated") else inner.label == inner.LABEL_REPEATED
         return out._replace(count=0) if is_list else out
 
     is_cut = depth >= _DEEPEST or next(count_fields) > _MOST_FIELDS
     members = () if is_cut else descriptor.fields
-    return Shape("struct", descriptor.full_name, tuple((inner.name, shape(inner)) for inner in members))
+    return FieldShape("struct", descriptor.full_name, tuple((inner.name, shape(inner)) for inner in members))
 
 
-def shape_of_message(message: Any, depth: int = 0) -> Shape:
+def shape_of_message(message: Any, depth: int = 0) -> FieldShape:
     """The fields of a message that was decoded from JSON; of lists those of their first members together."""
     if isinstance(message, list):
         of_all = reduce(_together, (shape_of_message(member, depth + 1) for member in message[:_JUDGED]), _NOTHING)
         is_vector = of_all.kind == "number" and len(message) <= _JUDGED
-        return of_all._replace(count=len(message) if is_vector else 0) if of_all.count is None else Shape("other")
+        return of_all._replace(count=len(message) if is_vector else 0) if of_all.count is None else FieldShape("other")
     if isinstance(message, bool) or message is None:
-        return Shape("other")
+        return FieldShape("other")
     if isinstance(message, int | float):
-        return Shape("number")
+        return FieldShape("number")
     if isinstance(message, str):
-        return Shape("text")
+        return FieldShape("text")
     fields = vars(message).items() if depth < _DEEPEST else ()
-    return Shape("struct", "", tuple((key, shape_of_message(value, depth + 1)) for key, value in fields))
+    return FieldShape("struct", "", tuple((key, shape_of_message(value, depth + 1)) for key, value in fields))
 
 
-def _together(one: Shape, other: Shape) -> Shape:
+def _together(one: FieldShape, other: FieldShape) -> FieldShape:
     """The type of a field that has these types in two messages: in each something may be missing."""
     if one.kind == "other" or other.kind == "other":
         return other if one.kind == "other" else one
@@ -157,7 +157,7 @@ def _together(one: Shape, other: Shape) -> Shape:
     return one._replace(fields=tuple(fields.items()))
 
 
-_NOTHING, _NUMBER = Shape("other"), Shape("number")
+_NOTHING, _NUMBER = FieldShape("other"), FieldShape("number")
 #: Members of lists of JSON that are looked at.
 _JUDGED: Final = 50
 
@@ -220,7 +220,7 @@ _OTHERS: Final = re.compile(
 )
 #: Parts of people: what their type is called is their class.
 _PARTS: Final = re.compile(r"legs?|faces?")
-#: Packages whose messages hold no things.
+#: Packages with messages that hold no things.
 NO_THINGS: Final = re.compile(
     r"(action|actionlib|bond|builtin|control|controller|diagnostic|dynamic_reconfigure|gazebo|lifecycle|map|moveit|nav"
     r"|novatel_gps|octomap|rcl|rosapi|rosgraph|sensor|shape|statistics|std|stereo|tf|tf2|trajectory|ublox|velodyne)"
@@ -229,7 +229,7 @@ NO_THINGS: Final = re.compile(
 
 
 @dataclass(frozen=True)
-class Fields:
+class ThingFields:
     """Where a message has its things, and which of their fields is what.
 
     Attributes
@@ -274,18 +274,18 @@ class Fields:
 _PICTURED_KEYS: Final = frozenset({"left", "top", "right", "bottom", "w", "h", "cx", "cy", "theta", "corners"})
 
 
-def recognised(shape: Shape, type_name: str) -> Fields | None:
+def recognised(shape: FieldShape, type_name: str) -> ThingFields | None:
     """The things of a type of messages; None if it has none, that is no position and no box."""
     out = [fields for things, each, names in _lists(shape, type_name) if (fields := _thing(things, each, names))]
     return max(out, key=lambda fields: (fields.is_certain, len(fields.paths)), default=None)
 
 
-def _lists(shape: Shape, type_name: str) -> Iterator[tuple[Path, Shape, list[str]]]:
+def _lists(shape: FieldShape, type_name: str) -> Iterator[tuple[Path, FieldShape, list[str]]]:
     """The lists of messages in a message, and in those that it consists of, and the message itself; with the words in
     their names.
     """
     own = _words_in(type_name)
-    insides: list[tuple[Path, Shape]] = [((name,), inner) for name, inner in shape.fields]
+    insides: list[tuple[Path, FieldShape]] = [((name,), inner) for name, inner in shape.fields]
     insides += [
         ((name, below), last) for name, inner in shape.fields if inner.is_struct for below, last in inner.fields
     ]
@@ -301,8 +301,11 @@ def _words_in(name: str) -> list[str]:
     return [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", re.split(r"[/.]", name)[-1])]
 
 
-def _thing(things: Path, each: Shape, words: Sequence[str]) -> Fields | None:
+def _thing(things: Path, each: FieldShape, words: Sequence[str]) -> ThingFields | None:
     """The fields of a thing; None if it has neither a position nor a box."""
+    is_person = any(map(PEOPLE.fullmatch, words))
+    if any(map(_OTHERS.fullmatch, words)) and not is_person:
+        return None
     picture = _picture(each)
     inside = next(iter(picture.values()), ())[:1]
     found: dict[str, Path | None] = {**_position(each, inside), **picture}
@@ -321,22 +324,20 @@ def _thing(things: Path, each: Shape, words: Sequence[str]) -> Fields | None:
     }
     found |= {} if found["velocity"] else _form(each, _FLAT_VELOCITIES)
     found |= {} if found["size"] or inside else _form(each, _FLAT_SIZES)
-    is_person = any(map(PEOPLE.fullmatch, words))
     if is_person and not found["class"] and not found["id"]:
         found["id"] = _fact(each, ["name"], "text", deepest=0)
     paths = {key: [path] for key, path in found.items() if path is not None}
     _add_posed_guess(each, guess, paths)
     said = sum(key in paths for key in ("id", "class", "score", "velocity", "vx", "size", "length"))
-    is_named = any(map(THINGS.fullmatch, words)) and not any(map(_OTHERS.fullmatch, words))
-    is_certain = is_named and said >= (1 if things else 2) - bool(picture)
+    is_certain = any(map(THINGS.fullmatch, words)) and said >= (1 if things else 2) - bool(picture)
     if not things and not is_certain:
         return None
     part = next((word.rstrip("s") for word in words if _PARTS.fullmatch(word)), "")
     class_name = "" if "class" in paths else part or ("person" if is_person else "")
-    return _with_classes(each, Fields(things, paths, {}, class_name, is_certain))
+    return _with_classes(each, ThingFields(things, paths, {}, class_name, is_certain))
 
 
-def _add_posed_guess(each: Shape, guess: Mapping[str, Path], paths: dict[str, list[Path]]) -> None:
+def _add_posed_guess(each: FieldShape, guess: Mapping[str, Path], paths: dict[str, list[Path]]) -> None:
     """Add the pose in a guess of what a thing is, for things that state no other."""
     prefix = guess["class"][: guess["class"].index(_EACH) + 1] if guess and "position" in paths else ()
     for key, path in _position(each.at(prefix) or _NOTHING, ()).items() if prefix else ():
@@ -344,8 +345,8 @@ def _add_posed_guess(each: Shape, guess: Mapping[str, Path], paths: dict[str, li
             paths[key].append((*prefix, *path))
 
 
-def _with_classes(each: Shape, fields: Fields) -> Fields:
-    """Fields with what the definition says of their class."""
+def _with_classes(each: FieldShape, fields: ThingFields) -> ThingFields:
+    """ThingFields with what the definition says of their class."""
     path = fields.paths.get("class", [()])[0]
     kind = each.at(path)
     if not path or kind is None:
@@ -358,12 +359,12 @@ def _word(name: str) -> str:
 
 
 @lru_cache(maxsize=1024)
-def _members(shape: Shape) -> Mapping[str, tuple[str, Shape]]:
+def _members(shape: FieldShape) -> Mapping[str, tuple[str, FieldShape]]:
     """The fields of a message by their name in lower case and without "_"."""
     return {_word(name): (name, inner) for name, inner in reversed(shape.fields)} if shape.is_struct else {}
 
 
-def _member(shape: Shape, words: str) -> tuple[Path, Shape]:
+def _member(shape: FieldShape, words: str) -> tuple[Path, FieldShape]:
     """The path of a field by words with dots between them, and its type."""
     path: Path = ()
     for word in words.split("."):
@@ -372,7 +373,7 @@ def _member(shape: Shape, words: str) -> tuple[Path, Shape]:
     return path, shape
 
 
-def _form(shape: Shape, forms: Sequence[str]) -> dict[str, Path]:
+def _form(shape: FieldShape, forms: Sequence[str]) -> dict[str, Path]:
     """The paths of numbers that stand together in one of several forms; empty if there is none of these."""
     for form in forms:
         members = {key: _member(shape, words) for key, _, words in (pair.partition("=") for pair in form.split())}
@@ -381,7 +382,7 @@ def _form(shape: Shape, forms: Sequence[str]) -> dict[str, Path]:
     return {}
 
 
-def _axes(shape: Shape | None) -> int:
+def _axes(shape: FieldShape | None) -> int:
     """The number of axes of a point; 0 if a type isn't one."""
     if shape is None or shape.kind == "number":
         return shape.count if shape is not None and shape.count in (2, 3) else 0
@@ -389,7 +390,7 @@ def _axes(shape: Shape | None) -> int:
     return 0 if w or not (x and y) else 2 + z
 
 
-def _vectors(shape: Shape, words: Sequence[str], depth: int = 0) -> Iterator[Path]:
+def _vectors(shape: FieldShape, words: Sequence[str], depth: int = 0) -> Iterator[Path]:
     """The paths of points: the type itself, and in fields with such names, the likeliest first."""
     if _axes(shape):
         yield ()
@@ -398,8 +399,8 @@ def _vectors(shape: Shape, words: Sequence[str], depth: int = 0) -> Iterator[Pat
         yield from ((name, *path) for path in _vectors(inner, words, depth + 1))
 
 
-def _position(shape: Shape, inside: Path) -> dict[str, Path]:
-    """The paths of the position of a thing, and of its orientation. Fields of its box in a picture don't count."""
+def _position(shape: FieldShape, inside: Path) -> dict[str, Path]:
+    """The paths of the position of a thing, and of its orientation. Those of its box in a picture don't count."""
     for path in _vectors(shape, _PLACES):
         if not inside or (path and path[:1] != inside) or (not path and _axes(shape) == 3):
             at = path[:-1] if path and _word(path[-1]) == "position" else path
@@ -414,9 +415,9 @@ def _position(shape: Shape, inside: Path) -> dict[str, Path]:
     return flat | ({"heading": heading} if heading else {})
 
 
-def _fact(shape: Shape, words: Sequence[str], kind: str, deepest: int = 2) -> Path | None:
+def _fact(shape: FieldShape, words: Sequence[str], kind: str, deepest: int = 2) -> Path | None:
     """The path of a field with such a name; those that are least deep count first."""
-    levels: list[tuple[Path, Shape]] = [((), shape)]
+    levels: list[tuple[Path, FieldShape]] = [((), shape)]
     for _ in range(deepest + 1):
         for path, owner in levels:
             for word in words:
@@ -431,20 +432,20 @@ def _fact(shape: Shape, words: Sequence[str], kind: str, deepest: int = 2) -> Pa
     return None
 
 
-def _may_say(name: str, inner: Shape) -> bool:
+def _may_say(name: str, inner: FieldShape) -> bool:
     """Whether a struct may say what a thing is, and not only where."""
     is_place = _word(name) in (*_PLACES, *_VELOCITIES) and _word(name) not in (*_SIZES, *_PICTURED)
     return inner.is_struct and not is_place and _word(name) != "header"
 
 
-def _id_below(shape: Shape) -> Path | None:
+def _id_below(shape: FieldShape) -> Path | None:
     """The path of an id in the field of an id: number, text, or the bytes of a UUID; None if there is none."""
     if shape.kind in ("number", "text") and shape.count in (None, 16):
         return ()
     return _member(shape, "uuid")[0] if "uuid" in _members(shape) else None
 
 
-def _guess(shape: Shape) -> dict[str, Path]:
+def _guess(shape: FieldShape) -> dict[str, Path]:
     """The paths of class and score in a list of guesses of what a thing is; empty if it has no such list."""
     for name, inner in shape.fields:
         if inner.kind == "struct" and inner.count is not None:
@@ -456,7 +457,7 @@ def _guess(shape: Shape) -> dict[str, Path]:
     return {}
 
 
-def _names_of(each: Shape, path: Path) -> dict[int, str]:
+def _names_of(each: FieldShape, path: Path) -> dict[int, str]:
     """The names of classes that are numbers, by the constants beside their field."""
     owner, kind = each.at(path[:-1]) or _NOTHING, each.at(path) or _NOTHING
     if kind.kind != "number":
@@ -469,7 +470,7 @@ def _names_of(each: Shape, path: Path) -> dict[int, str]:
     return {own: "" if name.lower() == "unknown" else name.lower() for name, own in named}
 
 
-def _picture(shape: Shape, depth: int = 0) -> dict[str, Path]:
+def _picture(shape: FieldShape, depth: int = 0) -> dict[str, Path]:
     """The paths of a box in a picture: of a thing, or of its field with such a name; empty if there is none."""
     out = {} if _axes(shape) == 3 or _axes(_member(shape, "center.position")[1]) == 3 else _form(shape, _BOXES)
     if _axes(_member(shape, "center")[1]) == 3:
@@ -526,7 +527,7 @@ def _joined(path: Path) -> str:
     return ".".join(path).replace(".[", "[")
 
 
-def mapped(shape: Shape, type_name: str, chosen: Mapping[str, Path]) -> Fields:
+def mapped(shape: FieldShape, type_name: str, chosen: Mapping[str, Path]) -> ThingFields:
     """The things of a type by the paths that a user gave; fields that these don't name are those that are recognised.
 
     Paths may begin at the message, or at a thing. Raises McaptrackError for paths that the type doesn't have.
@@ -555,7 +556,7 @@ def mapped(shape: Shape, type_name: str, chosen: Mapping[str, Path]) -> Fields:
             "`map=` has to name position, or x and y, or left, top, right and bottom, or left, top, w and h"
         )
     class_name = base.class_name if base and "class" not in paths else ""
-    return _with_classes(shape.at(things) or shape, Fields(things, paths, {}, class_name))
+    return _with_classes(shape.at(things) or shape, ThingFields(things, paths, {}, class_name))
 
 
 #: Paths that stand for the same thing: those that a user gives replace all that are recognised.
@@ -573,7 +574,7 @@ _ENOUGH: Final = (
 )  # fmt: skip
 
 
-def _begin(shape: Shape, path: Path, lists: Sequence[Path]) -> tuple[Path, Path] | None:
+def _begin(shape: FieldShape, path: Path, lists: Sequence[Path]) -> tuple[Path, Path] | None:
     """The list of a path, and the path from a thing of it on; None if the type has no such field."""
     if shape.at(path) is not None:
         if _EACH not in path:
@@ -604,10 +605,13 @@ class Message3d:
 Adjust = Callable[[Any, Box3d], Box3d | None]
 
 
-class Reader:
+_ENDED: Final = "boxes of tracks that have ended"
+
+
+class FieldReader:
     """Takes messages to boxes, by the paths of their fields."""
 
-    def __init__(self, fields: Fields, in_space: bool, adjust: Adjust | None = None) -> None:
+    def __init__(self, fields: ThingFields, in_space: bool, adjust: Adjust | None = None) -> None:
         self.fields, self.in_space, self._adjust = fields, in_space, adjust
         self._get = {key: [_getter(path) for path in paths] for key, paths in fields.paths.items()}
 
@@ -627,7 +631,7 @@ class Reader:
         for thing in things:
             box = self._box_3d(thing, head)
             if self._adjust and (box := self._adjust(thing, box)) is None:  # type: ignore[assignment]
-                out.ignored["boxes whose track was given up"] = out.ignored.get("boxes whose track was given up", 0) + 1
+                out.ignored[_ENDED] = out.ignored.get(_ENDED, 0) + 1
             else:
                 out.boxes.append(box)
         return out

@@ -1,4 +1,4 @@
-"""What the fields of messages of other software don't tell, by type: one line for each.
+"""Types of messages of other software that need more than their fields: one line for each.
 
 A type that isn't here is read by its fields all the same, which is said. A line says nothing but that names of fields
 don't mislead, or names the fields that do, the classes behind numbers (for JSON, which has no constants), or a function
