@@ -34,6 +34,7 @@ Code = Literal[
     "estimated-ground-plane",
     "extrapolated",
     "few-pictures",
+    "fields",
     "heights",
     "held-back",
     "journal",

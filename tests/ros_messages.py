@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mcaptrack.sources.foreign import Classes, MessageType, boxes_decoder
+from mcaptrack.sources.foreign import MessageType, boxes_decoder
 
 STAMP_NS = 1_700_000_000_123_456_789
 
@@ -127,4 +127,4 @@ def vision(layout: str, boxes) -> tuple[MessageType, bytes]:
 
 
 def boxes(kind: MessageType):
-    return boxes_decoder(kind, Classes())
+    return boxes_decoder(kind)

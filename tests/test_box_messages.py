@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import recorded
-from mcaptrack.sources.foreign import Classes, MessageType, boxes_decoder
-from mcaptrack.sources.foreign.boxes import Message3d, boxes_3d_decoder
+from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.foreign.fields import Message3d
 from tests.ros_messages import BAR, Ros
 from tests.space_logs import (
     SEEN,
@@ -85,9 +85,9 @@ def plain(message) -> object:
 def read(writer: Ros, message, encoding: str) -> Message3d:
     """The boxes of a message; a writer of ROS 1 or ROS 2 made it."""
     if encoding != "json":
-        return boxes_3d_decoder(writer.kind)(writer.pack(message))
+        return boxes_decoder(writer.kind, in_space=True)(writer.pack(message))
     kind = MessageType(writer.kind.name, "jsonschema", b"{}", "json")
-    return boxes_3d_decoder(kind)(json.dumps(plain(message)).encode())
+    return boxes_decoder(kind, in_space=True)(json.dumps(plain(message)).encode())
 
 
 def twist(writer: Ros, velocity):
@@ -238,7 +238,7 @@ def test_detections_that_state_their_pose_in_a_result_alone():
     head = {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "lidar"}
     boxes = [one((0, 0, 0), (7, 8, 9)), one((1, 0, 0), (7, 8, 9)), one((0, 0, 0), (0, 0, 0))]
     kind = MessageType("vision_msgs/msg/Detection3DArray", "jsonschema", b"{}", "json")
-    found = boxes_3d_decoder(kind)(json.dumps({"header": head, "detections": boxes}).encode())
+    found = boxes_decoder(kind, in_space=True)(json.dumps({"header": head, "detections": boxes}).encode())
     assert [box.centre for box in found.boxes] == [(7, 8, 9), (1, 0, 0), (0, 0, 0)]
     assert [box.orientation for box in found.boxes] == [(0, 0, 0, 1), (0, 0, 0, 0), (0, 0, 0, 0)]
 
@@ -246,13 +246,13 @@ def test_detections_that_state_their_pose_in_a_result_alone():
 def test_a_field_that_is_missing_is_named():
     kind = MessageType("jsk_recognition_msgs/BoundingBoxArray", "jsonschema", b"{}", "json")
     with pytest.raises(McaptrackError, match=r"message \(it has no field 'stamp'\)$"):
-        boxes_3d_decoder(kind)(b'{"header": {"frame_id": "a"}, "boxes": []}')
+        boxes_decoder(kind, in_space=True)(b'{"header": {"frame_id": "a"}, "boxes": []}')
 
 
 def test_scenes_of_foxglove_are_the_same_in_all_encodings():
     protobuf = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
-    wanted = boxes_3d_decoder(protobuf)(scene_update(START_NS, [SEEN]).SerializeToString())
-    found = boxes_3d_decoder(protobuf._replace(encoding="json"))(scene_update_json(START_NS, [SEEN]))
+    wanted = boxes_decoder(protobuf, in_space=True)(scene_update(START_NS, [SEEN]).SerializeToString())
+    found = boxes_decoder(protobuf._replace(encoding="json"), in_space=True)(scene_update_json(START_NS, [SEEN]))
     assert found.boxes == wanted.boxes
     assert wanted.boxes[0].source_id == "12"
     for ros1 in (False, True):
@@ -396,92 +396,6 @@ def test_definitions_in_idl_have_their_constants_in_a_module_beside():
     text = BAR + IDL.format(package=package, bar=BAR, labels=labels)
     kind = made.writer.kind._replace(schema_encoding="ros2idl", schema=text.encode())
     objects = [made.one(labels=((number, 1.0),)) for number in (1, 3, 6)]
-    found = boxes_3d_decoder(kind)(made.writer.pack(made.message(*objects)))
+    found = boxes_decoder(kind, in_space=True)(made.writer.pack(made.message(*objects)))
     assert [box.class_name for box in found.boxes] == ["car", "trailer", "pedestrian"]
     assert found.boxes[0].velocity == pytest.approx((0, 3, 0))
-
-
-HEAD = {"stamp": {"sec": 1, "nanosec": 5}, "frame_id": "odom"}
-PLACE = {"position": {"x": 3, "y": -1, "z": 0.9}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}
-FAST = {"x": 1, "y": 2, "z": 0}
-#: The same person in several kinds of messages, and the score, the id and the velocity that each states.
-PEOPLE = [
-    (
-        "people_msgs/msg/People",
-        {"people": [{"name": "11", "position": PLACE["position"], "velocity": FAST, "reliability": 0.5}]},
-        (0.5, "11", (1, 2, 0)),
-    ),
-    (
-        "spencer_tracking_msgs/TrackedPersons",
-        {"tracks": [{"track_id": 7, "pose": {"pose": PLACE}, "twist": {"twist": {"linear": FAST}}}]},
-        (None, 7, (1, 2, 0)),
-    ),
-    (
-        "spencer_tracking_msgs/DetectedPersons",
-        {"detections": [{"detection_id": 9, "confidence": 0.5, "pose": {"pose": PLACE}}]},
-        (0.5, None, None),
-    ),
-    (
-        "autoware_perception_msgs/msg/PredictedObjects",
-        {
-            "objects": [
-                {
-                    "object_id": {"uuid": [1] * 16},
-                    "existence_probability": 0.5,
-                    "classification": [{"label": 7, "probability": 1.0}],
-                    "kinematics": {
-                        "initial_pose_with_covariance": {"pose": PLACE},
-                        "initial_twist_with_covariance": {"twist": {"linear": FAST}},
-                    },
-                    "shape": {"type": 0, "dimensions": {"x": 0.5, "y": 0.5, "z": 1.8}, "footprint": {"points": []}},
-                }
-            ]
-        },
-        (0.5, "01" * 16, (1, 2, 0)),
-    ),
-]
-
-
-@pytest.mark.parametrize(("name", "message", "stated"), PEOPLE, ids=[one[0] for one in PEOPLE])
-def test_people_of_other_packages_are_read(name, message, stated):
-    kind = MessageType(name, "jsonschema", b"{}", "json")
-    found = boxes_3d_decoder(kind)(json.dumps({"header": HEAD, **message}).encode())
-    assert (found.stamp_ns, found.frame_id) == (1_000_000_005, "odom")
-    (box,) = found.boxes
-    score, source_id, velocity = stated
-    assert box.centre == (3, -1, 0.9)
-    assert box.class_name in ("person", "pedestrian")
-    assert np.isnan(box.score) if score is None else box.score == score
-    assert box.source_id == source_id
-    assert np.isnan(box.velocity[0]) if velocity is None else box.velocity == velocity
-
-
-@pytest.mark.parametrize("class_field", ["Class", "class_id"])
-def test_boxes_of_darknet_and_yolo_are_those_of_vision(class_field):
-    corners = {"xmin": 20, "ymin": 80, "xmax": 44, "ymax": 150, "probability": 0.9, class_field: "person", "id": 0}
-    middle = {"position": {"x": 32, "y": 115}, "theta": 0.0}
-    said = {
-        "darknet_ros_msgs/BoundingBoxes": {"bounding_boxes": [corners]},
-        "yolo_msgs/msg/DetectionArray": {
-            "detections": [
-                {"class_name": "person", "score": 0.9, "bbox": {"center": middle, "size": {"x": 24, "y": 70}}}
-            ]
-        },
-        "vision_msgs/Detection2DArray": {
-            "detections": [
-                {
-                    "bbox": {"center": middle, "size_x": 24, "size_y": 70},
-                    "results": [{"hypothesis": {"class_id": "person", "score": 0.9}}],
-                }
-            ]
-        },
-    }
-    rows = []
-    for name, message in said.items():
-        decode = boxes_decoder(MessageType(name, "jsonschema", b"{}", "json"), Classes())
-        rows.append(decode(json.dumps({"header": HEAD, **message}).encode()).tolist())
-        turned = json.loads(json.dumps(message).replace("24", "-24").replace("44", "4"))
-        with pytest.raises(McaptrackError):
-            decode(json.dumps({"header": HEAD, **turned}).encode())
-    assert str(rows[0]) == str(rows[1]) == str(rows[2])
-    assert rows[0][0][:4] == (20.0, 80.0, 24.0, 70.0)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from mcap.writer import Writer
 
 from mcaptrack import log, notices
-from mcaptrack.sources.foreign import named_detections
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.fixed_frame import named_detections
+from mcaptrack.sources.foreign.boxes import choosing
 from tests.worlds import ns
 
 COUNT = 20
@@ -84,3 +89,67 @@ def test_other_boxes_are_at_their_log_times_and_that_is_said(tmp_path, stamps, w
     times, said = read(written(tmp_path / "a.mcap", stamps))
     assert times == {number: ns(taken_s(number) + LATE_S + FOUND_S) for number in range(COUNT)}
     assert [(notice.code, words in notice.message) for notice in said] == ([("clock", True)] if words else [])
+
+
+# Boxes against the pictures that they are about
+
+
+SIZE = (320, 240)
+
+
+def with_boxes(path: Path, box: dict, pictures: bool, calibrated: bool = False) -> Path:
+    """A log with boxes of one kind, and pictures of 320 x 240 or the calibration of a camera with these."""
+    png = base64.b64encode(cv2.imencode(".png", np.zeros(SIZE[::-1], np.uint8))[1].tobytes()).decode()
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        boxes, images, lens = (
+            writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", b"{}"))
+            for topic, name in (
+                ("/cam/boxes", "vision_msgs/Detection2DArray"),
+                ("/cam/image", "foxglove.CompressedImage"),
+                ("/cam/camera_info", "sensor_msgs/CameraInfo"),
+            )
+        )
+        for number in range(COUNT):
+            about = stamp(taken_s(number))["header"]
+            t_ns = ns(taken_s(number))
+            message = {"header": about, "detections": [{"bbox": box, "results": []}]}
+            writer.add_message(boxes, t_ns, json.dumps(message).encode(), t_ns)
+            if pictures:
+                image = {"timestamp": about["stamp"], "format": "png", "data": png}
+                writer.add_message(images, t_ns, json.dumps(image).encode(), t_ns)
+            if calibrated:
+                writer.add_message(lens, t_ns, json.dumps({"width": SIZE[0], "height": SIZE[1]}).encode(), t_ns)
+        writer.finish()
+    return path
+
+
+SHARES = {"center": {"position": {"x": 0.5, "y": 0.5}}, "size_x": 0.1, "size_y": 0.5}
+
+
+@pytest.mark.parametrize("way", ["pictures", "calibrated", "map"])
+def test_boxes_in_shares_are_scaled_by_the_size_of_their_pictures(way, tmp_path):
+    path = with_boxes(tmp_path / "a.mcap", SHARES, way == "pictures", way == "calibrated")
+    chosen = "picture=320x240" if way == "map" else None
+    with log.read(path) as opened, notices.collected() as said, choosing("/cam/boxes", chosen, None):
+        found = named_detections(opened, "/cam/boxes")
+    assert [list(row)[:4] for row in found.frames[0].rows] == [[144, 60, 32, 120]]
+    assert [notice.code for notice in said] == ["units"]
+    assert found.facts["scale"] == "shares of 320x240"
+
+
+def test_boxes_in_shares_of_unknown_pictures_are_refused_with_the_way(tmp_path):
+    path = with_boxes(tmp_path / "a.mcap", SHARES, pictures=False)
+    with log.read(path) as opened, pytest.raises(McaptrackError, match=r"shares of a picture.*`map='picture="):
+        named_detections(opened, "/cam/boxes")
+
+
+@pytest.mark.parametrize(("scale", "codes"), [(1.0, []), (2.0, ["outside"])])
+def test_boxes_of_pictures_of_another_size_are_said(scale, codes, tmp_path):
+    box = {"center": {"position": {"x": 250 * scale, "y": 180 * scale}}, "size_x": 40 * scale, "size_y": 90 * scale}
+    path = with_boxes(tmp_path / "a.mcap", box, pictures=True)
+    with log.read(path) as opened, notices.collected() as said:
+        found = named_detections(opened, "/cam/boxes")
+    assert [notice.code for notice in said] == codes
+    assert found.facts["scale"] == "pixels"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import log
@@ -18,10 +19,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, TransformTree
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.sources import camera_motion
+from mcaptrack.sources import camera_motion, foreign
 from mcaptrack.sources.fixed_frame import named_detections, recorded, rows_of_boxes
-from mcaptrack.sources.foreign import MessageType
-from mcaptrack.sources.foreign.boxes import Message3d, boxes_3d_decoder
+from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.foreign.fields import Message3d
 from tests.ros_messages import Ros
 from tests.space_logs import (
     NAMES,
@@ -68,7 +69,7 @@ def test_the_same_log_gives_the_same_detections_in_every_form(way, tmp_path):
         assert rows["class_id"].tolist() == [1 + NAMES.index(row["class"]) for row in wanted]
         assert set(rows["source_id"].tolist()) == {-1}
         listed = ", ".join(map(str, sorted(set(rows["class_id"].tolist()))))
-        words = "1 counts as people, and others move as objects of unknown class do"
+        words = "1 counts as people, and others move as objects of unknown class do; `class_map=` names them"
         assert said == [f"classes of /lidar/boxes are numbers without names ({listed}): {words}"]
     else:
         names = {1: "pedestrian"} | found.classes
@@ -90,7 +91,9 @@ def test_any_pose_of_sensor_and_box_gives_the_numbers_of_scipy(angles, shifts, l
     upright = Rotation.from_euler("zyx", [angles[6], angles[7] / 60, angles[8] / 60]) * on_side
     back, at = (robot * sensor).inv(), np.array([START_NS])
     box = Seen(back.apply(centre - base - robot.apply(mount)), (back * upright).as_quat(), np.array([4.0, 2.0, 1.5]))
-    found = recorded([(START_NS, boxes_3d_decoder(_KIND)(scene_update(START_NS, [box]).SerializeToString()))])
+    found = recorded(
+        [(START_NS, boxes_decoder(_KIND, in_space=True)(scene_update(START_NS, [box]).SerializeToString()))]
+    )
     ways = (("map", "base", robot, base), ("base", "lidar", sensor, mount))
     links = [
         Recorded(parent, child, True, PoseSamples(at, at, shift[None], turn.as_quat()[None]))
@@ -147,7 +150,7 @@ _KIND = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
 
 
 def boxes_of(writer: Ros, message) -> Message3d:
-    return boxes_3d_decoder(writer.kind)(writer.pack(message))
+    return boxes_decoder(writer.kind, in_space=True)(writer.pack(message))
 
 
 def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
@@ -170,7 +173,7 @@ def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
     np.testing.assert_allclose([box.score for box in found.boxes], [0.87, 0.87, 0.25, np.nan, np.nan, 0.5, 0.5])
     assert [box.source_id for box in found.boxes] == [None, None, *[12] * 5]
     assert found.boxes[2].stamp_ns == START_NS + 4
-    assert found.ignored == {"markers that are no cubes": 1}
+    assert found.ignored == {"markers that are no solids": 1}
     one = ros("visualization_msgs/Marker")
     assert boxes_of(one, marker(one, START_NS, SEEN)).boxes[0].source_id == 12
 
@@ -191,7 +194,7 @@ def test_texts_beside_cubes_say_what_these_do_not():
     found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", markers))
     assert [box.class_name for box in found.boxes] == ["van", "truck", ""]
     np.testing.assert_array_equal([box.score for box in found.boxes], [0.75, 0.25, np.nan])
-    assert found.ignored == {"markers that are no cubes": 3}
+    assert found.ignored == {"markers that are no solids": 3}
 
 
 def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():
@@ -204,16 +207,16 @@ def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():
         other.cubes.add()
         other.metadata.add(key=key, value=value)
     message.entities.add(id="text alone").texts.add(text="car")
-    found = boxes_3d_decoder(_KIND)(message.SerializeToString())
+    found = boxes_decoder(_KIND, in_space=True)(message.SerializeToString())
     assert [box.source_id for box in found.boxes] == [None, None, "12", "77", "no number", "no number"]
     assert [box.class_name for box in found.boxes] == ["car", "car", "van", "", "", "bus"]
     np.testing.assert_array_equal([box.score for box in found.boxes], [0.5, 0.5, 0.25, np.nan, 0.5, np.nan])
-    assert found.ignored == {"entities without cubes": 1}
+    assert found.ignored == {"entities without solids": 1}
     arrays = recorded([(START_NS, found)])
     assert arrays.names == ["lidar", "roof"]
     assert arrays.source_id.tolist() == [-1, -1, 12, 77, 78, 78]
     assert arrays.remarks == {
-        "entities without cubes are left out": 1,
+        "entities without solids are left out": 1,
         "boxes have a size of 0: it is unknown": 3,
         "boxes have an orientation of zeros: they count as not turned": 3,
     }
@@ -223,7 +226,7 @@ def test_ids_and_values_of_metadata_may_be_numbers_in_json():
     update = json.loads(scene_update_json(START_NS, [SEEN]))
     (entity,) = update["entities"]
     entity["id"], entity["metadata"] = 42, [{"key": "score", "value": 0.25}, {"key": "class", "value": 3}]
-    decode = boxes_3d_decoder(MessageType("foxglove.SceneUpdate", "jsonschema", b"{}", "json"))
+    decode = boxes_decoder(MessageType("foxglove.SceneUpdate", "jsonschema", b"{}", "json"), in_space=True)
     (box,) = decode(json.dumps(update).encode()).boxes
     assert (box.source_id, box.score, box.class_name) == ("42", 0.25, "3")
     entity["id"] = [42]
@@ -421,3 +424,87 @@ def test_boxes_in_a_root_are_told_why_nothing_is_above_it(tmp_path, monkeypatch)
     assert found.frame_id == "lidar"
     words = "transforms: base_link -> lidar: 1 pose without a rotation or a position are left out"
     assert warnings.count(words) == 1
+
+
+# Drawings that are no cubes
+
+
+def wires(centre, turn: Rotation, size) -> list[np.ndarray]:
+    """The ends of the twelve edges of a box."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2 * size
+    pairs = [(a, b) for a in range(8) for b in range(a) if (np.abs(corners[a] - corners[b]) > 1e-9).sum() == 1]
+    return [turn.apply(corners[number]) + centre for pair in pairs for number in pair]
+
+
+@given(
+    st.lists(st.floats(-50, 50), min_size=3, max_size=3),
+    st.lists(st.floats(0.3, 4), min_size=3, max_size=3),
+    st.floats(-3, 3),
+    st.integers(0, 9),
+)
+def test_boxes_of_lines_are_boxes(centre, size, yaw, seed):
+    """The longer side on the ground is the length; which end is the front, lines don't say."""
+    points = wires(np.array(centre), Rotation.from_euler("z", yaw), np.array(size))
+    order = np.random.default_rng(seed).permutation(12)
+    shuffled = [points[2 * edge + end] for edge in order for end in (0, 1)]
+    writer = ros("visualization_msgs/MarkerArray")
+    lines = marker(writer, START_NS, Seen(np.zeros(3), np.array([0, 0, 0, 1.0]), np.ones(3)), 5, points=shuffled)
+    (box,) = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", [lines])).boxes
+    np.testing.assert_allclose(box.centre, centre, atol=1e-6)
+    np.testing.assert_allclose(box.size, [*sorted(size[:2], reverse=True), size[2]], atol=1e-6)
+    ahead = Rotation.from_quat(box.orientation).apply([1, 0, 0])
+    along = Rotation.from_euler("z", yaw).apply([1, 0, 0] if size[0] >= size[1] else [0, 1, 0])
+    assert abs(size[0] - size[1]) < 1e-6 or abs(ahead @ along) > 1 - 1e-6
+    cut = marker(writer, START_NS, SEEN, 5, points=shuffled[:-2])
+    assert not boxes_of(writer, writer.new("visualization_msgs/MarkerArray", [cut])).boxes
+
+
+@pytest.mark.parametrize("kind", [2, 3, 7])
+def test_markers_that_are_round_have_a_size_and_no_heading(kind):
+    writer = ros("visualization_msgs/MarkerArray")
+    points = [(0, 0, 0)] if kind == 7 else ()
+    lines = marker(writer, START_NS, SEEN, 5, points=wires(SEEN.centre, Rotation.identity(), SEEN.size))
+    drawn = [marker(writer, START_NS, SEEN, kind, points=points, space="people"), lines]
+    found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", drawn))
+    (box,) = found.boxes  # lines count only where there is nothing else
+    assert (box.centre, box.size, box.class_name) == ((1, 2, 3), (4, 2, 1.5), "people")
+    assert not box.has_heading
+    assert found.ignored == {"markers that are no solids": 1}
+
+
+@pytest.mark.parametrize("kind", ["spheres", "cylinders", "lines"])
+def test_entities_may_be_drawn_by_other_solids(kind):
+    message = scene_update(START_NS, [replace(SEEN, turn=np.array([0, 0, 0, 1.0]))])
+    (entity,) = message.entities
+    cube = entity.cubes.pop()
+    if kind == "lines":
+        line = entity.lines.add(type=2)
+        for x, y, z in wires(SEEN.centre, Rotation.identity(), SEEN.size):
+            line.points.add(x=x, y=y, z=z)
+    else:
+        solid = getattr(entity, kind).add()
+        solid.pose.CopyFrom(cube.pose)
+        solid.size.CopyFrom(cube.size)
+    (box,) = boxes_decoder(_KIND, in_space=True)(message.SerializeToString()).boxes
+    np.testing.assert_allclose([*box.centre, *box.size], [1, 2, 3, 4, 2, 1.5], atol=1e-9)
+    assert (box.class_name, box.source_id, box.has_heading) == ("car", "12", kind == "lines")
+
+
+@pytest.mark.parametrize(
+    ("topic", "space", "is_read"), [("/goal", "", 0), ("/goal", "person", 1), ("/people/now", "", 1)]
+)
+def test_what_is_round_is_a_thing_where_a_name_says_so(topic, space, is_read, tmp_path):
+    writer = ros("visualization_msgs/MarkerArray")
+    ball = writer.new("visualization_msgs/MarkerArray", [marker(writer, START_NS, SEEN, 2, space=space)])
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        out = Writer(stream)
+        out.start()
+        schema = out.register_schema(writer.kind.name, writer.kind.schema_encoding, writer.kind.schema)
+        out.add_message(out.register_channel(topic, "cdr", schema), START_NS, writer.pack(ball), START_NS)
+        out.finish()
+    with log.read(path) as opened:
+        assert foreign.holds_boxes(opened, topic) == bool(is_read)
+        assert list(foreign.uncertain_boxes(opened)) == [topic] * (not is_read)
+    found, _ = read(path, topic=topic)
+    assert found.frames[0].rows["class_id"].tolist() == [1 if is_read else 0]

@@ -28,7 +28,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Plugin, Provenance
-from mcaptrack.sources import foreign
+from mcaptrack.sources import fixed_frame
 from mcaptrack.testing import LawError
 from tests.commands import call, done
 from tools import pages
@@ -339,7 +339,7 @@ def test_messages_in_protobuf_and_of_ros_2_are_read_by_their_definitions_in_the_
         writer.finish()
     with log.read(Path("a.mcap")) as opened:
         for encoding in ("protobuf", "cdr"):
-            (frame,) = foreign.named_detections(opened, f"/{encoding}/rows").frames
+            (frame,) = fixed_frame.named_detections(opened, f"/{encoding}/rows").frames
             assert frame.rows["x_px"].tolist() == [5, 9]
 
 

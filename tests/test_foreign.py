@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.foreign import Classes, MessageType, boxes_decoder, picture_decoder
+from mcaptrack.sources.foreign import MessageType, boxes_decoder, picture_decoder
 from mcaptrack.sources.video import PIXEL_FORMATS, EncodedPicture, PixelLayout, decode_gray
 from tests.ros_messages import BAR, STAMP_NS, VISION, boxes, pixels, ros_writer, vision
 
@@ -287,61 +287,27 @@ class TestBoxes:
             (10.0, 10.0, 4.0, 8.0, 0.0, []),
             (10.0, 10.0, 4.0, 8.0, np.pi / 2, [(2, 0.5)]),
         ]
-        rows = boxes_decoder(vision(layout, boxes)[0], Classes())(vision(layout, boxes)[1])
-        np.testing.assert_allclose(rows["x_px"], [90, 8, 6])
-        np.testing.assert_allclose(rows["y_px"], [30, 6, 8])
-        np.testing.assert_allclose(rows["w_px"], [20, 4, 8])
-        np.testing.assert_allclose(rows["h_px"], [40, 8, 4])
-        np.testing.assert_array_equal(rows["score"], np.array([0.75, np.nan, 0.5], np.float32))
-        assert rows["class_id"].tolist() == [7, 0, 2]
-
-    @pytest.mark.parametrize("layout", ["v3", "v4"])
-    def test_names_of_classes_get_numbers_after_those_that_have_one(self, layout):
-        """People are 1 by any name; other names follow in the order of the alphabet; what is neither is unknown."""
-        names = ["person", "Pedestrian", "5", "car", "-3", "99999999999", "4294967295", "bicycle", "car"]
-        kind, payload = vision(layout, [(0.0, 0.0, 1.0, 1.0, 0.0, [(name, 0.5)]) for name in names])
-        classes = Classes()
-        rows = boxes_decoder(kind, classes)(payload)
-        numbers = classes.numbers()
-        assert [numbers.get(n, n) for n in rows["class_id"].tolist()] == [1, 1, 5, 7, 0, 0, 0, 6, 7]
-        assert classes.named() == [("bicycle", 6), ("car", 7)]
-
-    @pytest.mark.parametrize(
-        ("names", "wanted"),
-        [
-            (["pedestrian", "car", "pedestrian"], {1: "pedestrian", 2: "car"}),
-            (["person", "car"], {2: "car"}),
-            (["person", "pedestrian"], {}),
-            (["Human"], {1: "Human"}),
-        ],
-    )
-    def test_people_keep_the_name_that_all_of_them_have(self, names, wanted):
-        classes = Classes()
-        assert [classes.class_id(name) == 1 for name in names] == [name != "car" for name in names]
-        assert classes.names_by_id() == wanted
-
-    def test_there_are_only_so_many_names(self):
-        classes = Classes()
-        assert all(classes.class_id(f"name {n:05}") for n in range(1024))
-        assert classes.class_id("name 99999") == 0
-        assert classes.class_id("name 00000") == 2**32 - 1024
-        assert sorted(classes.numbers().values()) == list(range(2, 1026))
+        kind, payload = vision(layout, boxes)
+        found = boxes_decoder(kind)(payload)
+        np.testing.assert_allclose([box[:4] for box in found], [[90, 30, 20, 40], [8, 6, 4, 8], [6, 8, 8, 4]])
+        np.testing.assert_array_equal([box.score for box in found], [0.75, np.nan, 0.5])
+        assert [box.class_name for box in found] == ["7", "", "2"]
 
     def test_a_message_without_boxes_is_a_frame_without_rows(self):
         kind, payload = vision("v4", [])
-        assert len(boxes_decoder(kind, Classes())(payload)) == 0
+        assert len(boxes_decoder(kind)(payload)) == 0
 
     @pytest.mark.parametrize("box", [(np.nan, 0.0, 1.0, 1.0), (0.0, np.inf, 1.0, 1.0), (0.0, 0.0, -1.0, 1.0)])
     def test_boxes_that_can_not_be_are_said(self, box):
         kind, payload = vision("v4", [(*box, 0.0, [])])
         with pytest.raises(McaptrackError, match="a box can't be"):
-            boxes_decoder(kind, Classes())(payload)
+            boxes_decoder(kind)(payload)
 
     def test_other_channels_are_refused(self):
         with pytest.raises(
             McaptrackError, match=r"it holds x, not detections; vision_msgs/Detection2DArray, .* are read"
         ):
-            boxes_decoder(MessageType("x", "", b"", "json"), Classes())
+            boxes_decoder(MessageType("x", "", b"", "json"))
 
 
 def kinds() -> dict[str, tuple]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from math import degrees
 from typing import Any, Literal
 
@@ -44,6 +44,9 @@ class ChannelInfo:
         What made it, from which channel, and with which version of mcaptrack; None if it was recorded by others.
     written_by : str or None
         The program that wrote it with ``Recording.write``; None for other channels.
+    boxes : dict
+        How boxes of other software that it was made from were read: their clock, classes, scale and fields, and what
+        was chosen with ``map`` and ``class_map``; empty for other channels.
     plugins : dict or None
         Classes of other packages that made it, by the part that each is (transform, predictor): name, implementation,
         distribution and version.
@@ -78,6 +81,7 @@ class ChannelInfo:
     stale: bool
     camera: str | None = None
     written_by: str | None = None
+    boxes: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -263,6 +267,7 @@ def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: st
         stale=not replaced and _is_stale(opened, channel.topic, provenance),
         camera=camera,
         written_by=provenance.written_by or None if provenance else None,
+        boxes=dict(provenance.boxes) if provenance else {},
     )
 
 

@@ -34,6 +34,24 @@ Frame = Annotated[
         help="Bring boxes in space (3D) to this frame, such as map; by default to the root of the tree of frames.",
     ),
 ]
+FieldMap = Annotated[
+    str | None,
+    Option(
+        FILES,
+        metavar="KEY=PATH,...",
+        help="Which fields of the messages of `topic=` are what: x=people[].pose.position.x,y=... Keys are position, "
+        "x, y, z, velocity, vx, vy, size, length, width, height, heading, id, class and score of boxes in space; left, "
+        "top, right, bottom, w, h, class and score of boxes in pictures; picture=1280x720 is the size of these.",
+    ),
+]
+ClassNames = Annotated[
+    str | None,
+    Option(
+        FILES,
+        metavar="MAP",
+        help="Names of the classes of recorded boxes: 0=person,2=car, or coco, or a file with a name in each line.",
+    ),
+]
 Sidecar = Annotated[
     bool | None,
     Option(

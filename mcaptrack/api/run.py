@@ -11,8 +11,10 @@ from mcaptrack.api.common import as_location, split_names
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
 from mcaptrack.api.options import (
     FILES,
+    ClassNames,
     Definitions,
     EachLog,
+    FieldMap,
     Force,
     Frame,
     Output,
@@ -52,6 +54,8 @@ def run(
     topic: Topic = None,
     camera: Annotated[str | Sequence[str] | None, Option(FILES, metavar="A,B", commas=True, shown="all")] = None,
     frame: Frame = None,
+    map: FieldMap = None,  # noqa: A002  # the name of the option
+    class_map: ClassNames = None,
     output: Output = None,
     definitions: Definitions = None,
     sidecar: Sidecar = None,
@@ -174,6 +178,7 @@ def run(
     from mcaptrack.evaluation.zones import ZoneOptions
     from mcaptrack.pipeline import PlaneChoice, Watch, ZoneWatch, plan_all
     from mcaptrack.pipeline.several import unfitting
+    from mcaptrack.sources.foreign.boxes import choosing
     from mcaptrack.sources.foreign.definitions import definitions_of
 
     names = tuple(dict.fromkeys(split_names("camera", camera)))
@@ -210,7 +215,7 @@ def run(
     earlier = _log_before(as_location(log), follows)
     finishing = (watch, counted) if watch else (counted,)
     fuses = Fusing(names, fuse, joins)
-    with definitions_of(definitions):
+    with definitions_of(definitions), choosing(topic, map, class_map):
         return work(
             where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier
         )

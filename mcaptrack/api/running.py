@@ -25,6 +25,7 @@ from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice
 from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say, refuse_failed, together
 from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.sources.foreign.boxes import choosing
 from mcaptrack.sources.foreign.definitions import definitions_of
 from mcaptrack.sources.sidecar import SidecarChoice
 from mcaptrack.transforms import FUSION, STAGES, Transform
@@ -399,6 +400,8 @@ def run_stage(
     *,
     mode: Mode | None = None,
     frame: str | None = None,
+    fields: str | None = None,
+    class_map: str | None = None,
     make: Callable[[str], Transform] | None = None,
     views: bool = False,
     definitions: PathLike | Sequence[PathLike] | None = None,
@@ -415,5 +418,5 @@ def run_stage(
         return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
     where = Where(log, camera, topic, output, sidecar, force)
-    with definitions_of(definitions):
+    with definitions_of(definitions), choosing(topic, fields, class_map):
         return work(where, plan, progress, views=views, plane=PlaneChoice(frame=frame))

@@ -10,8 +10,10 @@ import mcaptrack
 from mcaptrack.api.declared import PYTHON_ONLY, Option, PythonOnly, checked, declared
 from mcaptrack.api.options import (
     Camera,
+    ClassNames,
     Definitions,
     EachLog,
+    FieldMap,
     Force,
     Frame,
     Output,
@@ -171,6 +173,8 @@ def track(
     to: To = None,
     camera: Camera = None,
     frame: Frame = None,
+    map: FieldMap = None,  # noqa: A002  # the name of the option
+    class_map: ClassNames = None,
     output: Output = None,
     definitions: Definitions = None,
     sidecar: Sidecar = None,
@@ -230,6 +234,8 @@ def track(
         stages,
         progress,
         frame=frame,
+        fields=map,
+        class_map=class_map,
         make=make,
         views=views,
         definitions=definitions,

@@ -78,7 +78,20 @@ class StageCommand(RunsStages):
         with stdout_to_stderr():
             self._transform = None if is_open(stage, self.values) else make()
             arguments: dict[str, Any] = {"stages": configured(), "make": make}
-        where = ("topic", "to", "frame", "camera", "output", "definitions", "sidecar", "views", "force", "mode")
+        where = [
+            "topic",
+            "to",
+            "frame",
+            "class_map",
+            "camera",
+            "output",
+            "definitions",
+            "sidecar",
+            "views",
+            "force",
+            "mode",
+        ]
+        arguments |= {"fields": self.values["map"]} if "map" in names else {}
         return arguments | {name: self.values[name] for name in where if name in names}
 
     @classmethod

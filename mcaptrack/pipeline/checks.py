@@ -95,24 +95,26 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
         if job.source in coming:
             name, is_read = coming[job.source].name, coming[job.source] is job.transform.reads
         elif job.source in opened.channels:
-            name, is_read = fits(opened.channels[job.source], job.transform.reads)
+            name, is_read = fits(opened, job.source, job.transform.reads)
         else:
             raise McaptrackError(_lacks(opened, prefix, job))
         if not is_read:
             reads = job.transform.reads
             theirs_too = foreign.BOXES_READ if reads is DETECTIONS else ()
             wanted = " or ".join(foreign.PICTURES_READ if reads is VIDEO else (reads.name, *theirs_too))
+            wanted += "; `map=` names the fields of others" if theirs_too else ""
             raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
         _check_outputs(opened, prefix, job)
         coming |= job.outputs()
 
 
-def fits(channel: log.Channel, reads: Schema) -> tuple[str, bool]:
+def fits(opened: log.Log, topic: str, reads: Schema) -> tuple[str, bool]:
     """Return the name of a channel's schema, and whether a stage that reads ``reads`` can read the channel."""
+    channel = opened.channel(topic)
     if reads is VIDEO:
         return channel.schema_name, foreign.holds_pictures(channel)
-    theirs = reads is DETECTIONS and (foreign.holds_detections(channel) or foreign.may_hold_boxes_3d(channel))
-    return channel.schema_name, theirs or channel.schema_name == reads.name
+    is_read = channel.schema_name == reads.name
+    return channel.schema_name, is_read or (reads is DETECTIONS and foreign.reading_of(opened, topic) is not None)
 
 
 def read_frames(opened: log.Log, topic: str, schema: Schema) -> Sequence[Frame]:
@@ -148,6 +150,13 @@ def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
         else:
             add = call("ingest", "VIDEO", into=opened.path)
             hint = f"add pictures with {add}, or name what to begin with by `topic=`"
+            if positions := foreign.uncertain_boxes(opened):
+                listed = list_names([f"{topic} ({name})" for topic, name in positions.items()], 5)
+                hint = (
+                    f"positions that may be of people are in {listed}: `topic=` takes them; or add pictures with {add}"
+                )
+            else:
+                hint += "; `map=` names the fields of positions or boxes in other messages"
             for topic in topics:
                 if kind := foreign.PICTURES_NOT_READ.get(plain_name(opened.channels[topic].schema_name)):
                     hint = f"{topic} is {kind}, which is not read; {hint}"
@@ -223,9 +232,10 @@ def first_stage(opened: log.Log, source: str) -> str:
     """Return the first stage of a run that begins with this topic. Raises McaptrackError if no stage reads it."""
     channel = opened.channel(source)
     for stage in STAGES.values():
-        if stage.reads in (VIDEO, DETECTIONS) and fits(channel, stage.reads)[1]:
+        if stage.reads in (VIDEO, DETECTIONS) and fits(opened, source, stage.reads)[1]:
             return stage.name
     wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.BOXES_READ))
     raise McaptrackError(
-        f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}"
+        f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}, and "
+        "`map=` names the fields of others, as `map='x=people[].pose.x,y=people[].pose.y'`"
     )

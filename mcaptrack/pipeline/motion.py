@@ -114,7 +114,7 @@ def boxes_input(state: RunState, transform: Transform) -> SideInput | None:
     topic = usual if is_usual else camera_at(opened, state.prefix).boxes
     if topic is None or _needs_still_camera(opened, topic, ()):
         return None
-    if topic not in state.results and not fits(opened.channels[topic], DETECTIONS)[1]:
+    if topic not in state.results and not fits(opened, topic, DETECTIONS)[1]:
         return None
     frames = state.frames(topic, DETECTIONS) if topic in state.results else read_frames(opened, topic, DETECTIONS)
     boxes = {frame.t_ns: columns_to_boxes(frame.rows) for frame in frames if len(frame.rows)}

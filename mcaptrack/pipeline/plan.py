@@ -28,7 +28,8 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations
 from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, is_made_by_stage, provenance_of
-from mcaptrack.sources.fixed_frame import holds_boxes_3d
+from mcaptrack.sources.foreign import holds_boxes, reading_of, uncertain_boxes
+from mcaptrack.sources.foreign.boxes import is_chosen_otherwise
 from mcaptrack.transforms import FUSION, STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import Space, traits_of
 
@@ -118,10 +119,9 @@ def spaces_of_boxes(opened: log.Log, topic: str) -> frozenset[Space]:
     channel = opened.channels.get(topic)
     if channel is None:
         return frozenset()
-    if holds_boxes_3d(opened, topic):
-        return frozenset({"ground"})
     if channel.schema_name != DETECTIONS.name:
-        return frozenset({"picture"})
+        reading = reading_of(opened, topic)
+        return frozenset({"ground" if reading and reading.in_space else "picture"})
     if not frame_id_of(channel.metadata) and is_made_by_stage(channel):
         return frozenset({"picture"})
     columns: dict[Space, str] = {"picture": "x_px", "ground": "x_m"}
@@ -145,7 +145,9 @@ def check_spaces(opened: log.Log, prefix: str, jobs: Sequence[Job], frame_id: st
     """
     sources = {job.source for job in jobs if job.source in opened.channels}
     is_calibrated = any(map(holds_calibrations, opened.channels.values()))
-    has_boxes = camera_at(opened, prefix).in_space or any(holds_boxes_3d(opened, source) for source in sources)
+    has_boxes = camera_at(opened, prefix).in_space or any(
+        holds_boxes(opened, source, in_space=True) for source in sources
+    )
     if frame_id and not has_boxes and not is_calibrated:
         warn("`frame=` has no effect: only recorded 3D boxes are brought to a frame", "option-not-used")
     for job in jobs:
@@ -237,6 +239,8 @@ class _Planner:
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
             if camera.boxes:
                 self._notes.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
+            for topic, name in uncertain_boxes(self.opened).items():
+                self._notes.append(f"{topic} ({name}) has positions that may be of people; `topic=` takes them instead")
             return camera.pictures
         if reads is DETECTIONS and camera.boxes and (depth or not camera.pictures):
             self._notes.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
@@ -403,7 +407,13 @@ class _Planner:
         Then the transform that made it need not be made again, nor imported.
         """
         is_asked = self.force or self.shared or self.frame_id or stage in self.defaults or topic in self.renewed
-        if is_asked or provenance.is_of_older_version or provenance.plugins or topic not in self.opened.channels:
+        if (
+            is_asked
+            or is_chosen_otherwise(self.opened, provenance.input)
+            or provenance.is_of_older_version
+            or provenance.plugins
+            or topic not in self.opened.channels
+        ):
             return False
         is_usual = main_topic(self.opened, stage, topic) == f"{self.prefix}/{STAGES[stage].output_topic}"
         is_projected = is_usual and "scale" in STAGES[stage].before
@@ -414,6 +424,7 @@ class _Planner:
         """Return a result with the transform of now; one at another topic than the usual one keeps its parameters."""
         stage, before, frame_id = result.stage, result.before, result.provenance.frame_id
         is_moved = self.frame_id not in ("", frame_id or self.frame_id)
+        is_moved |= result.had in self.opened.channels and is_chosen_otherwise(self.opened, result.had)
         if result.main != f"{self.prefix}/{stage.output_topic}":
             return result._replace(is_replaced=is_moved)
         is_open = stage.name not in self.defaults and self._is_made_by_another(result.source)
@@ -433,7 +444,7 @@ class _Planner:
             return f"{topic} was made from {result.had}: {again}, from {source}"
         if result.is_replaced:
             is_other = result.before is None or stage.choice(result.before) != stage.choice(transform)
-            others = " or ".join(f"`{name}=`" for name in (*self.shared, "frame"))
+            others = " or ".join(f"`{name}=`" for name in (*self.shared, "frame", "map", "class_map"))
             return f"{topic} was made {f'by another {stage.option}' if is_other else f'with another {others}'}: {again}"
         if result.is_projected:
             return f"{topic} was made with another ground plane: {again}, as before"

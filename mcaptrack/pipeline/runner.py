@@ -410,6 +410,7 @@ def _provenance_of(work: Work, warnings: Sequence[Notice]) -> Provenance:
         model=card.facts,
         warnings=[(notice.code, notice.message) for notice in warnings],
         continued=work.continued,
+        boxes=source.boxes,
         scores=work.scores,
     )
 
@@ -448,14 +449,16 @@ def _input(
         each = _Repeatable(lambda: _counted(watch.each("decode", pictures), numbers, steps, job.stage, progress))
         return Input(each, [], digest, lambda: len(seen), damaged=damaged, unreadable=unreadable)
     if job.source in results:
+        facts: Mapping[str, str] = {}
         frames, how = results[job.source].frames, results[job.source].provenance
         of_rows, names, frame_id = how.digest, class_names(how.to_metadata()), how.frame_id
     else:
-        frames, names, frame_id = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
+        named = read_named_frames(opened, job.source, job.transform.reads, job.frame_id, boxes)
+        frames, names, frame_id, facts = named
         of_rows = digest_of(opened, job.source)
     classes = {str(number): name for number, name in sorted(names.items())}
     stream = _Repeatable(lambda: _counted(frames, count(1), len(frames), job.stage, progress))
-    return Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id)
+    return Input(stream, frames, lambda: of_rows, lambda: len(frames), classes, frame_id, boxes=facts)
 
 
 def _counting(frames: Iterable[Frame], taken: list[int]) -> Iterator[Frame]:
@@ -485,7 +488,7 @@ def input_of(
     topic = opened.find(source, prefix) if source else f"{prefix}/{STAGES[stage].input_topic}"
     job = Job(stage, transform, topic, f"{prefix}/{STAGES[stage].output_topic}")
     check_inputs(opened, prefix, [job])
-    frames, names, _ = read_named_frames(opened, topic, transform.reads)
+    frames, names, *_ = read_named_frames(opened, topic, transform.reads)
     classes = {str(number): name for number, name in names.items()}
     source_of_job = Input(frames, frames, lambda: "", lambda: len(frames), classes)
     work = Work(RunState(opened, prefix, {}), job, source_of_job, read_planes(opened, prefix))

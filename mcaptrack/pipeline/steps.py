@@ -57,8 +57,8 @@ class Input(NamedTuple):
     """The input of a job.
 
     A stream of frames, all frames if they are rows (else empty), and, after the stream was read, the digest and the
-    number of its messages; the names of its classes, the frame of its metres, the numbers of damaged pictures, and the
-    errors of images that are left out.
+    number of its messages; the names of its classes, the frame of its metres, the numbers of damaged pictures, the
+    errors of images that are left out, and how boxes of other software were read.
     """
 
     stream: Iterable[Frame]
@@ -69,6 +69,7 @@ class Input(NamedTuple):
     frame_id: str = ""
     damaged: Sequence[int] = ()
     unreadable: Sequence[McaptrackError] = ()
+    boxes: Mapping[str, str] = {}
 
     def with_frames(self, frames: Sequence[Frame]) -> Input:
         """Return the same input with other rows."""

@@ -23,10 +23,11 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import has_any, joined_parts, row_ends, unique_values
 from mcaptrack.schema.provenance import Provenance, frame_id_of
+from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import motion_topic, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.corrections import corrected_tracks, corrections_of
-from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes
+from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import STAGES
 
 #: Minimum IoU of boxes at which a track matches the ground truth, as in the demo.
@@ -215,7 +216,7 @@ def _count_boxes(opened: log.Log, tracks: str, usual: str, boxes_read: BoxesRead
     source = opened.channels.get(provenance.input if provenance else usual) or opened.channels.get(usual)
     if source is None:
         return None
-    if holds_boxes(opened, source.topic):
+    if foreign.holds_boxes(opened, source.topic):
         return int(row_ends(boxes_read.read(opened, source.topic).frames)[-1])
     frames = _frames(opened, source.topic, DETECTIONS)
     return None if frames is None else int(frames.ends[-1])

@@ -57,7 +57,7 @@ _FOLDER: Final = Path(__file__).parent.parent
 _SIGNALLED: Final = frozenset(128 + number for number in (signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 1)))
 
 _LABELS: Final = "mcaptrack.sources.ingest.labels"
-_BOXES: Final = "mcaptrack.sources.foreign.boxes"
+_SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares.
 _COMMANDS: Final = (
     "ingest demo run detect motion track sample predict retrack fuse models info view render report query export "
@@ -126,26 +126,11 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "argoverse": f"{_LABELS}.argoverse:Argoverse",
             "yolo": f"{_LABELS}.yolo:Yolo",
         },
-        # By the name of the type of message, as in ROS 1 and Foxglove; the first three are of boxes in pictures.
+        # By the name of the type of message, as in ROS 1 and Foxglove: drawings. Others are read by their fields.
         "message_reader": {
-            "vision_msgs/Detection2DArray": f"{_BOXES}:detections_2d",
-            "darknet_ros_msgs/BoundingBoxes": f"{_BOXES}:darknet_boxes",
-            "yolo_msgs/DetectionArray": f"{_BOXES}:yolo_boxes",
-            "vision_msgs/Detection3DArray": f"{_BOXES}:detections_3d",
-            "foxglove.SceneUpdate": f"{_BOXES}:scene_cubes",
-            "visualization_msgs/MarkerArray": f"{_BOXES}:marker_cubes",
-            "visualization_msgs/Marker": f"{_BOXES}:marker_cubes",
-            "jsk_recognition_msgs/BoundingBoxArray": f"{_BOXES}:jsk_boxes",
-            "derived_object_msgs/ObjectArray": f"{_BOXES}:derived_objects",
-            "spencer_tracking_msgs/TrackedPersons": f"{_BOXES}:spencer_people",
-            "spencer_tracking_msgs/DetectedPersons": f"{_BOXES}:spencer_people",
-            "people_msgs/People": f"{_BOXES}:people",
-            "autoware_perception_msgs/PredictedObjects": f"{_BOXES}:autoware_objects",
-            "autoware_auto_perception_msgs/PredictedObjects": f"{_BOXES}:autoware_objects",
-            "autoware_perception_msgs/DetectedObjects": f"{_BOXES}:autoware_objects",
-            "autoware_perception_msgs/TrackedObjects": f"{_BOXES}:autoware_objects",
-            "autoware_auto_perception_msgs/DetectedObjects": f"{_BOXES}:autoware_objects",
-            "autoware_auto_perception_msgs/TrackedObjects": f"{_BOXES}:autoware_objects",
+            "foxglove.SceneUpdate": f"{_SOLIDS}:scene_solids",
+            "visualization_msgs/MarkerArray": f"{_SOLIDS}:marker_solids",
+            "visualization_msgs/Marker": f"{_SOLIDS}:marker_solids",
         },
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),

@@ -45,7 +45,7 @@ COCO: Final[tuple[str, ...]] = tuple(
 )
 #: A file of class names that is longer is none.
 _MOST_BYTES: Final = 2**20
-#: The end of the path of a file whose names are numbered from another number than 0: labels.txt@1.
+#: The path of a file with names that are numbered from another number than 0: labels.txt@1.
 _NUMBERED_FROM: Final = re.compile(r"(.+)@(\d{1,9})", re.DOTALL)
 #: A line of a file that states the number of its name: "0=person", "0: person", "0 person".
 _NUMBERED_LINE: Final = re.compile(r"(\d{1,10})(?:\s*[=:]\s*|\s+)(\S.*)")

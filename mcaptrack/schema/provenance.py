@@ -57,7 +57,8 @@ class Provenance:
     ``output`` is the end of the topic of an output that only the class of another package has, below its main output.
     ``columns`` are those of a schema of a user's own (see ``schema.own``). ``scores`` say what scores of its input were
     taken for where these are no likelihoods: by the name of a class, SCORE:LIKELIHOOD of points with straight lines
-    between them.
+    between them. ``boxes`` say how boxes of other software in its input were read: their clock, classes, scale and
+    fields, and what a user chose.
     """
 
     transform: str
@@ -78,6 +79,7 @@ class Provenance:
     continued: Mapping[str, str] = field(default_factory=dict)
     output: str = ""
     columns: str = ""
+    boxes: Mapping[str, str] = field(default_factory=dict)
     scores: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -121,8 +123,10 @@ class Provenance:
             "warnings": json.dumps(self.warnings, separators=(",", ":")),
             "continued": json.dumps(dict(self.continued), sort_keys=True),
             "scores": json.dumps(dict(self.scores), ensure_ascii=False),
+            "boxes": json.dumps(dict(self.boxes), sort_keys=True),
         }
-        for name in ("scores", "continued", "warnings", "references", "plugins", "classes", "zones", "model"):
+        names = ("scores", "boxes", "continued", "warnings", "references", "plugins", "classes", "zones", "model")
+        for name in names:
             if not getattr(self, name):
                 del values[name]
         return {_PREFIX + key: value for key, value in values.items() if value}
@@ -134,13 +138,13 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        names = ("classes", "zones", "model", "continued", "scores")
-        classes, zones, model, continued, scores = (read_texts(values.pop(key, "")) for key in names)
+        names = ("classes", "zones", "model", "continued", "scores", "boxes")
+        classes, zones, model, continued, scores, boxes = (read_texts(values.pop(key, "")) for key in names)
         plugins = _plugins(values)
         warnings = [warning for warning in _read(values.pop("warnings", ""), list) if _is_warning(warning)]
         fields: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
         fields |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
-        fields |= {"zones": zones, "continued": continued, "scores": scores}
+        fields |= {"zones": zones, "continued": continued, "scores": scores, "boxes": boxes}
         return cls(parameters=parameters, model=model, **fields)
 
 
@@ -152,6 +156,11 @@ def input_of(metadata: Mapping[str, str]) -> str:
 def frame_id_of(metadata: Mapping[str, str]) -> str:
     """Return the frame that the metres of a channel are in, by its metadata; "" where it names none."""
     return metadata.get(f"{_PREFIX}frame_id", "")
+
+
+def boxes_of(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return how boxes of other software that a channel was made from were read, by its metadata; empty for others."""
+    return read_texts(metadata.get(f"{_PREFIX}boxes", ""))
 
 
 def _read(text: str, kind: type[T]) -> T:

@@ -21,7 +21,7 @@ from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS, TRACKS, Frame, 
 from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
 from mcaptrack.schema.provenance import FUSE, REFINE, Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.fixed_frame import holds_boxes, holds_boxes_3d
+from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import STAGES
 
 #: The default name of a camera.
@@ -266,7 +266,7 @@ class _Channels:
             if has_own_rows(channel):
                 continue
             is_ours = self._provenance[topic] is not None or channel.schema_name in SCHEMAS
-            if is_ours or foreign.holds_pictures(channel) or holds_boxes(opened, topic):
+            if is_ours or foreign.holds_pictures(channel) or foreign.holds_boxes(opened, topic):
                 self._source[topic] = chain_of(opened, topic)[-1]
                 self._topics.setdefault(name_above(self._source[topic]), set()).add(topic)
         self._with_pictures = {name for name in self._topics if self._picture_topics([name])}
@@ -331,7 +331,9 @@ class _Channels:
 
     def _detection_topics(self, names: list[str]) -> list[str]:
         """Return the topics of detections in pictures that no stage made."""
-        return self._select(names, lambda channel: foreign.holds_detections(channel) or _is_ours(channel, False))
+        return self._select(
+            names, lambda channel: foreign.holds_boxes(self._opened, channel.topic, False) or _is_ours(channel, False)
+        )
 
     def _space_topics(self, names: list[str]) -> list[str]:
         """Return the topics of detections in space that no stage made."""

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -40,8 +39,19 @@ from mcaptrack.schema.classes import UNKNOWN
 from mcaptrack.schema.names import plain_name
 from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.foreign.boxes import Classes, Message3d
+from mcaptrack.sources.foreign.boxes import (
+    BOXES_READ,
+    ClassesRead,
+    Reading,
+    choice_for,
+    classes_of,
+    decoded_messages,
+    facts_of,
+    named_boxes,
+    read_classes,
+)
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, stamp_of
+from mcaptrack.sources.foreign.fields import Message3d
 from mcaptrack.sources.foreign.flatten import message_type_of
 
 # All 3D boxes of a channel as arrays, in the frames that they were recorded in.
@@ -184,7 +194,7 @@ class Recorded3d:
     score : (N,)
         NaN where there is none.
     class_id, source_id : (N,) of int64
-        Ids of classes as ``classes.class_id`` gives them; ids of the detector, -1 where there is none.
+        Ids of ``classes``; ids of the detector, -1 where there is none.
     message_ns, message_stamp_ns : (M,) of int64
         Log time and stamp of each message.
     is_measured : (M,) of bool
@@ -206,7 +216,7 @@ class Recorded3d:
     score: Floats
     class_id: Ints
     source_id: Ints
-    classes: Classes
+    classes: ClassesRead
     message_ns: Ints
     message_stamp_ns: Ints
     is_measured: Bools
@@ -335,8 +345,10 @@ def _starts(t_ns: Ints) -> Ints:
     return np.array(out, np.int64)
 
 
-def recorded(messages: Iterable[tuple[int, Message3d]]) -> Recorded3d:
-    """The boxes of messages, each with its log time in ns, as arrays.
+def recorded(
+    messages: Iterable[tuple[int, Message3d]], classes: Callable[[Sequence[str]], ClassesRead] = read_classes
+) -> Recorded3d:
+    """The boxes of messages, each with its log time in ns, as arrays; ``classes`` takes the texts of their classes.
 
     Boxes without a position are left out; sizes that can't be are unknown. ``remarks`` counts both.
     """
@@ -352,7 +364,7 @@ def recorded(messages: Iterable[tuple[int, Message3d]]) -> Recorded3d:
     head_ns = np.array([head[:2] for head in heads], np.int64).reshape(-1, 2)
     names = sorted({plain_frame(box.frame_id) for box in boxes})
     place = {name: number for number, name in enumerate(names)}
-    classes = Classes()
+    of_boxes = classes([box.class_name for box in boxes])
     message = np.array(owner, np.int64)
     out = Recorded3d(
         names,
@@ -366,9 +378,9 @@ def recorded(messages: Iterable[tuple[int, Message3d]]) -> Recorded3d:
         _columns([box.velocity for box in boxes], 3),
         np.array([box.has_heading for box in boxes], bool),
         np.array([box.score for box in boxes], np.float64),
-        np.array([classes.class_id(box.class_name) for box in boxes], np.int64),
+        of_boxes.ids,
         _ids([box.source_id for box in boxes]),
-        classes,
+        of_boxes,
         head_ns[:, 0],
         head_ns[:, 1],
         np.array([head[2] for head in heads], bool),
@@ -409,14 +421,15 @@ def _checked(boxes: Recorded3d) -> Recorded3d:
         odd_turn: Bools = ~np.asarray(np.isfinite(turn).all(axis=1))
         length = np.linalg.norm(np.where(odd_turn[:, None], 0.0, turn), axis=1)
         is_unturned = ~odd_turn & (length < np.finfo(np.float64).tiny)
+        is_odd_size = ~np.isfinite(size).all(axis=1) & ~np.isnan(size).all(axis=1)
         kinds = {
             "boxes have no position (no finite number) and are left out": is_far,
             "boxes have no z: it is unknown, and 0 in their frame for x and y": np.isnan(boxes.centre[:, 2]),
-            "boxes have a size that is no finite number: it is unknown": ~np.isfinite(size).all(axis=1),
+            "boxes have a size that is no finite number: it is unknown": is_odd_size,
             "boxes have a negative size: it is unknown": (size < 0).any(axis=1),
             "boxes have a size of 0: it is unknown": (size == 0).any(axis=1),
             "boxes have an orientation that is no finite number: it is unknown": odd_turn,
-            "boxes have an orientation of zeros: they count as not turned": is_unturned,
+            "boxes have an orientation of zeros: they count as not turned": is_unturned & boxes.has_heading,
         }
         velocity = boxes.velocity
         # Programs that don't measure velocities leave them at 0; objects that move can't all have one of 0.
@@ -436,8 +449,6 @@ def _checked(boxes: Recorded3d) -> Recorded3d:
     )
 
 
-#: Messages of a channel of drawings in which boxes are looked for.
-_TRIED: Final = 50
 _LISTED: Final = 8
 
 
@@ -591,32 +602,9 @@ def _has(message: Any, name: str) -> bool:
     return getattr(message, name, None) is not None
 
 
-_CACHE: Final[WeakKeyDictionary[log.Log, dict[str, bool]]] = WeakKeyDictionary()
-
-
-def holds_boxes(opened: log.Log, topic: str) -> bool:
-    """Whether a channel has boxes of other software: in pictures, or in space.
-
-    Drawings are boxes if there is one among the first messages.
-    """
-    channel = opened.channel(topic)
-    return foreign.holds_detections(channel) or holds_boxes_3d(opened, topic)
-
-
 def holds_boxes_3d(opened: log.Log, topic: str) -> bool:
-    """Whether a channel has 3D boxes of other software, as ``holds_boxes`` says."""
-    channel = opened.channel(topic)
-    if not foreign.may_hold_boxes_3d(channel):
-        return False
-    if not foreign.is_drawing(channel):
-        return True
-    cached = _CACHE.setdefault(opened, {})
-    if topic not in cached:
-        try:
-            cached[topic] = any(message.boxes for _, message in islice(foreign.boxes_3d(opened, topic), _TRIED))
-        except McaptrackError:
-            cached[topic] = False
-    return cached[topic]
+    """Whether a channel has boxes of other software in space, as ``foreign.holds_boxes`` says."""
+    return foreign.holds_boxes(opened, topic, in_space=True)
 
 
 def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
@@ -640,11 +628,27 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     Raises
     ------
     McaptrackError
-        If a message can't be read, or if the pose of no box is known.
+        If it has no boxes, if a message can't be read, or if the pose of no box is known.
     """
-    if not foreign.may_hold_boxes_3d(opened.channel(topic)):
-        return foreign.named_detections(opened, topic)
-    boxes, unnamed = recorded(foreign.boxes_3d(opened, topic)).in_usual_frame()
+    reading = foreign.reading_of(opened, topic)
+    if reading is None:
+        name = opened.channel(topic).schema_name or "no schema"
+        raise McaptrackError(f"{opened.path}: {topic} holds {name}, not detections; {', '.join(BOXES_READ)} are read")
+    if reading.known is None and reading.fields is not None and not choice_for(opened, topic).fields:
+        text = f"messages of {opened.channel(topic).schema_name} are read by the names of their fields"
+        warn(f"{opened.path}: {topic}: {text} ({reading.fields}); `map=` names others", "fields")
+    return _in_space(opened, topic, reading, frame_id) if reading.in_space else named_boxes(opened, topic, reading)
+
+
+def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> foreign.NamedFrames:
+    """The boxes in space of a channel, as ``named_detections`` returns them."""
+    decoded = decoded_messages(opened, topic, lambda kind: decoder_with_errors(kind, reading.read))
+    own = reading.class_name
+
+    def classes(texts: Sequence[str]) -> ClassesRead:
+        return classes_of(opened, topic, reading, [text or own for text in texts])
+
+    boxes, unnamed = recorded(((message.t_ns, of_message) for message, of_message in decoded), classes).in_usual_frame()
     for remark, count in boxes.remarks.items():
         warn(f"{opened.path}: {topic}: {count:,} {remark}", "left-out")
     if unnamed:
@@ -667,11 +671,6 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     boxes, frame = boxes.select(is_taken), frame[is_taken]
     _warn_odd(opened, topic, boxes)
     rows = rows_of_boxes(boxes, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
-    names = foreign.settle_classes(opened, topic, boxes.classes, [rows])
-    if nameless := boxes.classes.nameless(np.unique(rows["class_id"]).tolist()):
-        listed = list_names([*map(str, nameless)], _LISTED)
-        remark = "1 counts as people, and others move as objects of unknown class do"
-        warn(f"{opened.path}: classes of {topic} are numbers without names ({listed}): {remark}", "classes")
     if unclassed := int((rows["class_id"] == UNKNOWN).sum()):
         remark = "boxes have no class, or 0: they move as objects of unknown class do"
         warn(f"{opened.path}: {topic}: {unclassed:,} of {len(rows):,} {remark}", "classes")
@@ -683,7 +682,9 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     kept = np.flatnonzero(~is_left_out).tolist()
     times = start_ns.tolist()
     frames = [Frame(times[at], index, parts[at]) for index, at in enumerate(kept)]
-    return foreign.NamedFrames(frames, names, fixed)
+    clock = "stamps" if not boxes.times()[1] else "stamps, and log times where they are missing or off"
+    facts = facts_of(choice_for(opened, topic), reading, clock=clock, classes=boxes.classes.source, scale="metres")
+    return foreign.NamedFrames(frames, boxes.classes.names, fixed, facts)
 
 
 class BoxesRead:
@@ -795,7 +796,7 @@ def _warn_odd(opened: log.Log, topic: str, boxes: Recorded3d) -> None:
 
 
 def rows_of_boxes(boxes: Recorded3d, rotation: Floats, shift: Floats, where: str = "") -> Rows:
-    """Boxes as rows of detections (N,), from the poses of their frames: (N, 3, 3) and (N, 3). Classes are not settled.
+    """Boxes as rows of detections (N,), from the poses of their frames: (N, 3, 3) and (N, 3).
 
     ``where`` is named in warnings.
     """

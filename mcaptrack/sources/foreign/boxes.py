@@ -1,4 +1,7 @@
-"""Boxes of other software, as messages state them: those in pictures as rows of detections, those in space one by one.
+"""Boxes of other software in a log: which channels have them, and those in pictures as rows of detections.
+
+A channel is read by the reader of its type that a package brings, as a drawing, or by the fields of its messages.
+``choosing`` says what a user wants otherwise: paths of fields, and names of classes.
 
 Letters: N boxes.
 """
@@ -6,697 +9,278 @@ Letters: N boxes.
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import replace
 from functools import lru_cache
-from itertools import islice
-from math import cos, isfinite, isnan, nan, sin
+from itertools import islice, takewhile
+from math import isfinite
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from mcaptrack.contracts import UNKNOWN_VECTOR, Box, Box3d, Quaternion, Vector, is_in_space
-from mcaptrack.errors import McaptrackError
+from mcaptrack import log
+from mcaptrack.contracts import Box, Box3d, is_in_space
+from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.notices import warn
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.registry.guard import Guard
-from mcaptrack.schema import DETECTIONS, Rows
-from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
+from mcaptrack.schema import DETECTIONS, Frame
+from mcaptrack.schema.classes import COCO, PERSON, UNKNOWN, ClassMap, is_person
 from mcaptrack.schema.names import plain_name
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, number, stamp_of, text, to_bytes
+from mcaptrack.schema.provenance import Provenance, boxes_of, input_of
+from mcaptrack.sources.foreign.decoding import (
+    decoder_with_errors,
+    integer,
+    number,
+    stamp_of,
+    text,
+)
 from mcaptrack.sources.foreign.definitions import MessageType
+from mcaptrack.sources.foreign.fields import (
+    NO_THINGS,
+    PEOPLE,
+    THINGS,
+    FieldReader,
+    FieldShape,
+    Message3d,
+    ThingFields,
+    check_box,
+    head_of,
+    mapped,
+    message_head,
+    parse_map,
+    recognised,
+    shape_of_message,
+    shape_of_type,
+)
+from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.known_types import KNOWN, Known
 
 _KIND: Final = "message_reader"
-#: Schemas of boxes of other software in pictures.
-DETECTIONS_READ: Final = tuple(BUILT_IN[_KIND])[:3]
-
-_NUMBER: Final = re.compile(r"[0-9]{1,10}")
+#: What is read, in messages.
+BOXES_READ: Final = (
+    "vision_msgs/Detection2DArray",
+    "vision_msgs/Detection3DArray",
+    "messages of boxes or positions by their fields",
+)
+#: Messages of a channel in which boxes are looked for.
+_TRIED: Final = 50
+_LISTED: Final = 8
+_WHOLE_NUMBER: Final = re.compile(r"[0-9]{1,10}")
 _NAME: Final = re.compile(r"[^\W\d_]")
-#: The maximum number of class names of a channel; ids from ``_FIRST_NAME`` on are placeholders until all names are
-#: known.
+#: The maximum number of class names of a channel.
 _MAX_NAMES: Final = 1024
-_FIRST_NAME: Final = 2**32 - _MAX_NAMES
+_LAST_ID: Final = 2**32 - 1 - _MAX_NAMES
 _SHOWN: Final = 12
 _PERSON: Final = "person"
 
 
-class Classes:
-    """The classes of one channel: numeric classes keep their id, people are 1, and other names get new ids.
+# What a user chooses
 
-    New ids follow the largest id of the channel in alphabetical order, so that they don't depend on the order of
-    messages.
+
+class BoxesChoice(NamedTuple):
+    """A choice of how boxes of other software are read: the channel that is named, paths of its fields as ``map=`` has
+    them, and the text of a class map; "" for what isn't chosen.
     """
 
-    def __init__(self) -> None:
-        self._names: dict[str, int] = {}
-        self._people: set[str] = set()
-        self._largest = PERSON
-
-    def class_id(self, name: str) -> int:
-        """The id of a class; for a name a placeholder, which ``numbers`` maps to the final id."""
-        if is_person(name):
-            self._people.add(name)
-            return PERSON
-        if _NUMBER.fullmatch(name):
-            number = int(name) if int(name) < _FIRST_NAME else UNKNOWN
-            self._largest = max(self._largest, number)
-            return number
-        if not _NAME.search(name) or (name not in self._names and len(self._names) == _MAX_NAMES):
-            return UNKNOWN
-        return self._names.setdefault(name, _FIRST_NAME + len(self._names))
-
-    def numbers(self) -> dict[int, int]:
-        """The final id of each class name, by the placeholder from ``class_id``."""
-        order = enumerate(sorted(self._names), start=self._largest + 1)
-        return {self._names[name]: number for number, name in order}
-
-    def names_by_id(self) -> dict[int, str]:
-        """The names of all classes by their final id; of people only where all have one name other than "person"."""
-        people = {PERSON: min(self._people)} if len(self._people) == 1 and self._people != {_PERSON} else {}
-        return people | dict(enumerate(sorted(self._names), start=self._largest + 1))
-
-    def nameless(self, used: Collection[int]) -> list[int]:
-        """The final ids among ``used`` that messages state as numbers, without a name; 0 is no class."""
-        named = set(self.numbers().values()) | ({PERSON} if self._people else set()) | {UNKNOWN}
-        return sorted(set(used) - named)
-
-    def named(self) -> list[tuple[str, int]]:
-        """The first class names in alphabetical order, with their ids."""
-        return list(islice(zip(sorted(self._names), range(self._largest + 1, 2**32), strict=False), _SHOWN))
+    topic: str = ""
+    fields: str = ""
+    class_map: str = ""
 
 
-def boxes_decoder(
-    kind: MessageType, classes: Classes, stamps: list[int | None] | None = None
-) -> Callable[[bytes], Rows]:
-    """A function that decodes payloads of a channel to rows of detections (N,); raises as ``picture_decoder`` does.
-
-    ``classes`` collects the class names, and ``stamps`` the stamp of the picture that each message is about.
-    """
-    reader = reader_of(kind.name)
-    if reader is None or reader.in_space:
-        raise McaptrackError(
-            f"it holds {kind.name or 'no schema'}, not detections; {', '.join(DETECTIONS_READ)} are read"
-        )
-
-    def decode(message: Any) -> Rows:
-        if stamps is not None:
-            stamps.append(picture_stamp_of(message))
-        return rows_of(reader.read(message), classes)
-
-    return decoder_with_errors(kind, decode)
+_CHOICE: ContextVar[BoxesChoice] = ContextVar("choice of boxes", default=BoxesChoice())  # noqa: B039  # it is immutable
 
 
-def picture_stamp_of(message: Any) -> int | None:
-    """The stamp in ns of the picture of a message: of its ``image_header`` (darknet), or its own; None if unset."""
-    about = getattr(message, "image_header", None)
+@contextmanager
+def choosing(topic: str | None, fields: str | None, class_map: str | None) -> Iterator[None]:
+    """Read boxes of other software in this way. Raises McaptrackError for paths and class maps that are none."""
+    if fields and not topic:
+        raise McaptrackError("`map=` says how the messages of one channel are read; name it with `topic=`")
+    if fields:
+        parse_map(fields)
+    chosen = BoxesChoice(topic or "", fields or "", str(ClassMap.parse(class_map)) if class_map is not None else "")
+    token = _CHOICE.set(chosen)
     try:
-        stamp_ns = stamp_of(message) if about is None else stamp_of(SimpleNamespace(header=about))
-    except (AttributeError, TypeError, ValueError):
-        return None
-    return stamp_ns or None
+        yield
+    finally:
+        _CHOICE.reset(token)
 
 
-def rows_of(boxes: Sequence[Box], classes: Classes) -> Rows:
-    """Rows of detections of boxes."""
-    *numbers, _ = zip(*boxes, strict=True) if boxes else ((),) * 6
-    columns = dict(zip(("x_px", "y_px", "w_px", "h_px", "score"), numbers, strict=True))
-    ids = [classes.class_id(box.class_name) if box.class_name else UNKNOWN for box in boxes]
-    return DETECTIONS.rows(class_id=np.array(ids, np.uint32), **columns)
-
-
-def detections_2d(message: Any) -> list[Box]:
-    """The boxes of a message of vision_msgs."""
-    return [_box(detection) for detection in message.detections]
-
-
-def _box(detection: Any) -> Box:
-    """The upright box around a detection, with its best score."""
-    centre = detection.bbox.center
-    place = getattr(centre, "position", centre)  # a Point2D in vision_msgs 4, a Pose2D in version 3
-    x, y, theta, w, h = (
-        float(value)
-        for value in (place.x, place.y, getattr(centre, "theta", 0.0), detection.bbox.size_x, detection.bbox.size_y)
-    )
-    _check_box(x, y, w, h, theta)
-    if theta:
-        w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
-    name, score = best_hypothesis(detection.results)
-    return Box(x - w / 2, y - h / 2, w, h, score, name or "")
-
-
-def darknet_boxes(message: Any) -> list[Box]:
-    """The boxes of a message of darknet_ros."""
-    return [_darknet_box(box) for box in message.bounding_boxes]
-
-
-def _darknet_box(box: Any) -> Box:
-    left, top, right, bottom = (number(getattr(box, name)) for name in ("xmin", "ymin", "xmax", "ymax"))
-    _check_box(left, top, right - left, bottom - top)
-    name = box.class_id if hasattr(box, "class_id") else box.Class  # in ROS 1
-    return Box(left, top, right - left, bottom - top, number(box.probability), text(name))
-
-
-def yolo_boxes(message: Any) -> list[Box]:
-    """The boxes of a message of yolo_ros."""
-    return [_yolo_box(detection) for detection in message.detections]
-
-
-def _yolo_box(detection: Any) -> Box:
-    place, size = detection.bbox.center.position, detection.bbox.size
-    x, y, w, h = (number(value) for value in (place.x, place.y, size.x, size.y))
-    _check_box(x, y, w, h)
-    return Box(x - w / 2, y - h / 2, w, h, number(detection.score), text(detection.class_name))
-
-
-def _check_box(x: float, y: float, w: float, h: float, theta: float = 0.0) -> None:
-    """Raise ValueError for a box that can't be."""
-    if not all(isfinite(value) for value in (x, y, theta, w, h)) or w < 0 or h < 0:
-        raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")
-
-
-def best_hypothesis(results: Any) -> tuple[str | None, float]:
-    """The class with the highest score of results of vision_msgs, None if there is none, and its score, or NaN.
-
-    Before ROS 2 Humble a result is its own hypothesis, with ``id`` in the place of ``class_id``.
-    """
-    guesses = [getattr(result, "hypothesis", result) for result in results]
-    scored = [(number(guess.score), guess) for guess in guesses]
-    finite = [(score, guess) for score, guess in scored if isfinite(score)]
-    score, best = max(finite or scored, key=lambda pair: pair[0], default=(nan, None))
-    if best is None:
-        return None, nan
-    return str(best.class_id if hasattr(best, "class_id") else best.id).strip(), score if finite else nan
-
-
-# 3D boxes of other software, as messages state them: what the families of messages share, then each family.
-#
-# A family is a function that takes a decoded message to a ``Message3d``; ``recorded`` makes arrays of all messages
-# of a channel.
-
-
-_ORIGIN: Final[Vector] = (0.0, 0.0, 0.0)
-#: A quaternion of zeros: the orientation isn't stated.
-UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
-_WORD: Final = re.compile(r"[^\W\d_][\w-]*")
-_PERCENT: Final = re.compile(r"(?<![\w.])(\d{1,3}(?:\.\d+)?)\s*%")
-#: A number from 0 to 1 that isn't a distance, speed or angle.
-_SHARE: Final = re.compile(r"(?<![\w.-])(?:0?\.\d+|1\.0+|[01]\.)(?![\w.])(?!\s*(?:c?m|km|m?s|deg|rad|kph)\b|\s*°)")
-
-
-@dataclass
-class Message3d:
-    """The boxes of a message, and a count of its other parts for each description of them.
-
-    ``is_measured`` is false for a message that only takes boxes away from a viewer: nothing was measured then.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    boxes: list[Box3d] = field(default_factory=list)
-    ignored: Counter[str] = field(default_factory=Counter)
-    is_measured: bool = True
-
-
-def head_of(message: Any) -> tuple[int, str]:
-    """Stamp in ns and frame of a message with a ROS header."""
-    return stamp_of(message), text(message.header.frame_id)
-
-
-def own_head(message: Any, around: tuple[int, str]) -> tuple[int, str]:
-    """Stamp and frame of a part of a message: its own, or, where it states no frame, those of the message around it."""
-    stamp_ns, frame_id = head_of(message)
-    return (stamp_ns or around[0], frame_id) if frame_id else around
-
-
-def vector(value: Any) -> Vector:
-    """A point or vector; the origin where it is missing, as protobuf leaves out zeros."""
-    return _ORIGIN if value is None else (number(value.x), number(value.y), number(value.z))
-
-
-def quaternion(value: Any) -> Quaternion:
-    """A quaternion; zeros where it is missing."""
-    return UNSTATED if value is None else (number(value.x), number(value.y), number(value.z), number(value.w))
-
-
-def part(message: Any, name: str) -> Any:
-    """A field of a message; None where it is missing, as optional fields of JSON are."""
-    return getattr(message, name, None)
-
-
-def rotated(orientation: Quaternion, point: Vector) -> Vector:
-    """A point turned by a quaternion; as it is by one of zeros."""
-    x, y, z, w = orientation
-    norm = x * x + y * y + z * z + w * w
-    if not norm or not isfinite(norm):
-        return point
-    a, b, c = point
-    # p + 2 w (q x p) + 2 q x (q x p), for a quaternion that need not have length 1
-    u, v, t = y * c - z * b, z * a - x * c, x * b - y * a
-    return (
-        a + 2 * (w * u + y * t - z * v) / norm,
-        b + 2 * (w * v + z * u - x * t) / norm,
-        c + 2 * (w * t + x * v - y * u) / norm,
+def choice_for(opened: log.Log, topic: str) -> BoxesChoice:
+    """The way a channel is to be read: as is chosen now, or else as what was made of it was read."""
+    now = _CHOICE.get()
+    before = next((facts for facts in _facts_before(opened, topic) if facts), {})
+    return BoxesChoice(
+        now.topic if now.topic == topic else "",
+        (now.fields if now.topic == topic else "") or before.get("map", ""),
+        now.class_map or before.get("class_map", ""),
     )
 
 
-def moved(centre: Vector, orientation: Quaternion, point: Vector) -> Vector:
-    """A point of a box or group, given along its axes, in the frame of the box."""
-    x, y, z = rotated(orientation, point)
-    return centre[0] + x, centre[1] + y, centre[2] + z
-
-
-def around(points: Sequence[Vector]) -> tuple[Vector, Vector]:
-    """Middle and size of the box around points, along their axes. There has to be one at least."""
-    low, high = (tuple(pick(point[axis] for point in points) for axis in range(3)) for pick in (min, max))
-    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2)
-    return middle, (high[0] - low[0], high[1] - low[1], high[2] - low[2])
-
-
-def named(names: Mapping[int, str], label: Any) -> str:
-    """The name of a class by its number in an enumeration; the number where it has none."""
-    return names.get(integer(label), str(integer(label)))
-
-
-def enumeration(message: Any, prefix: str = "") -> Mapping[int, str]:
-    """The names of classes by number that the recorded definition of a message states, as constants with a prefix.
-
-    Names are in lower case, without the prefix; "unknown" is "". Empty where there are no constants, as in JSON.
-    """
-    kind: Any = type(message)
-    return _constants(kind, prefix)
-
-
-@lru_cache(maxsize=64)
-def _constants(kind: Any, prefix: str) -> Mapping[int, str]:
-    whole = {name: value for name, value in vars(kind).items() if name.isupper() and isinstance(value, int)}
-    names = {value: name.removeprefix(prefix).lower() for name, value in whole.items() if name.startswith(prefix)}
-    return {value: "" if name == "unknown" else name for value, name in names.items()}
-
-
-def words_of(said: str) -> tuple[str, float]:
-    """The class and the score in a text beside a box: "car 0.93" -> "car", 0.93; "" and NaN where there are none."""
-    word = _WORD.search(said)
-    percent, share = _PERCENT.search(said), _SHARE.search(said)
-    score = float(percent.group(1)) / 100 if percent else float(share.group()) if share else nan
-    return (word.group() if word else ""), score if score <= 1 else nan
-
-
-# vision_msgs/Detection3DArray, in its forms before ROS 2 Humble and since.
-
-
-def detections_3d(message: Any) -> Message3d:
-    """The boxes of a message."""
-    head = head_of(message)
-    return Message3d(*head, [_detection(detection, head) for detection in message.detections])
-
-
-def _stated_pose(centre: Any, results: Any) -> Any:
-    """The pose of a box; that of its first result where only this one is filled in."""
-    stated = [result.pose.pose for result in results if part(part(result, "pose"), "pose") is not None]
-    is_unset = not any(vector(centre.position)) and bool(stated) and any(vector(stated[0].position))
-    return stated[0] if is_unset else centre
-
-
-def _detection(detection: Any, around: tuple[int, str]) -> Box3d:
-    class_name, score = best_hypothesis(detection.results)
-    pose = _stated_pose(detection.bbox.center, detection.results)
-    return Box3d(
-        *own_head(detection, around),
-        vector(pose.position),
-        quaternion(part(pose, "orientation")),
-        vector(detection.bbox.size),
-        class_name or "",
-        score,
-        part(detection, "id") or part(detection, "tracking_id") or None,
-    )
-
-
-# foxglove.SceneUpdate: the cubes of its entities.
-#
-# Entities are drawings: they stay until they are deleted, replaced or ``lifetime`` is over. As measurements they count
-# once, at their timestamp; ``frame_locked`` says where a drawing is later, which makes no difference then.
-
-
-#: Keys of metadata, in lower case and without separators, the first that there is.
-_CLASS_KEYS: Final = ("class", "classname", "label", "category", "type", "objectclass", "classification", "objecttype")
-_SCORE_KEYS: Final = ("score", "confidence", "probability", "existenceprobability")
-_ID_KEYS: Final = ("trackid", "trackingid", "objectid", "instanceid")
-_OTHERS: Final = ("arrows", "spheres", "cylinders", "lines", "triangles", "texts", "models")
-
-
-def scene_cubes(message: Any) -> Message3d:
-    """The cubes of a message."""
-    entities, deletions = list(part(message, "entities") or ()), list(part(message, "deletions") or ())
-    first = next(iter([*entities, *deletions]), None)
-    out = Message3d(_stamp(first), text(part(first, "frame_id") or ""))
-    for entity in entities:
-        cubes = list(part(entity, "cubes") or ())
-        if not cubes and any(part(entity, name) for name in _OTHERS):
-            out.ignored["entities without cubes"] += 1
-        out.boxes += [_cube(entity, cube, is_alone=len(cubes) == 1) for cube in cubes]
-    out.is_measured = bool(out.boxes) or not (deletions or out.ignored)
-    return out
-
-
-def _stamp(entity: Any) -> int:
-    return stamp_of(entity) if part(entity, "timestamp") is not None else 0
-
-
-def _cube(entity: Any, cube: Any, is_alone: bool) -> Box3d:
-    said = {
-        "".join(filter(str.isalnum, text(pair.key).lower())): _words(pair.value)
-        for pair in part(entity, "metadata") or ()
-    }
-    texts = list(part(entity, "texts") or []) if is_alone else []
-    word, share = words_of(text(texts[0].text)) if texts else ("", nan)
-    score = _first(said, _SCORE_KEYS)
-    pose = part(cube, "pose")
-    return Box3d(
-        _stamp(entity),
-        text(part(entity, "frame_id") or ""),
-        vector(part(pose, "position")),
-        quaternion(part(pose, "orientation")),
-        vector(part(cube, "size")),
-        _first(said, _CLASS_KEYS).strip() or word,
-        _score(score) if score else share,
-        # The id of several cubes is that of none of them.
-        _first(said, _ID_KEYS) or (_words(part(entity, "id")) if is_alone else "") or None,
-    )
-
-
-def _first(said: dict[str, str], keys: tuple[str, ...]) -> str:
-    return next((said[key] for key in keys if said.get(key)), "")
-
-
-def _words(value: Any) -> str:
-    """A text; numbers count as theirs, since writers of JSON give ids and scores as numbers."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return repr(value) if is_number else text("" if value is None else value)
-
-
-def _score(written: str) -> float:
-    try:
-        return number(written)
-    except ValueError:
-        return words_of(written)[1]
-
-
-# visualization_msgs/MarkerArray and Marker: cubes, and lists of cubes. They are drawings, as entities of scenes are: a
-# cube counts when it is added.
-
-
-_CUBE, _CUBE_LIST, _TEXT, _ADD = 1, 6, 9, 0
-#: Namespaces that say nothing about the class of their markers.
-_GENERIC: Final = re.compile(
-    r"((b(ounding)?_?box(es)?|(basic_?)?shapes?|(box|cluster|cube|detection|id|marker|object|obstacle|track)(e?s)?|ns)"
-    r"(_?array)?[\W_]*\d*|[\W\d_]*)"
-)
-
-
-def marker_cubes(message: Any) -> Message3d:
-    """The cubes of a message."""
-    markers = list(message.markers) if hasattr(message, "markers") else [message]
-    out = Message3d(*(head_of(markers[0]) if markers else (0, "")))
-    # Deletions say nothing about what is measured.
-    added = [marker for marker in markers if integer(part(marker, "action") or 0) == _ADD]
-    labels = _labels(added)
-    for marker in added:
-        kind = integer(marker.type)
-        if kind == _CUBE:
-            name, score = _marker_class(marker)
-            label, share = words_of(labels.get(integer(marker.id), ""))
-            name, score = name or label, share if isnan(score) else score
-            pose = _marker_pose(marker)
-            box = Box3d(*head_of(marker), *pose, vector(marker.scale), name, score, integer(marker.id))
-            out.boxes.append(box)
-        elif kind == _CUBE_LIST:
-            name, score = _marker_class(marker)
-            centre, orientation = _marker_pose(marker)
-            out.boxes += [
-                Box3d(*head_of(marker), moved(centre, orientation, vector(point)), orientation, size, name, score)
-                for size in [vector(marker.scale)]
-                for point in part(marker, "points") or ()
-            ]
-        elif kind != _TEXT or integer(marker.id) not in labels:
-            out.ignored["markers that are no cubes"] += 1
-    out.is_measured = bool(out.boxes) or not (markers and (out.ignored or not added))
-    return out
-
-
-def _labels(markers: list[Any]) -> dict[int, str]:
-    """The texts of markers beside cubes, by the id that they share with one cube."""
-    cubes, texts = (
-        Counter(integer(marker.id) for marker in markers if integer(marker.type) == kind) for kind in (_CUBE, _TEXT)
-    )
-    return {
-        integer(marker.id): text(part(marker, "text") or "")
-        for marker in markers
-        if integer(marker.type) == _TEXT and cubes[integer(marker.id)] == texts[integer(marker.id)] == 1
-    }
-
-
-def _marker_pose(marker: Any) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    return vector(marker.pose.position), quaternion(part(marker.pose, "orientation"))
-
-
-def _marker_class(marker: Any) -> tuple[str, float]:
-    """The class, which is the namespace or, if that says nothing, a word of the text; and the score in the text."""
-    space = text(part(marker, "ns") or "").strip().rpartition("/")[2]
-    word, score = words_of(text(part(marker, "text") or ""))
-    return (word, score) if _GENERIC.fullmatch(space.lower()) else (space, score)
-
-
-# jsk_recognition_msgs/BoundingBoxArray.
-
-
-def jsk_boxes(message: Any) -> Message3d:
-    """The boxes of a message."""
-    head = head_of(message)
-    return Message3d(*head, [_jsk_box(box, head) for box in message.boxes])
-
-
-def _jsk_box(box: Any, around: tuple[int, str]) -> Box3d:
-    return Box3d(
-        *own_head(box, around),
-        vector(box.pose.position),
-        quaternion(part(box.pose, "orientation")),
-        vector(box.dimensions),
-        str(integer(box.label)),
-        number(box.value) or nan,  # 0 where no value is set
-    )
-
-
-# derived_object_msgs/ObjectArray.
-
-
-#: The classes of derived_object_msgs/Object, for messages without their definition (JSON).
-_OBJECT_NAMES: Final = (
-    ",unknown_small,unknown_medium,unknown_big,pedestrian,bike,car,truck,motorcycle,other_vehicle,barrier,sign"
-)
-_OBJECT_CLASSES: Final = dict(enumerate(_OBJECT_NAMES.split(",")))
-_PREFIX: Final = "CLASSIFICATION_"
-#: The largest certainty of a classification.
-_CERTAIN: Final = 255
-#: The level of detection from which the velocity is known.
-_TRACKED: Final = 1
-#: The types of shape_msgs/SolidPrimitive.
-_BOX, _SPHERE, _CYLINDER, _CONE = 1, 2, 3, 4
-
-
-def derived_objects(message: Any) -> Message3d:
-    """The objects of a message. Those without a shape, as of radars, have the size of their polygon, or none."""
-    head = head_of(message)
-    return Message3d(*head, [_object_box(seen, head) for seen in message.objects])
-
-
-def _shape_size(shape: Any) -> Vector:
-    """The size of the box around a shape; NaN if it has none."""
-    kind, lengths = integer(shape.type), [number(dimension) for dimension in shape.dimensions]
-    if kind == _BOX and len(lengths) >= 3:
-        return lengths[0], lengths[1], lengths[2]
-    if kind == _SPHERE and lengths:
-        return 2 * lengths[0], 2 * lengths[0], 2 * lengths[0]
-    if kind in (_CYLINDER, _CONE) and len(lengths) >= 2:  # height and radius
-        return 2 * lengths[1], 2 * lengths[1], lengths[0]
-    return UNKNOWN_VECTOR
-
-
-def _object_box(seen: Any, head: tuple[int, str]) -> Box3d:
-    certainty = integer(seen.classification_certainty)
-    centre, size = vector(seen.pose.position), _shape_size(seen.shape)
-    orientation = quaternion(part(seen.pose, "orientation"))
-    if isnan(size[0]) and (points := [vector(point) for point in part(part(seen, "polygon"), "points") or ()]):
-        x, y, z, w = orientation
-        along = [rotated((-x, -y, -z, w), point) for point in points]  # the polygon is in the frame of the message
-        middle, (length, width, _) = around(along)
-        centre, size = rotated(orientation, middle), (length, width, nan)
-    return Box3d(
-        *own_head(seen, head),
-        centre,
-        orientation,
-        size,
-        named(enumeration(seen, _PREFIX) or _OBJECT_CLASSES, seen.classification),
-        certainty / _CERTAIN if certainty else nan,
-        integer(seen.id),
-        vector(seen.twist.linear) if integer(seen.detection_level) == _TRACKED else UNKNOWN_VECTOR,
-    )
-
-
-# People without a size: people_msgs/People, and TrackedPersons and DetectedPersons of spencer_tracking_msgs.
-
-
-def people(message: Any) -> Message3d:
-    """The people of a message."""
-    head = head_of(message)
-    return Message3d(
-        *head,
-        [
-            Box3d(
-                *head,
-                vector(person.position),
-                UNSTATED,
-                UNKNOWN_VECTOR,
-                _PERSON,
-                number(person.reliability),
-                text(person.name) or None,
-                vector(person.velocity),
-                has_heading=False,
-            )
-            for person in message.people
-        ],
-    )
-
-
-def spencer_people(message: Any) -> Message3d:
-    """The tracked or detected people of a message."""
-    head = head_of(message)
-    tracks, detections = part(message, "tracks") or (), part(message, "detections") or ()
-    boxes = [_spencer_person(head, track, integer(track.track_id), nan) for track in tracks]
-    boxes += [_spencer_person(head, seen, None, number(seen.confidence)) for seen in detections]
-    return Message3d(*head, boxes)
-
-
-def _spencer_person(head: tuple[int, str], person: Any, track_id: int | None, score: float) -> Box3d:
-    pose, twist = person.pose.pose, part(person, "twist")
-    velocity = UNKNOWN_VECTOR if twist is None else vector(twist.twist.linear)
-    orientation = quaternion(part(pose, "orientation"))
-    return Box3d(*head, vector(pose.position), orientation, UNKNOWN_VECTOR, _PERSON, score, track_id, velocity)
-
-
-# DetectedObjects, TrackedObjects and PredictedObjects of Autoware (autoware_perception_msgs and
-# autoware_auto_perception_msgs).
-
-
-#: The labels of ObjectClassification, for messages without their definition (JSON). Earlier ones had no bus.
-_AUTOWARE_NAMES: Final = (
-    ",car,truck,bus,trailer,motorcycle,bicycle,pedestrian,animal,hazard,over_drivable,under_drivable"
-)
-_AUTOWARE_CLASSES: Final = dict(enumerate(_AUTOWARE_NAMES.split(",")))
-_AUTOWARE_CYLINDER, _AUTOWARE_POLYGON = 1, 2
-_HEADING_UNKNOWN: Final = 0
-
-
-def autoware_objects(message: Any) -> Message3d:
-    """The objects of a message."""
-    head = head_of(message)
-    return Message3d(*head, [_autoware_box(item, head) for item in message.objects])
-
-
-def _autoware_box(item: Any, head: tuple[int, str]) -> Box3d:
-    kinematics, shape = item.kinematics, item.shape
-    is_predicted = hasattr(kinematics, "initial_pose_with_covariance")
-    now = kinematics.initial_pose_with_covariance if is_predicted else kinematics.pose_with_covariance
-    pose = now.pose
-    centre, orientation, size = vector(pose.position), quaternion(part(pose, "orientation")), vector(shape.dimensions)
-    if integer(shape.type) == _AUTOWARE_CYLINDER:  # x is the diameter
-        size = (size[0], size[0], size[2])
-    elif integer(shape.type) == _AUTOWARE_POLYGON:
-        middle, size = _footprint([vector(point) for point in shape.footprint.points], size[2])
-        centre = moved(centre, orientation, middle)
-    velocity = UNKNOWN_VECTOR
-    if getattr(kinematics, "has_twist", True):  # along the axes of the object
-        moves = kinematics.initial_twist_with_covariance if is_predicted else kinematics.twist_with_covariance
-        velocity = rotated(orientation, vector(moves.twist.linear))
-    name, probability = _likeliest(item)
-    existence = number(item.existence_probability)
-    return Box3d(
-        *head,
-        centre,
-        orientation,
-        size,
-        name,
-        existence if existence > 0 else probability,
-        _uuid(item),
-        velocity,
-        is_predicted or integer(kinematics.orientation_availability) != _HEADING_UNKNOWN,
-    )
-
-
-def _likeliest(item: Any) -> tuple[str, float]:
-    """The likeliest class, and its probability; "" and NaN if there is none."""
-    guesses = [(number(guess.probability), guess) for guess in item.classification]
-    shares = [(share if isfinite(share) else -1.0, guess) for share, guess in guesses]
-    if not shares:
-        return "", nan
-    share, guess = max(shares, key=lambda pair: pair[0])
-    return named(enumeration(guess) or _AUTOWARE_CLASSES, guess.label), share if share > 0 else nan
-
-
-def _footprint(points: list[Vector], height: float) -> tuple[Vector, Vector]:
-    """Middle and size of the upright box around a footprint, along the axes of the object."""
-    if not points:
-        return (0.0, 0.0, 0.0), (nan, nan, height)
-    (x, y, _), (length, width, _) = around(points)
-    return (x, y, 0.0), (length, width, height)
-
-
-def _uuid(item: Any) -> str | None:
-    """The UUID of a tracked object, in hexadecimal; None for a detected one."""
-    uuid = part(item, "object_id")
-    return None if uuid is None else to_bytes(uuid.uuid).hex()
-
-
-#: Schemas of 3D boxes, by their names in ROS 1 and Foxglove; ROS 2 adds "/msg/".
-BOXES_3D_READ: Final = tuple(BUILT_IN[_KIND])[3:]
-#: Those that are drawings: a channel with such messages need not hold boxes.
-DRAWINGS: Final = ("foxglove.SceneUpdate", "visualization_msgs/MarkerArray", "visualization_msgs/Marker")
-
-
-def boxes_3d_decoder(kind: MessageType) -> Callable[[bytes], Message3d]:
-    """A function that decodes payloads of a channel to 3D boxes; raises as ``picture_decoder`` does."""
-    reader = reader_of(kind.name)
-    if reader is None or not reader.in_space:
-        raise McaptrackError(f"it holds {kind.name or 'no schema'}, not 3D boxes; {', '.join(BOXES_3D_READ)} are read")
-    return decoder_with_errors(kind, reader.read)
-
-
-# Readers by the type of messages: built-in ones, and those of other packages.
-
-
-class BoxReader(NamedTuple):
-    """A reader of the messages of a type: a function that gives a list of ``Box``, or of boxes in space a
-    ``Message3d``.
+def is_chosen_otherwise(opened: log.Log, topic: str) -> bool:
+    """Whether boxes of other software were read in another way than is chosen now."""
+    if not any(_CHOICE.get()[1:]) or topic not in opened.channels or reading_of(opened, topic) is None:
+        return False
+    choice = choice_for(opened, topic)[1:]
+    return any((facts.get("map", ""), facts.get("class_map", "")) != choice for facts in _facts_before(opened, topic))
+
+
+_FACTS: Final[WeakKeyDictionary[log.Log, dict[str, list[Mapping[str, str]]]]] = WeakKeyDictionary()
+
+
+def _facts_before(opened: log.Log, topic: str) -> list[Mapping[str, str]]:
+    """The record of how a channel was read, by each channel that was made of it."""
+    if opened not in _FACTS:
+        _FACTS[opened] = {}
+        for channel in opened.channels.values():
+            if source := input_of(channel.metadata):
+                _FACTS[opened].setdefault(source, []).append(boxes_of(channel.metadata))
+    return _FACTS[opened].get(topic, [])
+
+
+# How a channel is read
+
+
+class Reading(NamedTuple):
+    """The way the messages of a channel are read.
+
+    Attributes
+    ----------
+    in_space : bool
+        Whether boxes are in metres.
+    read : callable
+        From a message to a list of ``Box``, or of boxes in space a ``Message3d``.
+    fields : ThingFields or None
+        What its fields are; None for drawings, and readers of packages.
+    is_certain : bool
+        Whether it holds boxes of what moves, or only may.
+    class_name : str
+        The class of what states none, by the name of the channel; "" if it doesn't say.
+    known : Known or None
+        What is known of its type.
     """
 
     in_space: bool
     read: Callable[[Any], Any]
+    fields: ThingFields | None = None
+    is_certain: bool = True
+    class_name: str = ""
+    known: Known | None = None
 
 
-def reader_of(schema_name: str) -> BoxReader | None:
-    """The reader of a type of messages; None if there is none.
+_READINGS: Final[WeakKeyDictionary[log.Log, dict[tuple[str, BoxesChoice], Reading | None]]] = WeakKeyDictionary()
 
-    Raises McaptrackError if that of another package can't be imported. Packages that aren't needed are not imported.
+
+def reading_of(opened: log.Log, topic: str) -> Reading | None:
+    """The way a channel is read; None if its messages hold neither boxes nor positions.
+
+    A warning names a package with its reader that can't be imported. Raises McaptrackError for paths of a user that its
+    type doesn't have.
     """
-    name = plain_name(schema_name)
+    choice = choice_for(opened, topic)
+    kept = _READINGS.setdefault(opened, {})
+    if (topic, choice) not in kept:
+        kept[topic, choice] = _reading(opened, opened.channel(topic), choice)
+    return kept[topic, choice]
+
+
+def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Reading | None:
+    if not channel.schema_name or Provenance.from_metadata(channel.metadata):  # views of mcaptrack are drawings, too
+        return None
+    kind, words = message_type_of(opened, channel.topic), re.findall("[a-z]+", channel.topic.lower())
+    person = _PERSON if any(PEOPLE.fullmatch(word) for word in words) else ""
+    name = plain_name(kind.name)
+    try:
+        if not choice.fields and (special := _special(name)):
+            if name in BUILT_IN[_KIND]:
+                return _of_drawings(special, _samples(opened, channel.topic, kind), words, person)
+            return special
+    except McaptrackError as error:
+        warn(f"{error}; messages of {channel.topic} are not read", "other")
+        return None
+    if NO_THINGS.fullmatch(name) and not choice.fields:
+        return None
+    try:
+        shape = shape_of_type(kind) or _shape_of(_samples(opened, channel.topic, kind))
+        reader = fields_reader(name, shape, choice.fields)
+    except McaptrackError as error:
+        if choice.fields:
+            raise McaptrackError(f"{opened.path}: {channel.topic}: {error}") from None
+        return None  # a type that can't be decoded
+    if reader is None:
+        return None
+    if reader.fields.in_picture and reader.in_space:  # of both the one that is filled in
+        centres = [
+            box.centre for message in _samples(opened, channel.topic, kind) for box in reader.in_frame(message).boxes
+        ]
+        reader.in_space = not centres or any(any(centre) for centre in centres)
+    known = KNOWN.get(name)
+    is_certain = known is not None or reader.fields.is_certain or bool(choice.fields or person)
+    return Reading(reader.in_space, reader.read, reader.fields, is_certain, person, known)
+
+
+def _of_drawings(special: Reading, messages: Sequence[Any], words: Sequence[str], person: str) -> Reading | None:
+    """The way drawings are read; None if there is no box among the first ones.
+
+    What is round may be a mark of anything, where nothing names it.
+    """
+    boxes = [box for message in messages for box in special.read(message).boxes]
+    is_certain = any(box.has_heading for box in boxes) or any(THINGS.fullmatch(word) for word in words)
+    is_certain |= any(is_person(box.class_name) for box in boxes)
+    return special._replace(is_certain=is_certain, class_name=person) if boxes else None
+
+
+def _shape_of(messages: Sequence[Any]) -> FieldShape:
+    """The fields of messages in JSON, of all together."""
+    return shape_of_message(list(messages))._replace(count=None)
+
+
+def _samples(opened: log.Log, topic: str, kind: MessageType, most: int = _TRIED) -> list[Any]:
+    """The first messages of a channel; none if they can't be decoded."""
+    try:
+        decode = decoder_with_errors(kind, lambda message: message)
+        return [decode(message.payload) for message in islice(opened.timed(topic), most)]
+    except McaptrackError:
+        return []
+
+
+@lru_cache(maxsize=256)
+def fields_reader(name: str, shape: FieldShape, chosen: str = "") -> FieldReader | None:
+    """The reader of a type by its fields: those that a user chose, those of ``known_types``, and by their names.
+
+    None if there are neither boxes nor positions. Raises McaptrackError for chosen paths that the type doesn't have.
+    """
+    known = KNOWN.get(name, Known())
+    fields = recognised(shape, name)
+    if fields is not None and known.fields:
+        paths = {key: path for key, path in parse_map(known.fields).items() if shape.at((*fields.things, *path))}
+        fields = mapped(shape, name, paths) if paths else fields
+    if fields is not None and known.classes and not fields.names:
+        fields = replace(fields, names=dict(enumerate(known.classes.split(","))))
+    if chosen:
+        fields = mapped(shape, name, parse_map(chosen))
+    return None if fields is None else FieldReader(fields, fields.in_space, None if chosen else known.adjust)
+
+
+def _special(name: str) -> Reading | None:
+    """The way messages of a type are read if not by their fields: drawings, and types that a package reads.
+
+    Raises McaptrackError if the reader of a package can't be imported. Packages that aren't needed are not imported.
+    """
     if name in BUILT_IN[_KIND]:
-        return BoxReader(name not in DETECTIONS_READ, find(_KIND, name).cls)
-    named = next((other for other in others(_KIND) if plain_name(other) == name), "")
-    return _of_package(find(_KIND, named)) if named else None
+        return Reading(True, find(_KIND, name).cls)
+    other = "" if name in KNOWN else next((other for other in others(_KIND) if plain_name(other) == name), "")
+    return _of_package(find(_KIND, other)) if other else None
 
 
 @lru_cache(maxsize=64)
-def _of_package(entry: Entry) -> BoxReader:
+def _of_package(entry: Entry) -> Reading:
     reader, guard = entry.made("read"), Guard(str(entry))
     in_space = is_in_space(entry, reader)
 
@@ -705,7 +289,34 @@ def _of_package(entry: Entry) -> BoxReader:
             boxes = list(reader.read(message))
         return checked_message_3d(entry, message, boxes) if in_space else checked_boxes(entry, boxes)
 
-    return BoxReader(in_space, read)
+    return Reading(in_space, read)
+
+
+def boxes_decoder(kind: MessageType, in_space: bool = False) -> Callable[[bytes], Any]:
+    """A function that decodes payloads of a type to a list of ``Box``, or of boxes in space to a ``Message3d``.
+
+    Raises McaptrackError for other types; the returned function raises it for malformed payloads.
+    """
+    name = plain_name(kind.name)
+    reading, shape = _special(name), None
+    if reading is None and (shape := shape_of_type(kind)) is not None and (reader := fields_reader(name, shape)):
+        reading = Reading(in_space, reader.in_frame if in_space else reader.in_picture, reader.fields)
+        if not (reader.in_space if in_space else reader.fields.in_picture):
+            reading = None
+    if reading is None and shape is None and name in KNOWN:
+        return decoder_with_errors(kind, lambda message: _read_json(name, message, in_space))
+    if reading is None or reading.in_space != in_space:
+        what = "3D boxes" if in_space else "detections"
+        raise McaptrackError(f"it holds {kind.name or 'no schema'}, not {what}; {', '.join(BOXES_READ)} are read")
+    return decoder_with_errors(kind, reading.read)
+
+
+def _read_json(name: str, message: Any, in_space: bool) -> Any:
+    """The boxes of a message in JSON, by its own fields."""
+    reader = fields_reader(name, shape_of_message(message))
+    if reader is None:
+        return Message3d(*message_head(message, [])) if in_space else []
+    return reader.in_frame(message) if in_space else reader.in_picture(message)
 
 
 def checked_boxes(entry: Entry, boxes: list[Any]) -> list[Box]:
@@ -713,7 +324,7 @@ def checked_boxes(entry: Entry, boxes: list[Any]) -> list[Box]:
     with blamed(entry, "gave what is no Box"):
         out = [Box(float(x), float(y), float(w), float(h), number(s), text(name)) for x, y, w, h, s, name in boxes]
         for x, y, w, h, *_ in out:
-            _check_box(x, y, w, h)
+            check_box(x, y, w, h)
     return out
 
 
@@ -741,3 +352,309 @@ def _checked_box_3d(box: Any, head: tuple[int, str]) -> Box3d:
         stamp_ns=stamp or head[0], frame_id=frame or head[1], centre=centre, size=size, velocity=velocity,
         orientation=orientation, class_name=text(box.class_name), score=float(box.score),
     )  # fmt: skip
+
+
+# Which channels have boxes
+
+
+def holds_boxes(opened: log.Log, topic: str, in_space: bool | None = None) -> bool:
+    """Whether a channel has boxes of other software: in pictures, or in space, or of either kind.
+
+    Positions that may be of anything count where a user names their channel, or has named it before.
+    """
+    reading = reading_of(opened, topic)
+    if reading is None or in_space not in (None, reading.in_space):
+        return False
+    return reading.is_certain or bool(choice_for(opened, topic).topic or _facts_before(opened, topic))
+
+
+def uncertain_boxes(opened: log.Log) -> dict[str, str]:
+    """The channels that may hold positions of people, or of anything, by topic: the type of their messages."""
+    return {
+        topic: channel.schema_name
+        for topic, channel in sorted(opened.channels.items())
+        if channel.messages and (reading := reading_of(opened, topic)) and not reading.is_certain
+    }
+
+
+# Classes
+
+
+class ClassesRead(NamedTuple):
+    """The classes of the boxes of a channel.
+
+    ``ids`` (N,) are numbers: those of classes that are numbers stay, people are 1, and other names have numbers after
+    the largest, in alphabetical order, so that they don't depend on the order of messages. ``names`` are the names by
+    number, of people only where all have one name other than "person". ``remarks`` say what was assumed, and
+    ``source`` where names are from.
+    """
+
+    ids: Ints
+    names: dict[int, str]
+    remarks: list[str]
+    source: str
+
+
+def read_classes(
+    texts: Sequence[str], class_map: str = "", has_coco: bool = False, has_zero: bool = False
+) -> ClassesRead:
+    """The classes of boxes from the texts that messages state (N,), "" where they state none.
+
+    ``class_map`` is the text of a class map. With ``has_coco`` numbers are those of COCO, from 0 on; with ``has_zero``
+    0 is a class and not a missing one, so that numbers up to 79 with a 0 among them are those of COCO.
+    """
+    own = dict.fromkeys(texts)
+    own.pop("", None)
+    numbers = sorted({int(name) for name in own if _WHOLE_NUMBER.fullmatch(name)})
+    source = "numbers" if len(numbers) == len(own) else "names"
+    is_coco = not class_map and source == "numbers" and bool(numbers) and numbers[-1] < len(COCO)
+    is_coco = is_coco and (has_coco or (has_zero and numbers[0] == 0))
+    remarks = []
+    if class_map or is_coco:
+        names = ClassMap.parse(class_map or "coco")
+        source = f"class map {names}" if class_map else "COCO's numbers"
+        named = {text: names.name(text) or (f"class {text}" if _WHOLE_NUMBER.fullmatch(text) else text) for text in own}
+        if missing := [str(number) for number in numbers if names.name(number) is None]:
+            remarks.append(f"are numbers that are not in the class map: {list_names(missing, _LISTED)}")
+        if is_coco:
+            listed = list_names([f"{number} is {COCO[number]}" for number in numbers], _LISTED)
+            remarks.append(f"are numbers: those of COCO are taken ({listed}); `class_map=` names others")
+    else:
+        named = {text: text for text in own}
+    ids, by_id = _numbered(named)
+    new = [f"{number} is {name!r}" for number, name in by_id.items() if number != PERSON]
+    if new and not is_coco:
+        remarks.append(f"are names; in class_id 1 is a person, {', '.join(new[:_SHOWN])}")
+    nameless = {ids[text] for text in own} - set(by_id) - {UNKNOWN}
+    nameless -= {PERSON} if any(is_person(name) for name in named.values()) else set()
+    if nameless or (has_zero and numbers[:1] == [0] and not (class_map or is_coco)):
+        listed = list_names([*map(str, numbers)], _LISTED)
+        how = "1 counts as people, and others move as objects of unknown class do; `class_map=` names them"
+        remarks.append(f"are numbers without names ({listed}): {how}")
+    return ClassesRead(np.array([ids.get(text, UNKNOWN) for text in texts], np.int64), by_id, remarks, source)
+
+
+def _numbered(named: Mapping[str, str]) -> tuple[dict[str, int], dict[int, str]]:
+    """The number of each class by what messages call it, and the names by number."""
+    ids, people, others_named = dict[str, int](), set[str](), dict[str, None]()
+    for own, name in named.items():
+        if is_person(name):
+            ids[own] = PERSON
+            people.add(name)
+        elif _WHOLE_NUMBER.fullmatch(name):
+            ids[own] = int(name) if int(name) <= _LAST_ID else UNKNOWN
+        elif _NAME.search(name) and (name in others_named or len(others_named) < _MAX_NAMES):
+            others_named[name] = None
+    first = max([PERSON, *ids.values()]) + 1
+    numbers = {name: first + order for order, name in enumerate(sorted(others_named))}
+    ids |= {own: numbers.get(name, UNKNOWN) for own, name in named.items() if own not in ids}
+    of_people = {PERSON: min(people)} if len(people) == 1 and people != {_PERSON} else {}
+    return ids, of_people | {number: name for name, number in numbers.items()}
+
+
+# Boxes in pictures
+
+
+class NamedFrames(NamedTuple):
+    """Frames of a channel, the names of their classes by class id, the frame that their metres are in, or "", and how
+    boxes of other software were read.
+    """
+
+    frames: Sequence[Frame]
+    classes: dict[int, str]
+    frame_id: str = ""
+    facts: Mapping[str, str] = {}
+
+
+def named_boxes(opened: log.Log, topic: str, reading: Reading) -> NamedFrames:
+    """The boxes in pictures of another detector, one frame for each message, with the names of their classes.
+
+    Boxes with the stamp of a picture are at the log time of this picture, others at their own. Boxes in shares of the
+    picture are scaled to its size. What is assumed is said.
+    """
+    where, choice = f"{opened.path}: {topic}", choice_for(opened, topic)
+    convert = lambda message: (picture_stamp_of(message), reading.read(message))  # noqa: E731
+    log_ns, stamps_ns, boxes, ends = list[int](), list[int | None](), list[Box](), [0]
+    for message, (stamp_ns, of_message) in decoded_messages(
+        opened, topic, lambda kind: decoder_with_errors(kind, convert)
+    ):
+        log_ns.append(message.t_ns)
+        stamps_ns.append(stamp_ns)
+        boxes += of_message
+        ends.append(len(boxes))
+    t_ns, pictures, clock = _times_of_pictures(opened, topic, log_ns, stamps_ns)
+    texts = [box.class_name or reading.class_name or "" for box in boxes]
+    classes = classes_of(opened, topic, reading, texts)
+    columns = np.array([box[:5] for box in boxes], np.float64).reshape(-1, 5)
+    size = _size_stated(choice) or picture_size_near(opened, topic, pictures)
+    scale = scale_boxes(where, columns[:, :4], size)
+    rows = DETECTIONS.rows(
+        class_id=classes.ids, **dict(zip(("x_px", "y_px", "w_px", "h_px", "score"), columns.T, strict=True))
+    )
+    order = np.argsort(t_ns, kind="stable").tolist()
+    frames = [Frame(t_ns[at], index, rows[ends[at] : ends[at + 1]]) for index, at in enumerate(order)]
+    return NamedFrames(
+        frames, classes.names, "", facts_of(choice, reading, clock=clock, classes=classes.source, scale=scale)
+    )
+
+
+def classes_of(opened: log.Log, topic: str, reading: Reading, texts: Sequence[str]) -> ClassesRead:
+    """The classes of the boxes of a channel, from their texts (N,); warnings say what is assumed."""
+    has_zero = reading.fields is not None and reading.fields.has_zero
+    class_map = choice_for(opened, topic).class_map
+    classes = read_classes(texts, class_map, reading.known is not None and reading.known.has_coco, has_zero)
+    for remark in classes.remarks:
+        warn(f"{opened.path}: classes of {topic} {remark}", "classes")
+    if not any(texts) or (reading.fields is not None and "class" not in reading.fields.paths):
+        by = "type" if reading.fields is not None and reading.fields.class_name else "channel"
+        return classes._replace(source=f"the name of the {by}" if any(texts) else "none")
+    return classes
+
+
+def facts_of(choice: BoxesChoice, reading: Reading, **facts: str) -> dict[str, str]:
+    """The record of how a channel was read, with what was chosen."""
+    chosen = {"fields": str(reading.fields or ""), "map": choice.fields, "class_map": choice.class_map}
+    return {key: value for key, value in (facts | chosen).items() if value}
+
+
+def scale_boxes(where: str, boxes: Floats, size: tuple[int, int] | None) -> str:
+    """Scale boxes (N, 4) that are in shares of a picture to its size, in place; returns their scale.
+
+    Warns of boxes outside of their pictures. Raises McaptrackError for shares of a picture of unknown size.
+    """
+    ends = boxes[:, :2] + boxes[:, 2:]
+    if not len(boxes):
+        return ""
+    if ends.max() <= 1 + _MARGIN and boxes[:, :2].min() >= -_MARGIN and boxes[:, 2:].any():
+        if size is None:
+            raise McaptrackError(
+                f"{where}: boxes are from 0 to 1, shares of a picture of unknown size: say it with "
+                "`map='picture=1280x720'`, or add the pictures"
+            )
+        boxes *= [*size, *size]
+        warn(
+            f"{where}: boxes are from 0 to 1: they are taken as shares of pictures of {size[0]} x {size[1]} px", "units"
+        )
+        return f"shares of {size[0]}x{size[1]}"
+    if size is not None:
+        margin = _MARGIN * np.array(size)
+        outside = int(((ends > size + margin) | (boxes[:, :2] < -margin)).any(axis=1).sum())
+        if outside > len(boxes) * _MARGIN:
+            x, y = ends.max(axis=0)
+            text = f"{outside:,} of {len(boxes):,} boxes reach outside of the pictures of {size[0]} x {size[1]} px"
+            warn(f"{where}: {text}, as far as ({x:.0f}, {y:.0f}): they may be of pictures of another size", "outside")
+    return "pixels"
+
+
+#: Boxes may reach a little outside of the picture: by this share of it; as many may reach farther.
+_MARGIN: Final = 0.1
+
+
+def _size_stated(choice: BoxesChoice) -> tuple[int, int] | None:
+    stated = parse_map(choice.fields).get("picture") if choice.fields else None
+    width, height = stated[0].split("x") if stated else ("0", "0")
+    return (int(width), int(height)) if stated else None
+
+
+def picture_size_near(opened: log.Log, topic: str, pictures: str = "") -> tuple[int, int] | None:
+    """Width and height of the pictures that boxes are about; of others near their topic, or of a calibration there."""
+    from mcaptrack.sources.calibrations import holds_calibrations
+    from mcaptrack.sources.pictures import picture_size
+
+    for name in [*([pictures] if pictures else ()), *_pictures_near(opened, topic)]:
+        if size := picture_size(opened, name):
+            return size
+    calibrations = [channel.topic for channel in opened.channels.values() if holds_calibrations(channel)]
+    for name in sorted(calibrations, key=lambda other: (-_shared(other, topic), other)):
+        for message in _samples(opened, name, message_type_of(opened, name), 1):
+            if message.width and message.height:
+                return int(message.width), int(message.height)
+    return None
+
+
+def _pictures_near(opened: log.Log, topic: str) -> list[str]:
+    from mcaptrack.sources.foreign.picture_messages import holds_pictures
+
+    topics = [channel.topic for channel in opened.channels.values() if holds_pictures(channel) and channel.messages]
+    return sorted(topics, key=lambda other: (-_shared(other, topic), other))
+
+
+def picture_stamp_of(message: Any) -> int | None:
+    """The stamp in ns of the picture of a message: of its ``image_header`` (darknet), or its own; None if unset."""
+    about = getattr(message, "image_header", None)
+    try:
+        stamp_ns = stamp_of(message) if about is None else stamp_of(SimpleNamespace(header=about))
+    except (AttributeError, TypeError, ValueError):
+        return None
+    return stamp_ns or None
+
+
+def _times_of_pictures(
+    opened: log.Log, topic: str, log_ns: Sequence[int], stamps_ns: Sequence[int | None]
+) -> tuple[Sequence[int], str, str]:
+    """The log times of the pictures that boxes are about, by their stamps, the channel of these pictures, and the
+    clock.
+
+    Their own log times if no channel has such pictures. A picture that was not recorded is as late as the others.
+    """
+    from mcaptrack.sources.foreign.picture_messages import stamps
+
+    if all(stamp in (None, at_ns) for stamp, at_ns in zip(stamps_ns, log_ns, strict=True)):
+        return log_ns, "", "log times"
+    near = _pictures_near(opened, topic)
+    for pictures in near:
+        try:
+            shown_ns = opened.times(pictures)
+            is_made = Provenance.from_metadata(opened.channel(pictures).metadata)
+            taken_ns = shown_ns if is_made else stamps(opened, pictures)
+        except McaptrackError:
+            continue  # pictures that can't be read have no stamps
+        at = dict(zip(reversed(taken_ns.tolist()), reversed(shown_ns.tolist()), strict=True))
+        if 2 * sum(stamp in at for stamp in stamps_ns) > len(stamps_ns):
+            late_ns = int(np.median(shown_ns - taken_ns))
+            pairs = zip(stamps_ns, log_ns, strict=True)
+            t_ns = [own if stamp is None else at.get(stamp, max(stamp + late_ns, 0)) for stamp, own in pairs]
+            return t_ns, pictures, f"stamps of the pictures of {pictures}"
+    if near:
+        late_s = np.median([(own - stamp) / NS_PER_S for stamp, own in zip(stamps_ns, log_ns, strict=True) if stamp])
+        said = f"boxes are taken at their log times, {late_s:.3g} s after their stamps, which no picture has"
+        warn(f"{opened.path}: {topic}: {said}", "clock")
+    return log_ns, "", "log times"
+
+
+def _shared(topic: str, other: str) -> int:
+    """The number of parts of two topics that are the same, from the first on."""
+    pairs = zip(topic.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+# Messages of a channel
+
+
+def decoded_messages(
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
+) -> Iterator[tuple[log.Message, Any]]:
+    """The messages of a channel with what the function that ``make`` makes for their type gives.
+
+    Raises McaptrackError, with topic and time.
+    """
+    read = message_reader(opened, topic, make)
+    return ((message, read(message)) for message in opened.timed(topic))
+
+
+def message_reader(
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
+) -> Callable[[log.Message], Any]:
+    """A function that decodes messages of a channel; both raise errors as ``decoded_messages`` does."""
+    try:
+        decode = make(message_type_of(opened, topic))
+    except McaptrackError as error:
+        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
+
+    def read(message: log.Message) -> Any:
+        try:
+            return decode(message.payload)
+        except McaptrackError as error:
+            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
+
+    return read

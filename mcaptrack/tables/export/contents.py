@@ -27,7 +27,7 @@ from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
-from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes, holds_boxes_3d
+from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
 
@@ -261,7 +261,7 @@ class LogTables:
         ours = log.topics_with_schema(self.opened, [schema.name])
         found_topics = [channel.topic for channel in ours if channel.holds(schema)]
         if schema is DETECTIONS:
-            found_topics += [topic for topic in self.opened.channels if holds_boxes(self.opened, topic)]
+            found_topics += [topic for topic in self.opened.channels if foreign.holds_boxes(self.opened, topic)]
         return sorted(found_topics)
 
     def source(self, name: str) -> str:
@@ -347,7 +347,7 @@ class LogTables:
 
     def _frames(self, topic: str) -> FrameColumns:
         if topic not in self._kept:
-            if holds_boxes(self.opened, topic):
+            if foreign.holds_boxes(self.opened, topic):
                 self._kept[topic] = self._boxes(topic)
                 return self._kept[topic]
             schema = self.opened.channel(topic).schema
@@ -360,7 +360,7 @@ class LogTables:
     def _boxes(self, topic: str) -> FrameColumns:
         """Foreign boxes; none, and a note, if they can't be read: the other tables don't depend on them."""
         try:
-            frames, self._class_names[topic], _ = self._boxes_read.read(self.opened, topic)
+            frames, self._class_names[topic], *_ = self._boxes_read.read(self.opened, topic)
         except McaptrackError as error:
             self._note("detections", f"{error}; no boxes of {topic} are in the table")
             times = enumerate(self.opened.times(topic).tolist())

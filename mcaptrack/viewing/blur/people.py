@@ -474,8 +474,8 @@ def _people(opened: log.Log, topic: str) -> tuple[Schema, Ints, Ints, Ints, Floa
     schema = next((candidate for candidate in (TRACKS, DETECTIONS) if channel.holds(candidate)), None)
     if schema is not None:
         frames = opened.frame_columns(topic, schema)
-    elif foreign.holds_detections(channel):
-        schema, named = DETECTIONS, foreign.named_detections(opened, topic)
+    elif foreign.holds_boxes(opened, topic, in_space=False):
+        schema, named = DETECTIONS, named_detections(opened, topic)
         frames, names = named.frames, names | named.classes
     else:
         return None
