@@ -199,7 +199,7 @@ def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Read
     try:
         if not choice.fields and (special := _special(name)):
             if name in BUILT_IN[_KIND]:
-                return _of_drawings(special, _samples(opened, channel.topic, kind), words, person)
+                return _of_drawings(special, _samples(opened, channel.topic, special.read), words, person)
             return special
     except McaptrackError as error:
         warn(f"{error}; messages of {channel.topic} are not read", "other")
@@ -207,7 +207,7 @@ def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Read
     if NO_THINGS.fullmatch(name) and not choice.fields:
         return None
     try:
-        shape = shape_of_type(kind) or _shape_of(_samples(opened, channel.topic, kind))
+        shape = shape_of_type(kind) or _shape_of(_samples(opened, channel.topic))
         reader = fields_reader(name, shape, choice.fields)
     except McaptrackError as error:
         if choice.fields:
@@ -216,21 +216,19 @@ def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Read
     if reader is None:
         return None
     if reader.fields.in_picture and reader.in_space:  # of both the one that is filled in
-        centres = [
-            box.centre for message in _samples(opened, channel.topic, kind) for box in reader.in_frame(message).boxes
-        ]
+        centres = [box.centre for message in _samples(opened, channel.topic, reader.in_frame) for box in message.boxes]
         reader.in_space = not centres or any(any(centre) for centre in centres)
     known = KNOWN.get(name)
     is_certain = known is not None or reader.fields.is_certain or bool(choice.fields or person)
     return Reading(reader.in_space, reader.read, reader.fields, is_certain, person, known)
 
 
-def _of_drawings(special: Reading, messages: Sequence[Any], words: Sequence[str], person: str) -> Reading | None:
+def _of_drawings(special: Reading, messages: Sequence[Message3d], words: Sequence[str], person: str) -> Reading | None:
     """The way drawings are read; None if there is no box among the first ones.
 
     What is round may be a mark of anything, where nothing names it.
     """
-    boxes = [box for message in messages for box in special.read(message).boxes]
+    boxes = [box for message in messages for box in message.boxes]
     is_certain = any(box.has_heading for box in boxes) or any(THINGS.fullmatch(word) for word in words)
     is_certain |= any(is_person(box.class_name) for box in boxes)
     return special._replace(is_certain=is_certain, class_name=person) if boxes else None
@@ -241,13 +239,18 @@ def _shape_of(messages: Sequence[Any]) -> FieldShape:
     return shape_of_message(list(messages))._replace(count=None)
 
 
-def _samples(opened: log.Log, topic: str, kind: MessageType, most: int = _TRIED) -> list[Any]:
-    """The first messages of a channel; none if they can't be decoded."""
+def _samples(
+    opened: log.Log, topic: str, convert: Callable[[Any], Any] = lambda message: message, most: int = _TRIED
+) -> list[Any]:
+    """The first messages of a channel, converted, up to one that can't be read."""
+    out = []
     try:
-        decode = decoder_with_errors(kind, lambda message: message)
-        return [decode(message.payload) for message in islice(opened.timed(topic), most)]
+        decode = decoder_with_errors(message_type_of(opened, topic), convert)
+        for message in islice(opened.timed(topic), most):
+            out.append(decode(message.payload))  # noqa: PERF401  # what was read before an error stays
     except McaptrackError:
-        return []
+        pass  # reading the channel says why
+    return out
 
 
 @lru_cache(maxsize=256)
@@ -566,9 +569,9 @@ def picture_size_near(opened: log.Log, topic: str, pictures: str = "") -> tuple[
             return size
     calibrations = [channel.topic for channel in opened.channels.values() if holds_calibrations(channel)]
     for name in sorted(calibrations, key=lambda other: (-_shared(other, topic), other)):
-        for message in _samples(opened, name, message_type_of(opened, name), 1):
-            if message.width and message.height:
-                return int(message.width), int(message.height)
+        for size in _samples(opened, name, lambda message: (int(message.width), int(message.height)), 1):
+            if all(size):
+                return size  # type: ignore[no-any-return]
     return None
 
 

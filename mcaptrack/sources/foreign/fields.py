@@ -393,8 +393,9 @@ def _vectors(shape: FieldShape, words: Sequence[str], depth: int = 0) -> Iterato
     """The paths of points: the type itself, and in fields with such names, the likeliest first."""
     if _axes(shape):
         yield ()
-    for word in words if depth < 4 else ():
-        name, inner = _members(shape).get(word, ("", _NOTHING))
+    members = _members(shape) if depth < 4 else {}
+    for word in filter(members.__contains__, words):
+        name, inner = members[word]
         yield from ((name, *path) for path in _vectors(inner, words, depth + 1))
 
 
