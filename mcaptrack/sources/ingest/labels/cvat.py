@@ -100,6 +100,17 @@ def _member(path: Path, names: list[str]) -> str:
     raise McaptrackError(f"{path} is a zip file without the {_MEMBER} of CVAT: {content}; unpack other formats")
 
 
+#: What else XML begins with: what it is, and how it becomes something that is read.
+_OTHER_XML: Final = {
+    "fcd-export": "this is SUMO's; its xml2csv.py makes CSV of it, which is read",
+    "sequence": "this is UA-DETRAC's; convert it to MOTChallenge or CSV (frame num, target id, box)",
+}
+
+
+def _convert(name: str) -> str:
+    return f"; {_OTHER_XML[name]}" if name in _OTHER_XML else ""
+
+
 def _listed(names: list[str]) -> str:
     return list_names([name[:60] for name in names], _SHOWN)
 
@@ -146,7 +157,9 @@ class _Parser(XmlReader):
         if len(self.names) > _MAX_DEPTH:
             self.fail("nested deeper than annotations of CVAT are")
         if len(self.names) == 1 and name != "annotations":
-            self.fail(f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT are read")
+            self.fail(
+                f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT and <annotation> of Pascal VOC or LabelMe are read{_convert(name)}"
+            )
         if "meta" in self.names[:2]:
             self._text = []
         elif name == _TRACK and len(self.names) == 2:

@@ -6,6 +6,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -13,8 +14,9 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape, files_in
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import ClassNames, Numbers, as_boxes, check_columns, read_numbers
+from mcaptrack.sources.ingest.labels.text import ClassNames, Numbers, as_boxes, check_columns, lines_of, read_numbers
 
 _COLUMNS: Final = (
     "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
@@ -30,6 +32,8 @@ _SITTING: Final = ("person_sitting", "person")
 _REGION: Final = "dontcare"
 #: The frame of reference of boxes in space: of the camera, with z up.
 _FRAME_ID: Final = "camera_link"
+#: So many files of a folder tell whether it is of this kind.
+_LOOKED_AT: Final = 100
 
 
 def _rows(file: LabelFile) -> tuple[Numbers, dict[int, str]]:
@@ -111,3 +115,29 @@ class Kitti3d(Format):
         axes = "x is forward, y left, z up (in the file x is right, y down, z forward); positions are centres of boxes"
         table.remark(f": {axes}")
         return table.take(~(is_region | has_no_box))
+
+
+class KittiFrames(PictureFormat):
+    """Folders of KITTI's detection labels, a file for each picture, as DeepStream writes them, too."""
+
+    name, title = "kitti-frames", "KITTI detection"
+    row = "a folder of text files, one for each picture: `type [id] truncated occluded alpha left top right bottom ... [score]`"
+    reads_folders = True
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether the first file of a folder that has rows begins so."""
+        texts = (LabelFile(path).row.split() for path in file.entries[:_LOOKED_AT] if path.suffix.lower() == ".txt")
+        cells = next(filter(None, texts), [])
+        return len(cells) in (15, 16, 17) and cells[0][:1].isalpha()
+
+    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+        """The pictures of a folder."""
+        for path in files_in(file.path, ".txt"):
+            picture = Picture(path.name, [], where=str(path))
+            for number, line in lines_of(path):
+                picture.where, cells = f"{path}:{number}", line.split()
+                check_columns(cells, 15, 17)
+                track = cells.pop(1) if len(cells) == 17 else None
+                (box,) = as_boxes(np.array([cells[4:8]], float)).tolist()
+                picture.shapes.append(Shape(box, cells[0], cells[15] if len(cells) == 16 else None, track))
+            yield picture
