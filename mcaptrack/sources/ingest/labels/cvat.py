@@ -102,13 +102,9 @@ def _member(path: Path, names: list[str]) -> str:
 
 #: What else XML begins with: what it is, and how it becomes something that is read.
 _OTHER_XML: Final = {
-    "fcd-export": "this is SUMO's; its xml2csv.py makes CSV of it, which is read",
-    "sequence": "this is UA-DETRAC's; convert it to MOTChallenge or CSV (frame num, target id, box)",
+    "fcd-export": ", of SUMO: its tool xml2csv.py makes CSV of it, which is read",
+    "sequence": ", of UA-DETRAC: write its boxes as MOTChallenge or CSV (frame,id,left,top,width,height)",
 }
-
-
-def _convert(name: str) -> str:
-    return f"; {_OTHER_XML[name]}" if name in _OTHER_XML else ""
 
 
 def _listed(names: list[str]) -> str:
@@ -157,9 +153,8 @@ class _Parser(XmlReader):
         if len(self.names) > _MAX_DEPTH:
             self.fail("nested deeper than annotations of CVAT are")
         if len(self.names) == 1 and name != "annotations":
-            self.fail(
-                f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT and <annotation> of Pascal VOC or LabelMe are read{_convert(name)}"
-            )
+            read = "of XML, <annotations> of CVAT and <annotation> of Pascal VOC or LabelMe are read"
+            self.fail(f"XML that begins with <{name[:40]}>{_OTHER_XML.get(name, '')}; {read}")
         if "meta" in self.names[:2]:
             self._text = []
         elif name == _TRACK and len(self.names) == 2:

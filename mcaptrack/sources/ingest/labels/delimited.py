@@ -169,14 +169,13 @@ def with_lists(table: Opened) -> Opened:
     on. Tables with other columns of boxes stay as they are.
     """
     plain, header = _plain(table.header), table.header
-    at, match = next(
-        ((at, match) for at, name in enumerate(plain) if name and (match := _LIST.fullmatch(name))), (0, None)
-    )
-    if match is None or any(name in HEADERS[key] for key in ("x", "cx") for name in plain):
+    lists = [(at, match[2]) for at, name in enumerate(plain) if name and (match := _LIST.fullmatch(name))]
+    if not lists or any(name in HEADERS[key] for key in ("x", "cx") for name in plain):
         return table
-    name, keys = header[at], _LISTS[match[2]]
+    at, order = lists[0]
+    name, keys = header[at], _LISTS[order]
     note = f"{name} holds {'left, top, width, height' if keys == 'xywh' else ', '.join(keys)}"
-    note += f"; a column with the name {name}_xyxy holds corners" if not match[2] else ""
+    note += f"; a column with the name {name}_xyxy holds corners" if not order else ""
 
     def split_list(line: str) -> list[str]:
         parts = table.split(line)
@@ -352,6 +351,7 @@ def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def read_table(table: Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
+    """The rows of a table of boxes in pictures, as those of the format ``name``. Raises McaptrackError."""
     path, header = table.path, table.header
     places = choose_columns(table.where, header, chosen)
     frames, ids = FrameNames(), TrackIds()
@@ -457,8 +457,8 @@ HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "y2": ("y2", "ymax", "maxy", "bottom", "bbbottom", "bboxbottom", "bboxy2", "bboxymax", "ybr", "ybottom"),
     "cx": ("cx", "xc", "xcenter", "xcentre", "centerx", "centrex"),
     "cy": ("cy", "yc", "ycenter", "ycentre", "centery", "centrey"),
-    "frame": ("frame", "frameindex", "frameidx", "framenumber", "frameno", "framenum", "frameid", "fr", "image", "imageid",
-              "imagename", "filename", "file"),
+    "frame": ("frame", "frameindex", "frameidx", "framenumber", "frameno", "framenum", "frameid", "fr", "image",
+              "imageid", "imagename", "filename", "file"),
     "t": ("t", "time", "timestamp", "seconds", "stamp", "%time", "simtime", *_WITH_UNITS),
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
@@ -547,9 +547,8 @@ def choose_columns(where: str, header: Sequence[str], chosen: Mapping[str, str])
         complete.sort(key=lambda pair: -len(chosen.keys() & pair))
         if not complete:
             x, y = (_fitting(_HEADERS_3D[key], plain, {}) or _by_end(key, header, {}) for key in _PLACE[:2])
-            metres = (
-                f"of positions in metres with `columns='x_m={header[x[0]]},y_m={header[y[0]]}'`, " if x and y else ""
-            )
+            metres = f"x_m={header[x[0]]},y_m={header[y[0]]}" if x and y else ""
+            metres = f"of positions in metres with `columns={metres!r}`, " if metres else ""
             raise McaptrackError(
                 f"{where}: no columns for {' and '.join(axis[0])} (or {' and '.join(axis[1])}) of boxes; {shown}; name "
                 f"those {metres}of boxes in pixels with `columns='x=left,y=top,w=width,h=height,frame=frame'`"
@@ -667,6 +666,7 @@ def are_metres(header: Sequence[str], chosen: Mapping[str, str]) -> bool:
 
 
 def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
+    """The rows of a table of boxes or positions in metres. Raises McaptrackError."""
     path, places = table.path, _choose_columns_3d(table.where, table.header, chosen)
     times, ids = list[int](), list[str]()
 
@@ -699,9 +699,8 @@ def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
         id=track_id, boxes_m=boxes, score=cells.column("score"), class_id=np.nan_to_num(kind, nan=NO_CLASS),
         velocity=cells.stacked(_VELOCITY), remarks=remarks,
     )  # fmt: skip
-    rate = (
-        next(filter(None, map(_RATE.match, comments_of(path))), None) if table.delimiter and "t" not in places else None
-    )
+    comments = comments_of(path) if table.delimiter and "t" not in places else []
+    rate = next(filter(None, map(_RATE.match, comments)), None)
     if rate is not None and float(rate[1]) > 0:
         rows.frame, facts.is_timed = np.rint(rows.frame * NS_PER_S / float(rate[1])), True
         rows.remark(f": times by its {rate[0]}")

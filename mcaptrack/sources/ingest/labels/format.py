@@ -162,9 +162,9 @@ class LabelFile:
         """The error for a file of none of these formats, with what it is instead."""
         if self.is_folder:
             held = list_names([path.name for path in self.entries], _LISTED) or "nothing"
-            looked = f"in {', '.join(PLACES)}, and in itself for files of {formats}"
+            looked = f"looked in {', '.join(PLACES)}, and in itself for files of {formats}"
             return McaptrackError(
-                f"{self.path} holds no images ({', '.join(IMAGE_SUFFIXES)}) and no labels that are known; looked {looked}; "
+                f"{self.path} holds no images ({', '.join(IMAGE_SUFFIXES)}) and no labels that are known; {looked}; "
                 f"it holds {held}; give the label file, or the folder that label files lie in, with `label_format=`"
             )
         if self.is_json and self.json != []:

@@ -121,7 +121,7 @@ class KittiFrames(PictureFormat):
     """Folders of KITTI's detection labels, a file for each picture, as DeepStream writes them, too."""
 
     name, title = "kitti-frames", "KITTI detection"
-    row = "a folder of text files, one for each picture: `type [id] truncated occluded alpha left top right bottom ... [score]`"
+    row = "a folder of text files, one for each picture: `type [id] truncated occluded alpha left top right bottom ...`"
     reads_folders = True
 
     def recognises(self, file: LabelFile) -> bool:

@@ -37,7 +37,7 @@ def box_of_mask(mask: Mapping[str, Any]) -> list[float]:
 
 
 def _unpacked(text: str) -> list[int]:
-    """Runs of a text: numbers of 5 bits in each character, the sixth says that more follow; differences from the third."""
+    """The runs in a text: 5 bits in a character, a sixth if more follow; from the third on, differences to two before."""
     counts, value, shift = list[int](), 0, 0
     for character in text:
         bits = ord(character) - 48

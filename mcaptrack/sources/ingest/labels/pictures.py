@@ -78,7 +78,7 @@ class PictureFormat(Format):
     is_normalised: ClassVar[bool] = False
 
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
-        """The pictures of a file or a folder; KeyError, TypeError, ValueError and AttributeError say that it is wrong."""
+        """The pictures of a file or a folder. Raises KeyError, TypeError, ValueError or AttributeError if one is wrong."""
         raise NotImplementedError
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
@@ -120,12 +120,11 @@ class PictureFormat(Format):
         facts.states_labelled, facts.first_frame = True, int(frames.min())
         if names:
             facts.names, facts.numbering, facts.named_by = names, {}, "file"
-        stated = (
-            (frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True) if picture.size
-        )
-        facts.sizes = {frame: (float(width), float(height)) for frame, (width, height) in stated}
-        if len(sizes := set(facts.sizes.values())) == 1:
-            ((width, height),) = sizes
+        sizes = ((frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True))
+        stated = {frame: (float(size[0]), float(size[1])) for frame, size in sizes if size}
+        facts.sizes = {frame: size for frame, size in stated.items() if min(size) > 0} or None
+        if len(different := set(stated.values())) == 1 and facts.sizes:
+            ((width, height),) = different
             facts.size = (int(width), int(height))
         track_id, said = ids.of(path, rows[:, 7])
         regions = [number for number, name in names.items() if name.lower() == _REGION]

@@ -45,11 +45,8 @@ class Records(Format):
             rows = file.records if file.is_json else []
         except McaptrackError:
             return False
-        return (
-            bool(rows)
-            and isinstance(rows[0], dict)
-            and any(not isinstance(value, list | dict) for value in rows[0].values())
-        )
+        values = rows[0].values() if rows and isinstance(rows[0], dict) else ()
+        return any(not isinstance(value, list | dict) for value in values)
 
     def holds_3d(self, file: LabelFile, columns: Mapping[str, str]) -> bool:
         """Whether the columns are those of boxes or positions in metres."""

@@ -36,9 +36,8 @@ class Via(PictureFormat):
             for entry in _pictures(file.json):
                 regions = entry["regions"]
                 regions = [*regions.values()] if isinstance(regions, dict) else regions
-                yield _picture(
-                    entry["filename"], ((each["shape_attributes"], each["region_attributes"]) for each in regions)
-                )
+                shapes = ((each["shape_attributes"], each["region_attributes"]) for each in regions)
+                yield _picture(entry["filename"], shapes)
             return
         by_name: dict[str, list[tuple[Any, Any]]] = {}
         for row in csv.DictReader(line for _, line in file.lines()):

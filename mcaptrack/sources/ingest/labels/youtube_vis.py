@@ -42,6 +42,6 @@ class YoutubeVis(PictureFormat):
             label = categories.get(track["category_id"], track["category_id"])
             for picture, box in zip(pictures, of_pictures, strict=True):
                 if box:
-                    box = box_of_mask(box) if isinstance(box, dict) else box
-                    picture.shapes.append(Shape(box, label, track.get("score"), track.get("id", number)))
+                    sides = box_of_mask(box) if isinstance(box, dict) else box
+                    picture.shapes.append(Shape(sides, label, track.get("score"), track.get("id", number)))
         yield from pictures
