@@ -69,6 +69,7 @@ _ZIP: Final = b"PK\x03\x04"
 #: A zip file without members.
 _EMPTY_ZIP: Final = b"PK\x05\x06"
 _MEMBER: Final = "annotations.xml"
+_WORKBOOK: Final = "xl/workbook.xml"
 _SHOWN: Final = 5
 
 
@@ -96,6 +97,10 @@ def _member(path: Path, names: list[str]) -> str:
         return members[0]
     if members:
         raise McaptrackError(f"{path} holds {len(members)} of {_MEMBER}; give each as a file ({_listed(members)})")
+    if _WORKBOOK in names:
+        raise McaptrackError(
+            f"{path} is a workbook of Excel; save its sheet as CSV or Parquet, which are read as labels"
+        )
     content = f"it holds {_listed(names)}" if names else "it is empty"
     raise McaptrackError(f"{path} is a zip file without the {_MEMBER} of CVAT: {content}; unpack other formats")
 

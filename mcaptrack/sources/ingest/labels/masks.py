@@ -37,7 +37,7 @@ def box_of_mask(mask: Mapping[str, Any]) -> list[float]:
 
 
 def _unpacked(text: str) -> list[int]:
-    """The runs in a text: 5 bits in a character, a sixth if more follow; from the third on, differences to two before."""
+    """The runs in a text: 5 bits in a character, a sixth if more follow; the fourth and later are differences."""
     counts, value, shift = list[int](), 0, 0
     for character in text:
         bits = ord(character) - 48

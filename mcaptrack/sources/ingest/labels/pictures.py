@@ -78,7 +78,7 @@ class PictureFormat(Format):
     is_normalised: ClassVar[bool] = False
 
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
-        """The pictures of a file or a folder. Raises KeyError, TypeError, ValueError or AttributeError if one is wrong."""
+        """The pictures of a file or a folder. KeyError, TypeError, ValueError and AttributeError say what is wrong."""
         raise NotImplementedError
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
