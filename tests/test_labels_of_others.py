@@ -303,7 +303,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], str, str]] = {
 def test_one_scene_says_the_same_in_every_kind_of_file(name, tmp_path):
     write, label_format, holds = KINDS[name]
     path = write(tmp_path)
-    labels = read_labels(path, wanted=WantedClasses("all"))
+    labels = read_labels(path, role=None, wanted=WantedClasses("all"))
     assert labels.format == label_format
     # A mask of a box is counted in pixels, and boxes in shares of a picture of 640x480 are shares.
     scale = np.array([*SIZE, *SIZE]) if labels.is_normalised else np.ones(4)
@@ -334,7 +334,7 @@ def test_a_mask_has_the_box_that_pycocotools_gives(tmp_path):
 
 
 def places(path: Path) -> tuple[BoxTable, list[list[float]]]:
-    labels = read_labels(path)
+    labels = read_labels(path, role=None)
     assert labels.boxes_m is not None
     return labels, labels.boxes_m[:, :2].tolist()
 
@@ -389,7 +389,7 @@ def test_highd_has_corners_and_ind_has_centres_in_metres(tmp_path):
 def test_a_column_of_times_may_hold_dates(cell, t_ns, tmp_path):
     labels, _ = places(written(tmp_path / "a.csv", f"time,x_m,y_m,id\n{cell},1,2,3\n"))
     assert labels.frame.tolist() == [t_ns]
-    labels = read_labels(written(tmp_path / "b.csv", f"time,x,y,w,h\n{cell},1,2,3,4\n"))
+    labels = read_labels(written(tmp_path / "b.csv", f"time,x,y,w,h\n{cell},1,2,3,4\n"), role=None)
     assert labels.times_s.tolist() == [t_ns / 1e9]
 
 

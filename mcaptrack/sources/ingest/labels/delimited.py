@@ -165,8 +165,8 @@ _NUMBER: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 def with_lists(table: Opened) -> Opened:
-    """A table in which a column of boxes, as lists of four numbers, is replaced by four columns: bbox by bbox.x and so
-    on. Tables with other columns of boxes stay as they are.
+    """A table in which four columns, bbox.x and so on, replace one that holds boxes as lists of four numbers, if there
+    are no others of boxes.
     """
     plain, header = _plain(table.header), table.header
     lists = [(at, match[2]) for at, name in enumerate(plain) if name and (match := _LIST.fullmatch(name))]
@@ -186,7 +186,7 @@ def with_lists(table: Opened) -> Opened:
             raise ValueError(f"the column {name} holds {parts[at][:40]!r}, which are no four numbers")
         return [*parts[:at], *numbers, *parts[at + 1 :]]
 
-    names = [*header[:at], *(f"{name}.{key}" for key in keys), *header[at + 1 :]]
+    names = [*header[:at], *(f"bbox.{key}" for key in keys), *header[at + 1 :]]
     return table._replace(header=names, split=split_list, note=note)
 
 
@@ -276,6 +276,8 @@ def is_table(file: LabelFile) -> bool:
         if header_of(file.path, file.row):
             return True
         names = comment_header(file.path, file.row)
+        if are_metres(names, {}):
+            return True
         columns = choose_columns(str(file.path), names, {}) if names else _MOT_COLUMNS
     except McaptrackError:
         return False
@@ -463,7 +465,7 @@ HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
     "name": ("classname", "categoryname", "labelname", "name"),
-    "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid", "pedestrianid"),
+    "id": ("trackid", "trackerid", "pedestrianid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid"),
 }  # fmt: skip
 #: Keys of which several columns may fit; the first header of the list above is read.
 _RANKED: Final = ("frame", "t", "class", "id")

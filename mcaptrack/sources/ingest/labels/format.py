@@ -104,6 +104,9 @@ class LabelFile:
 
     def refuse_binary(self) -> None:
         """Raise McaptrackError for a kind of file that never holds labels, with what to do."""
+        if not self.is_folder and not self.head:
+            with opened(self.path):  # says so if it is packed and damaged
+                pass
         for magic, kind in _OTHERS.items():
             if self.head.startswith(magic):
                 raise McaptrackError(f"{self.path} is {kind}: that is read as labels")
@@ -119,14 +122,22 @@ class LabelFile:
         return read_json(self.path, "JSON", _MAX_BYTES, opened)
 
     @cached_property
+    def has_json_lines(self) -> bool:
+        """Whether each of its first two lines is a JSON object."""
+        lines = lines_of(self.path, MAX_LINE) if self.is_json else iter(())
+        try:
+            first = [line.strip() for _, line in islice(lines, 2)]
+        except McaptrackError:
+            return False
+        return len(first) == 2 and all(line[0] == "{" and line[-1] == "}" for line in first)
+
+    @cached_property
     def records(self) -> list[Any]:
         """Its content as a list: of JSON lines, of a JSON list, or of tables as pandas writes them; none of others.
 
         Raises McaptrackError if a line is no JSON.
         """
-        lines = lines_of(self.path, MAX_LINE) if self.is_json else iter(())
-        first = [line for _, line in islice(lines, 2)]
-        if len(first) == 2 and all(line.strip()[:1] == "{" and line.strip()[-1:] == "}" for line in first):
+        if self.has_json_lines:
             return [self._of_line(number, line) for number, line in lines_of(self.path, MAX_LINE)]
         content = self.json if self.is_json else None
         if not isinstance(content, dict):

@@ -24,10 +24,10 @@ class Labelme(PictureFormat):
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The pictures of a file or of a folder."""
         for path in files_in(file.path, ".json") if file.is_folder else [file.path]:
-            content = LabelFile(path).json
+            content, self.where = LabelFile(path).json, str(path)
             sides = content.get("imageWidth"), content.get("imageHeight")
             name = str(content.get("imagePath") or path.name)
-            picture = Picture(name, [], sides if all(sides) else None, str(path))
+            picture = Picture(name, [], sides if all(sides) else None)
             for each in content["shapes"]:
                 kind = each.get("shape_type", "polygon")
                 if kind in ("rectangle", "polygon", "rotation"):

@@ -67,9 +67,9 @@ class Mots(PictureFormat):
         """The frames of a file."""
         rows = ((number, line.split()) for number, line in file.lines())
         for frame, group in groupby(rows, key=lambda row: row[1][0]):
-            picture = Picture(frame, [], where=str(file.path))
+            picture = Picture(frame, [])
             for number, (_, track, kind, height, width, counts) in group:
-                picture.where, picture.size = f"{file.path}:{number}", (width, height)
+                self.where, picture.size = f"{file.path}:{number}", (width, height)
                 box = box_of_mask({"size": (height, width), "counts": counts})
                 picture.shapes.append(Shape(box, _NAMES.get(kind, kind), None, track))
             yield picture

@@ -41,23 +41,21 @@ class Shape:
 
 @dataclass
 class Picture:
-    """A picture: its name, or its number; its width and height in px, if they are known; what is in it.
-
-    ``where`` is its place in messages; ``other`` counts shapes by kind that are no boxes.
+    """A picture: its name, or its number; its width and height in px, if they are known; what is in it; and the number
+    of shapes by kind that are no boxes.
     """
 
     name: str
     shapes: list[Shape]
     size: tuple[Any, Any] | None = None
-    where: str = ""
     other: Counter[str] = field(default_factory=Counter)
 
 
 def around(points: Sequence[Any]) -> list[float]:
     """The box of left, top, width, height around points (K, 2). Raises ValueError if there are none."""
     xy = np.asarray(points, float).reshape(-1, 2)
-    if not len(xy):
-        raise ValueError("a shape without points")
+    if not len(xy) or not np.isfinite(xy).all():
+        raise ValueError("a shape without points, or with one that is missing")
     return [*xy.min(axis=0).tolist(), *np.ptp(xy, axis=0).tolist()]
 
 
@@ -71,11 +69,12 @@ def files_in(folder: Path, suffix: str) -> list[Path]:
 
 class PictureFormat(Format):
     """Base of formats that describe pictures one by one: a subclass yields these. ``is_normalised``: boxes are in
-    shares of the picture's size.
+    shares of the picture's size, and ``where`` is the place that is read, if it isn't the file.
     """
 
     name: ClassVar[str]
     is_normalised: ClassVar[bool] = False
+    where: str = ""
 
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The pictures of a file or a folder. KeyError, TypeError, ValueError and AttributeError say what is wrong."""
@@ -85,10 +84,9 @@ class PictureFormat(Format):
         """The boxes of all pictures. The numbers in their names are those of frames, otherwise their order."""
         rows, places, pictures = array("d"), list[str](), list[Picture]()
         names, ids, other = ClassNames(), TrackIds(), Counter[str]()
-        read, where = self.pictures(file), str(file.path)
         try:
-            for picture in read:
-                where = picture.where or f"{file.path}: {picture.name[:_MAX_NAME]}"
+            for picture in self.pictures(file):
+                where = self.where or f"{file.path}: {picture.name[:_MAX_NAME]}"
                 for shape in picture.shapes:
                     left, top, width, height = (float(number) for number in shape.box)
                     label = names.number(str(shape.label)) if shape.label not in (None, "") else NO_CLASS
@@ -102,7 +100,9 @@ class PictureFormat(Format):
                     raise McaptrackError(f"{file.path} has more than {MAX_ROWS} rows; give it in parts")
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             text = f"no {error}" if isinstance(error, KeyError) else str(error)
-            raise McaptrackError(f"{where}: not {self.title} ({self.row.strip('`')}): {text[:200]}") from None
+            raise McaptrackError(
+                f"{self.where or file.path}: not {self.title} ({self.row.strip('`')}): {text[:200]}"
+            ) from None
         if not pictures:
             raise McaptrackError(f"{file.path} holds no labels of {self.title}")
         table = self._table(file.path, np.frombuffer(rows).reshape(-1, _COLUMNS), pictures, names.names, ids)

@@ -39,7 +39,7 @@ class Records(Format):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a file begins so, or is JSON of rows with more than one value each."""
-        if file.head.startswith((_PARQUET, _ARROW, _STREAM)):
+        if file.head.startswith((_PARQUET, _ARROW, _STREAM)) or file.has_json_lines:
             return True
         try:
             rows = file.records if file.is_json else []

@@ -61,13 +61,13 @@ class Voc(PictureFormat):
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The pictures of a file or of a folder."""
         for path in files_in(file.path, ".xml") if file.is_folder else [file.path]:
-            root = _Tree(path).tree()
+            root, self.where = _Tree(path).tree(), str(path)
             if root.tag != _ROOT:
-                raise ValueError(f"{path.name} begins with <{root.tag[:40]}>")
+                raise ValueError(f"it begins with <{root.tag[:40]}>")
             sides = [root.findtext(f"size/{side}") for side in ("width", "height")]
             sides = sides if all(sides) else [root.findtext(f"imagesize/{side}") for side in ("ncols", "nrows")]
             name = root.findtext("filename") or path.name
-            picture = Picture(name, [], (sides[0], sides[1]) if all(sides) else None, str(path))
+            picture = Picture(name, [], (sides[0], sides[1]) if all(sides) else None)
             for each in root.iterfind("object"):
                 corners = [each.findtext(f"bndbox/{key}") for key in ("xmin", "ymin", "xmax", "ymax")]
                 points = [[point.findtext("x"), point.findtext("y")] for point in each.iterfind("polygon/pt")]
