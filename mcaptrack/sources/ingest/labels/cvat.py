@@ -169,7 +169,8 @@ class _Parser(XmlReader):
             self._track = _Track(number, self._label(attributes), line)
         elif name == "image" and len(self.names) == 2:
             self._check_task(attributes)
-            self._image = self._whole(attributes.get("id", ""), "the id of an image")
+            id_text = attributes.get("id", str(len(self.images)))  # those of other writers lack it: they are in order
+            self._image = self._whole(id_text, "the id of an image")
             if self._image in self.images:
                 self.fail(f"image {self._image} is there before; give one file for each task")
             self.images[self._image] = None

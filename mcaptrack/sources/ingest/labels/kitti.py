@@ -16,7 +16,15 @@ from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape, files_in
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import ClassNames, Numbers, as_boxes, check_columns, lines_of, read_numbers
+from mcaptrack.sources.ingest.labels.text import (
+    ClassNames,
+    Numbers,
+    as_boxes,
+    check_columns,
+    lines_of,
+    read_numbers,
+    states_number,
+)
 
 _COLUMNS: Final = (
     "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
@@ -63,7 +71,12 @@ class Kitti(Format):
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 17 or 18 columns, and a word in the third."""
         cells = file.cells
-        return len(cells) in (17, 18) and cells[2][:1].isalpha() and cells[2].replace("_", "").isalnum()
+        return (
+            len(cells) in (17, 18)
+            and states_number(cells[0])
+            and cells[2][:1].isalpha()
+            and cells[2].replace("_", "").isalnum()
+        )
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""

@@ -100,9 +100,8 @@ class PictureFormat(Format):
                     raise McaptrackError(f"{file.path} has more than {MAX_ROWS} rows; give it in parts")
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             text = f"no {error}" if isinstance(error, KeyError) else str(error)
-            raise McaptrackError(
-                f"{self.where or file.path}: not {self.title} ({self.row.strip('`')}): {text[:200]}"
-            ) from None
+            what = f"{self.title} ({self.row.strip('`')})"
+            raise McaptrackError(f"{self.where or file.path}: not {what}: {text[:200]}") from None
         if not pictures:
             raise McaptrackError(f"{file.path} holds no labels of {self.title}")
         table = self._table(file.path, np.frombuffer(rows).reshape(-1, _COLUMNS), pictures, names.names, ids)
