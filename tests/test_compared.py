@@ -13,7 +13,10 @@ import pytest
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_files
+from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.sources.ingest import IngestOptions
+from mcaptrack.sources.ingest.labels.frames import Frames
 from mcaptrack.tables.compared import compare_files, pair_files
 from tests.commands import call, printed
 from tests.worlds import boxed, ns
@@ -25,8 +28,8 @@ def write(path: Path, *rows) -> Path:
     return path
 
 
-def scores(tracks: Path, truth: Path, **options) -> tuple[dict, list[str]]:
-    both = compare_files(tracks, truth, **options)
+def scores(tracks: Path, truth: Path, topics=(), **options) -> tuple[dict, list[str]]:
+    both = compare_files(tracks, truth, IngestOptions(**options), topics)
     outcome = evaluate([sequence_of_files("x", tracks, both.ground_truth, both.tracks, 1)], EvaluateOptions(("iou",)))
     return outcome.results[0].to_json(), both.notes + outcome.notes
 
@@ -47,11 +50,21 @@ def test_mot15_and_its_positions_are_no_classes(tmp_path):
     assert (row["MOTA"], row["GT"], row["FN"]) == (1.0, 1, 0)
 
 
-def test_frames_outside_of_the_truth_count_as_trackeval_counts_them(tmp_path):
+def test_frames_outside_of_the_truth_count_as_trackeval_counts_them_where_it_is_of_the_whole_sequence(tmp_path):
     early = [line(n, 9, 300, 0.9) for n in range(1, 4)]
-    truth = write(tmp_path / "gt.txt", *WALK[4:])
-    row, _ = scores(write(tmp_path / "t.txt", *FOUND, *early), truth)
+    truth, found = write(tmp_path / "gt.txt", *WALK[4:]), write(tmp_path / "t.txt", *FOUND, *early)
+    with collected() as warnings:
+        row, _ = scores(found, truth)
+        assert (row["FP"], row["FN"]) == (0, 0)
+    assert [notice.code for notice in warnings] == ["labelled"]
+    assert "frames='5:11'" in warnings[0].message
+    with collected() as warnings:
+        row, _ = scores(found, truth, frame_ranges=Frames.parse(":").ranges)
+        (tmp_path / "seqinfo.ini").write_text("[Sequence]\nseqLength=10\n")
+        other, _ = scores(found, truth)
     assert (row["FP"], row["FN"]) == (7, 0)  # four of the walker before he is labelled, three of a ghost
+    assert other == row
+    assert not warnings
 
 
 def kitti(frame, who, kind, x, *, truncated=0, occluded=0, height=50.0, more=()):
@@ -78,9 +91,11 @@ def test_kitti_counts_pedestrians_and_ignores_its_regions(tmp_path):
 
 def test_frames_that_count_from_0_meet_those_that_count_from_1(tmp_path):
     early = write(tmp_path / "t.txt", *((n - 1, *rest) for n, *rest in FOUND))
-    row, notes = scores(early, write(tmp_path / "gt.txt", *WALK))
+    with collected() as warnings:
+        row, _ = scores(early, write(tmp_path / "gt.txt", *WALK))
     assert (row["FP"], row["FN"], row["MOTA"]) == (0, 0, 1.0)
-    assert any("counts frames from 0" in note for note in notes)
+    assert [notice.code for notice in warnings] == ["clock"]
+    assert "are assumed to be the same picture" in warnings[0].message
 
 
 def test_exported_tables_are_scored(tmp_path):
@@ -268,21 +283,20 @@ def test_files_of_one_format_or_that_count_frames_are_compared_by_frame(found, t
         path.write_text(FORMATS[name])
     counts = {"mot", "kitti"}
     if found == truth or {found, truth} <= counts:
-        both = compare_files(*paths)
+        with collected() as warnings:
+            both = compare_files(*paths)
         for frames in (both.tracks, both.ground_truth):
             assert [len(frame.rows) for frame in frames] == [1, 1]
         assert [frame.t_ns for frame in both.tracks] == [frame.t_ns for frame in both.ground_truth]
-        a, b = (
-            f"{path} counts frames from {int(name == 'mot')}" for path, name in zip(paths, (found, truth), strict=True)
-        )
-        notes = [f"{a}, {b}: their first frames are taken as the same"] * (found != truth)
-        assert both.notes == notes
+        a, b = (f"frame {int(name == 'mot')} of {path}" for path, name in zip(paths, (found, truth), strict=True))
+        text = f"{b} and {a} are assumed to be the same picture; `first_frame=` sets the number"
+        assert [notice.message for notice in warnings] == [text] * (found != truth)
         words = "frames are compared by their numbers, whatever the frames per second"
-        assert compare_files(*paths, fps=Fraction(3)).notes == [words, *notes]
+        assert compare_files(*paths, IngestOptions(fps=Fraction(3))).notes == [words]
     elif "trajnet" in (found, truth) and "sdd" in (found, truth):
         words = r"25 by trajnet.* Stanford Drone|30 by Stanford Drone.* 25 by trajnet"
         with pytest.raises(McaptrackError, match=words):
             compare_files(*paths)
-        both = compare_files(*paths, fps=Fraction(5))
+        both = compare_files(*paths, IngestOptions(fps=Fraction(5)))
         ends = {frames[-1].t_ns for frames in (both.tracks, both.ground_truth)}
         assert (ends, both.notes) == ({ns(2)}, [])

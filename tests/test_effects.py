@@ -89,9 +89,10 @@ def template(template, tmp_path_factory) -> Path:
     (folder / "table.csv").write_text("frame,id,x,y,w,h\n" + "".join(f"{n},1,{n},24,8,16\n" for n in range(30)))
     (folder / "cubes.csv").write_text("t,id,x_m,y_m\n" + "".join(f"{n},1,{n},2\n" for n in range(3)))
     _write_nuscenes(folder / "nuscenes")
-    (folder / "yolo").mkdir()
-    for n in range(30):
-        (folder / "yolo" / f"{n:04}.txt").write_text(f"0 {0.1 + n / 100} 0.5 0.1 0.3\n")
+    for name, more in (("yolo", ""), ("shares", " 0.9 1")):
+        (folder / name).mkdir()
+        for n in range(30):
+            (folder / name / f"{n:04}.txt").write_text(f"0 {0.1 + n / 100} 0.5 0.1 0.3{more}\n")
     (folder / "motion.txt").write_text("".join(f"{n}\t1\t0\t0.5\t0\t1\t0\n" for n in range(30)))
     lens, down = "[40, 0, 31.5, 0, 40, 23.5, 0, 0, 1]", "[0, -2.2, 2.2]"
     (folder / "pose.yml").write_text(f"%YAML:1.0\n---\nK: {lens}\nrvec: {down}\ntvec: [0, 0, 9]\n")

@@ -649,7 +649,7 @@ S = 10**9
 @pytest.mark.parametrize(
     ("frames", "options", "times", "remark", "doubt"),
     [
-        ((0, 2), {"fps": 2}, (0, S), "frame 0 is at 0.000 s", ""),
+        ((0, 2), {"fps": 2}, (0, S // 2, S), "frame 0 is at 0.000 s", ""),  # frame 1 is labelled, too
         ((1, 2), {"fps": 2}, (0, S // 2), "frame 1 is at 0.000 s", "frames begin with 1; frame 1 is assumed"),
         ((4, 5), {"fps": 2}, (3 * S // 2, 2 * S), "frame 1 is at 0.000 s", "frames begin with 4; frame 1 is assumed"),
         ((4, 5), {"fps": 2, "first_frame": 4}, (0, S // 2), "frame 4 is at 0.000 s", ""),

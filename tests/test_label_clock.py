@@ -75,9 +75,14 @@ class World:
         return path
 
     def expected(self, times: list[int]) -> list[tuple[int, int, int]]:
-        """Time, number and how many people, of each labelled picture; those of the sparse formats are every fourth."""
-        step = STEP if self.name in POSITIONS else 1
-        return [(times[k], k, len(self.seen.get(k, []))) for k in range(0, len(times), step)]
+        """Time, number and how many people, of each labelled picture; those of the sparse formats are every fourth.
+
+        Ground truth that isn't of a whole sequence is taken to begin with its first label and to end with its last.
+        """
+        step, first, last = STEP if self.name in POSITIONS else 1, 0, len(times) - 1
+        if self.role == "truth" and not (self.folder / "seqinfo.ini").exists():
+            first, last = min(self.seen), max(self.seen)
+        return [(times[k], k, len(self.seen.get(k, []))) for k in range(first, last + 1, step)]
 
 
 def by_ffmpeg(path: Path) -> list[int]:
@@ -264,17 +269,17 @@ def test_files_that_are_compared_or_tuned_have_the_same_frames(tmp_path, name, r
     every.write_text("".join(f"{k + 1},9,{k},1,2,2\n" for k in range(PICTURES)))
     wanted = {k: len(people) for k, people in world.seen.items()}
     if role == "tracks":
-        both = compare_files(found, every, Fraction(FPS))
+        both = compare_files(found, every, IngestOptions(fps=Fraction(FPS)))
         assert {f.index: len(f.rows) for f in both.tracks if len(f.rows)} == wanted
         assert {f.index: f.rows["x_px"].tolist() for f in both.ground_truth} | {
             f.index: [f.index] for f in both.tracks
         } == {f.index: [f.index] for f in both.ground_truth}
     elif role == "detections":
-        tuned = detections_and_ground_truth(found, every, Fraction(FPS), None, "foot")
+        tuned = detections_and_ground_truth(found, every, IngestOptions(fps=Fraction(FPS)))
         assert [(f.t_ns, f.index) for f in tuned.ground_truth] == [(t, k) for k, t in enumerate(CLIP_NS)]
         assert [(f.t_ns, f.index, len(f.rows)) for f in tuned.detections] == world.expected(CLIP_NS)
     else:
-        frames = label_frames({"truth": found, "tracks": every}, Fraction(FPS), None, "foot")["truth"]
+        frames = label_frames({"truth": found, "tracks": every}, IngestOptions(fps=Fraction(FPS)))["truth"]
         assert [(f.t_ns, f.index, len(f.rows)) for f in frames] == world.expected(CLIP_NS)
 
 
@@ -322,7 +327,7 @@ def test_labels_that_are_not_of_a_logs_pictures_are_refused(tmp_path, stock, nam
 
 def test_a_camera_without_pictures_has_a_clock_where_the_log_has_something(tmp_path, stock):
     path = Path(shutil.copy(stock / "robot.mcap", tmp_path / "a.mcap"))
-    add(lines(tmp_path / "gt.txt", 3), path, role="truth", camera="rear", fps=Fraction(10), start_ns=ROBOT_NS + 5)
+    add(lines(tmp_path / "gt.txt", 1, 2, 3), path, role="truth", camera="rear", fps=Fraction(10), start_ns=ROBOT_NS + 5)
     with log.read(path) as opened:
         times = [f.t_ns for f in opened.frames("/rear/truth", TRACKS)]
     assert times == [ROBOT_NS + 5 + t for t in CLIP_NS[:3]]

@@ -314,7 +314,7 @@ def test_labels_are_put_to_the_pictures_with_their_number(index, frames, first, 
     path, labels = labels_of(frames, tmp_path, first)
     lost: list[str] = []
     with notices.listening(lambda _: None), notices.collected() as warned:
-        placed = timeline(index, **more).place(labels, lost)
+        placed = timeline(index, **more).place(labels, "tracks", lost)
     assert list(zip(placed.index.tolist(), placed.number.tolist(), strict=True)) == wanted
     assert placed.t_ns.tolist() == [10 * at for at, _ in wanted]
     assert lost == [f"{path}: {words}" for words in said]
@@ -326,7 +326,7 @@ def test_labels_are_put_to_the_pictures_with_their_number(index, frames, first, 
 def test_one_label_of_the_first_picture_counts_in_no_way(tmp_path):
     _, labels = labels_of([1], tmp_path)
     with notices.listening(lambda _: None), notices.collected() as warned:
-        placed = timeline([0, 1], every=3).place(labels, [])
+        placed = timeline([0, 1], every=3).place(labels, "tracks", [])
     assert (placed.number.tolist(), warned) == ([1, 4], [])
 
 
@@ -347,7 +347,7 @@ NOT_PLACED: dict[str, tuple[list[int], int | None, dict[str, Any], str]] = {
 def test_labels_without_a_picture_say_what_to_do(frames, first, more, words, tmp_path):
     path, labels = labels_of(frames, tmp_path, first)
     with pytest.raises(McaptrackError) as error:
-        timeline([0, 1, 2], **more).place(labels, [])
+        timeline([0, 1, 2], **more).place(labels, "tracks", [])
     assert str(error.value) == f"{path}: {words}"
 
 

@@ -135,8 +135,8 @@ class TestSources:
     def lines(self, words):
         return "\n".join(words(who, n, *path(n)) for n in range(25) for who, path in PATHS.items())
 
-    def read(self, path, **options):
-        return read_scenes([path], SourceOptions(**options), 0.4)
+    def read(self, path, topic=None, **options):
+        return read_scenes([path], SourceOptions(IngestOptions(**options), topic), 0.4)
 
     def test_trajnet(self, tmp_path):
         (tmp_path / "t.txt").write_text(self.lines(lambda who, n, x, y: f"{12 * n} {who} {x} {y}"))

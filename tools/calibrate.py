@@ -18,6 +18,7 @@ import numpy as np
 
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
 from mcaptrack.predictors import NAMES, make
+from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.training.recipe import RECIPES
 from mcaptrack.training.sources import SourceOptions, read_scenes, synthetic, windows_of
 from mcaptrack.training.windows import Windows, ar1
@@ -36,7 +37,7 @@ def main() -> None:
     given = parser.parse_args()
     recipe = replace(RECIPES["red"], past=given.past, least=given.past, stride=given.stride)
     if given.sources:
-        options = SourceOptions(fps=given.fps, ground_plane=given.ground_plane)
+        options = SourceOptions(IngestOptions(fps=given.fps, ground_plane=given.ground_plane))
         windows = windows_of(read_scenes(given.sources, options, recipe.step_s), recipe)
     else:
         windows = synthetic(recipe, 10_000, seed=77)

@@ -5,25 +5,23 @@ from __future__ import annotations
 import datetime as dt
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+from mcaptrack.api import labels
 from mcaptrack.api.declared import OneOfMany, Option, declared
 from mcaptrack.api.options import (
     FILES,
-    FPS_PATTERN,
     LABELS,
-    PLUGIN,
     Force,
     GroundPlane,
     PathLike,
     PointOfBox,
     Reports,
     Sidecar,
-    named,
     no_progress,
     output,
 )
@@ -36,9 +34,8 @@ if TYPE_CHECKING:
     from mcaptrack.sources.ingest import IngestReport
 
 _EPOCH: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
-#: Headings in the help: how pictures are stored, and how label files are read.
+#: A heading in the help: how pictures are stored.
 _PICTURES: Final = "Pictures"
-_READING: Final = "Reading of label files"
 
 Source = Annotated[
     PathLike,
@@ -50,7 +47,6 @@ Source = Annotated[
     ),
 ]
 _Labels = Annotated[PathLike | None, Option(LABELS)]
-_Format = Annotated[str, named("label_format", ("auto",), _READING, "format", PLUGIN, "FORMAT")]
 
 
 @dataclass(frozen=True)
@@ -115,7 +111,7 @@ def ingest(
     output: Annotated[PathLike | None, output("INPUT.mcap in the working folder")] = None,
     *,
     camera: Annotated[str, Option(FILES)] = "camera",
-    fps: Annotated[float | str | Fraction | None, Option(_PICTURES, tuning=FPS_PATTERN, shown=False)] = None,
+    fps: Annotated[float | str | Fraction | None, Option(_PICTURES, tuning=labels.FPS_PATTERN, shown=False)] = None,
     start_time: Annotated[float | str | dt.datetime | None, Option(_PICTURES)] = None,
     image_format: Annotated[ImageFormat, Option(_PICTURES, tuning=True)] = "auto",
     quality: Annotated[int | None, Option(_PICTURES, 1, 100, tuning=True)] = None,
@@ -129,14 +125,15 @@ def ingest(
     tracks: _Labels = None,
     truth: _Labels = None,
     motion: Annotated[PathLike | None, Option(_PICTURES)] = None,
-    label_format: _Format = "auto",
-    first_frame: Annotated[int | None, Option(_READING, 0, 10**12, tuning=True)] = None,
-    frames: Annotated[int | None, Option(_READING, 1, 10_000_000, tuning=True)] = None,
-    columns: Annotated[str | Mapping[str, str] | None, Option(_READING)] = None,
-    size: Annotated[str | tuple[int, int] | None, Option(_READING, shown=False)] = None,
-    classes: Annotated[str | None, Option(_READING)] = None,
-    frame: Annotated[str | None, Option(_READING)] = None,
-    scene: Annotated[str | None, Option(_READING, shown=False)] = None,
+    label_format: labels.Format = "auto",
+    columns: labels.Columns = None,
+    classes: labels.Classes = None,
+    class_map: labels.ClassNames = None,
+    first_frame: labels.FirstFrame = None,
+    frames: labels.LabelledFrames = None,
+    size: labels.Size = None,
+    frame: Annotated[str | None, Option(labels.READING)] = None,
+    scene: Annotated[str | None, Option(labels.READING, shown=False)] = None,
     role: Annotated[InputRole | None, Option(LABELS, flag="as")] = None,
     into: Annotated[PathLike | None, Option(FILES)] = None,
     sidecar: Sidecar = None,
@@ -192,29 +189,6 @@ def ingest(
     motion : path, optional
         File with the motion of the camera: a row per frame, of its number (from 0) and the 2x3 transform from pixels of
         the frame before.
-    label_format : {"auto", "mot", "kitti", "sdd", "trajnet", "obsmat", "coco", "cvat", "yolo", "supervision", ...}
-        Format of the label files, one of an installed package, or module:Class. auto: as the content tells; csv: any
-        table with a header.
-
-        Those of 3D boxes are "csv", "kitti-3d", "nuscenes" and "argoverse".
-    first_frame : int, optional
-        Number of the first picture in label files; by default 1 in MOTChallenge, otherwise 0.
-    frames : int, optional
-        Number of frames, if there are labels but no pictures; by default as seqinfo.ini says, otherwise up to the last
-        label.
-    columns : str or dict of str to str, optional
-        Columns of label files with a header: x=left,y=top,w=width,h=height,frame=n. Also x2, y2, cx, cy, t (seconds),
-        score, class, name (of the class), id; 3D boxes: x_m, y_m, z_m, length_m, width_m, height_m, heading_rad,
-        heading_deg, qw to qz; by default guessed from the header.
-
-        A dict has what they hold as keys: ``{"x": "left", "frame": "n"}``.
-    size : str or tuple of int, optional
-        Width and height of the pictures, like 1920x1080, if there are only labels in shares of them.
-    classes : str, optional
-        Classes of tracks and ground truth, by name or number, as in person,car; all for every one; by default person,
-        of 3D boxes all.
-
-        Detections keep all.
     frame : str, optional
         Frame of reference of 3D boxes; by default that of the format, or the root of the log's transforms.
     scene : str, optional
@@ -254,34 +228,27 @@ def ingest(
 
     """
     from mcaptrack.api.common import as_path, optional_path, paths_of, warnings_about
-    from mcaptrack.sources.ingest import IngestOptions
     from mcaptrack.sources.ingest import ingest as make_log
-    from mcaptrack.sources.ingest.labels.delimited import parse_columns
-    from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
     _check_places(output, into, sidecar)
-    path, labels = as_path(source), {"detections": detections, "tracks": tracks, "truth": truth}
-    options = IngestOptions(
+    path, files = as_path(source), {"detections": detections, "tracks": tracks, "truth": truth}
+    how = labels.label_options(
+        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
+        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
+    )  # fmt: skip
+    options = replace(
+        how,
         camera=camera,
-        fps=parse_fps(fps),
         start_ns=parse_start_time(start_time),
         image_format=image_format,
         quality=quality,
         keyframe_interval_s=keyframe_interval_s,
-        ground_plane=optional_path(ground_plane),
         calibration=tuple(paths_of(calibration)),
         calibration_name=calibration_name,
         calibration_unit=calibration_unit,
-        point=point,
-        labels={name: as_path(label) for name, label in labels.items() if label is not None},  # type: ignore[misc]
-        label_format=label_format,
-        first_frame=first_frame,
-        frames=frames,
+        labels={name: as_path(label) for name, label in files.items() if label is not None},  # type: ignore[misc]
         role=role,
         motion=optional_path(motion),
-        columns=parse_columns(columns) if columns else None,
-        size=parse_size(size),
-        classes=None if classes is None else WantedClasses(classes),
         frame_id=frame,
         scene=scene,
     )
@@ -353,30 +320,6 @@ def default_log(source: Path) -> Path:
     """Return the default path of the log of an input: in the working folder."""
     whole = Path(os.path.abspath(source))  # "." has no name
     return sibling(Path(whole.name or "log"), ".mcap", of=whole.name if source.is_dir() else whole.stem)
-
-
-def parse_fps(fps: float | str | Fraction | None) -> Fraction | None:
-    """Return frames per second as a fraction, from 25, "29.97" or "30000/1001"."""
-    from mcaptrack.geometry import clocks
-
-    try:
-        return None if fps is None else clocks.parse_fps(str(fps))
-    except ValueError:
-        raise McaptrackError(
-            f"`fps=` needs a number like 25, 29.97 or 30000/1001, from one frame a day to 10000 a second, not {fps!r}"
-        ) from None
-
-
-def parse_size(size: str | tuple[int, int] | None) -> tuple[int, int] | None:
-    """Return width and height from "1920x1080" or two numbers."""
-    from mcaptrack.geometry import boxes
-
-    if size is None:
-        return None
-    parsed = boxes.parse_size(size if isinstance(size, str) else "x".join(map(str, size)))
-    if parsed is None:
-        raise McaptrackError(f"`size=` is the width and height of pictures in pixels, like 1920x1080, not {size!r:.40}")
-    return parsed
 
 
 def parse_start_time(time: float | str | dt.datetime | None) -> int | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from fractions import Fraction
 from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, PythonOnly
@@ -54,16 +53,6 @@ GroundPlane = Annotated[
     PathLike | None, Option(LABELS, help="File with a 3x3 homography from pixels to metres on the ground.")
 ]
 PointOfBox = Annotated[Point, Option(LABELS, tuning=True, help="Which point of a box touches the ground.")]
-#: What a file in the working folder may give for frames per second.
-FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
-LabelFps = Annotated[
-    float | str | Fraction | None,
-    Option(
-        LABELS,
-        tuning=FPS_PATTERN,
-        help="Frames per second of label files, such as 25 or 30000/1001; by default as seqinfo.ini beside them says.",
-    ),
-]
 #: What files in the working folder may give for a detector, tracker or so on: built-in or installed ones.
 PLUGIN: Final = r"[A-Za-z0-9_-]+"
 Cameras = Annotated[str | Sequence[str] | None, Option(metavar="A,B", commas=True, shown="all with a ground plane")]
@@ -116,7 +105,9 @@ def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown
     return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)
 
 
-def named(kind: Kind, built_in: Sequence[str], panel: str, flag: str, tuning: str = "", metavar: str = "") -> Option:
+def named(
+    kind: Kind, built_in: Sequence[str], panel: str, flag: str, tuning: str = "", metavar: str = "", text: str = ""
+) -> Option:
     """The option that chooses a format by name: a built-in one, or of another package; ``built_in`` are its names that
     the help shows, or what stands before those of the registry, with ``metavar`` in the help.
     """
@@ -126,7 +117,8 @@ def named(kind: Kind, built_in: Sequence[str], panel: str, flag: str, tuning: st
 
         return (*built_in, *(names(kind) if metavar else others(kind)))
 
-    return Option(panel, flag=flag, tuning=tuning or False, metavar=metavar or "|".join(built_in), names=every)
+    shown = metavar or "|".join(built_in)
+    return Option(panel, flag=flag, tuning=tuning or False, metavar=shown, names=every, help=text)
 
 
 Output = Annotated[PathLike | None, output()]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from fractions import Fraction
+from dataclasses import dataclass, field, replace
 from html import escape
 from itertools import count
 from pathlib import Path
@@ -14,15 +13,14 @@ import numpy as np
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
-from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, optional_path, paths_of, warn_unused
+from mcaptrack.api import labels
+from mcaptrack.api.common import Notes, as_path, detail, locations_of, names_of, paths_of, warn_unused
 from mcaptrack.api.declared import Argument, Option, checked, declared
-from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import (
     LABELS,
     SCORES,
     Camera,
     GroundPlane,
-    LabelFps,
     MinIou,
     PathLike,
     PointOfBox,
@@ -31,7 +29,7 @@ from mcaptrack.api.options import (
     no_progress,
     similarity,
 )
-from mcaptrack.choices import Point, Similarity
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import (
     COMBINED,
@@ -40,6 +38,7 @@ from mcaptrack.evaluation import (
     EvaluateOptions,
     EvaluationInput,
     EvaluationRow,
+    Labelled,
     sequence_of_files,
     sequence_of_log,
 )
@@ -55,6 +54,8 @@ from mcaptrack.pipeline.rebuild import rebuild
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import camera_at, provenance_of
+from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import compare_files, pair_files
 from mcaptrack.transforms import STAGES, Predict
 
@@ -85,6 +86,9 @@ class Scores:
         by one for each class, with the name of the class in ``of_class``.
     notes : tuple of str
         How files were paired and read.
+    labelled : dict of str to mcaptrack.evaluation.Labelled
+        For each sequence which frames of its ground truth were labelled, and how that is known; others count in no
+        score.
     warnings : tuple of mcaptrack.Notice
         What was assumed, and what could not be compared.
 
@@ -93,6 +97,7 @@ class Scores:
     results: tuple[EvaluationRow, ...]
     notes: tuple[str, ...]
     warnings: tuple[Notice, ...]
+    labelled: Mapping[str, Labelled] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Scores({len(self.results)} results; `rows` returns them)"
@@ -308,11 +313,17 @@ def evaluate(
     rules: Annotated[Rules, Option(SCORES, tuning=True)] = "trackeval",
     smoothed: Annotated[bool, Option(SCORES, tuning=True)] = False,
     topic: Annotated[str | Sequence[str] | None, Option(SCORES)] = None,
-    classes: Annotated[str | None, Option(LABELS)] = None,
+    label_format: labels.Format = "auto",
+    columns: labels.Columns = None,
+    classes: labels.Classes = None,
+    class_map: labels.ClassNames = None,
+    first_frame: labels.FirstFrame = None,
+    frames: labels.LabelledFrames = None,
+    fps: labels.LabelFps = None,
+    size: labels.Size = None,
     camera: Camera = None,
     ground_plane: GroundPlane = None,
     point: PointOfBox = "foot",
-    fps: LabelFps = None,
     progress: Reports = no_progress,
 ) -> Scores:
     """Score tracks and predictions against ground truth.
@@ -340,9 +351,6 @@ def evaluate(
         They are called "samples, smoothed"; the paper names them SORT + smoothing.
     topic : str or sequence of str, optional
         Score these channels; by default tracks, samples, retracks, retracks/online; of 3D boxes retracks/full, too.
-    classes : str, optional
-        Classes of label files to score, by name or number, as in person,car; all for every one; by default person; 3D
-        boxes: all.
 
     Returns
     -------
@@ -371,15 +379,16 @@ def evaluate(
     topics, notes = names_of(topic), Notes()
     gates = tuple(np.asarray(gate_m, float).reshape(-1).tolist())
     options = EvaluateOptions((similarity,) if similarity else (), gates, min_iou, rules, topics)
+    how = labels.label_options(
+        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
+        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
+    )  # fmt: skip
     paths = locations_of(tracks)
     with collected() as warnings:
         if truth is None:
             sequences = _from_logs(paths, camera, topics, smoothed)
         else:
-            plane = optional_path(ground_plane)
-            sequences = _from_files(
-                [as_path(path) for path in paths], paths_of(truth), parse_fps(fps), plane, point, topics, classes, notes
-            )
+            sequences = _from_files([as_path(path) for path in paths], paths_of(truth), how, topics, notes)
         total, counter = sum(len(sequence.candidates) for sequence in sequences), count()
 
         def tell(candidate: str) -> None:
@@ -390,15 +399,13 @@ def evaluate(
         progress("evaluate", total, total)
         for note in outcome.notes:
             warn(note, "not-compared")
-        has_point, has_plane = point != "foot", ground_plane is not None
         if truth is None:
-            reason = "it is about label files; logs have theirs inside"
-            warn_unused(reason, ground_plane=has_plane, point=has_point, fps=fps is not None)
+            labels.warn_of_unused(how, "it is about label files; logs have theirs inside", "classes")
             warn_unused("logs are scored by all classes that they have", classes=classes is not None)
         else:
             warn_unused("files of tracks are of no camera", camera=camera is not None)
             warn_unused("files hold no samples with predictions", smoothed=smoothed)
-            warn_unused("there is no ground plane", point=has_point and not has_plane)
+            warn_unused("there is no ground plane", point=point != "foot" and ground_plane is None)
             is_unused = classes is not None and any(map(holds_tables, [*paths, *paths_of(truth)]))
             warn_unused("tables are compared as a whole", classes=is_unused)
             warn_unused("only tables hold several channels", topic=bool(topics) and not any(map(holds_tables, paths)))
@@ -407,7 +414,8 @@ def evaluate(
             warn_unused("nothing is compared by distance on the ground", gate_m=gates != DEFAULT_GATES_M)
         if compared <= {"metres"}:
             warn_unused("nothing is compared by overlap", min_iou=min_iou != IOU_THRESHOLD)
-    return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)))
+    labelled = {sequence.name: sequence.labelled for sequence in sequences}
+    return Scores(tuple(outcome.results), tuple(notes), tuple(dict.fromkeys(warnings)), labelled)
 
 
 def holds_tables(path: Location) -> bool:
@@ -426,6 +434,8 @@ def _from_logs(
         with logs.read(path) as opened:
             prefix = pipeline.find_camera(opened, camera)
             sequence = sequence_of_log(opened, prefix, topics)
+            if how := provenance_of(opened, camera_at(opened, prefix).truth):
+                how.warn_again()
             if smoothed:
                 sequence.candidates = [*sequence.candidates, _smoothed(opened, prefix)]
             sequence.name = name
@@ -453,22 +463,18 @@ def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
 
 
 def _from_files(
-    tracks: Sequence[Path],
-    truths: Sequence[Path],
-    fps: Fraction | None,
-    ground_plane: Path | None,
-    point: Point,
-    topics: tuple[str, ...],
-    classes: str | None,
-    notes: Notes,
+    tracks: Sequence[Path], truths: Sequence[Path], how: IngestOptions, topics: tuple[str, ...], notes: Notes
 ) -> list[EvaluationInput]:
     pairs, note_on_pairs = pair_files(tracks, truths)
     if note_on_pairs:
         notes.say(note_on_pairs)
     sequences = []
-    for name, path, labels in pairs:
-        both = compare_files(path, labels, fps, ground_plane, point, topics, classes)
+    for name, path, truth in pairs:
+        both = compare_files(path, truth, how, topics)
         for note in both.notes:
             notes.say(note)
-        sequences.append(sequence_of_files(name, path, both.ground_truth, both.tracks, len(pairs), both.classes))
+        sequence = sequence_of_files(
+            name, path, both.ground_truth, both.tracks, len(pairs), both.classes, both.labelled
+        )
+        sequences.append(sequence)
     return sequences

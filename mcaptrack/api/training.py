@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from mcaptrack import __version__
-from mcaptrack.api.common import Notes, as_path, optional_path, paths_of
+from mcaptrack.api import labels
+from mcaptrack.api.common import Notes, as_path, paths_of
 from mcaptrack.api.declared import Argument, Option, declared
-from mcaptrack.api.ingesting import parse_fps
-from mcaptrack.api.options import FILES, Force, GroundPlane, LabelFps, PathLike, PointOfBox, Reports, Topic, no_progress
+from mcaptrack.api.options import FILES, Force, GroundPlane, PathLike, PointOfBox, Reports, Topic, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.training.recipe import RECIPES, Recipe
@@ -59,7 +59,14 @@ def train(
     threads: Annotated[int, Option(_TRAINING, 1, 1024, tuning=True)] = 1,
     resume: Annotated[bool, Option(FILES)] = False,
     topic: Topic = None,
-    fps: LabelFps = None,
+    label_format: labels.Format = "auto",
+    columns: labels.Columns = None,
+    classes: labels.Classes = None,
+    class_map: labels.ClassNames = None,
+    first_frame: labels.FirstFrame = None,
+    frames: labels.LabelledFrames = None,
+    fps: labels.LabelFps = None,
+    size: labels.Size = None,
     ground_plane: GroundPlane = None,
     point: PointOfBox = "foot",
     force: Force = False,
@@ -148,7 +155,11 @@ def train(
     from mcaptrack.training.loop import train as fit
 
     where = find_device(device)  # before anything takes long
-    options = SourceOptions(fps=parse_fps(fps), ground_plane=optional_path(ground_plane), point=point, topic=topic)
+    how = labels.label_options(
+        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
+        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
+    )  # fmt: skip
+    options = SourceOptions(how, topic)
     with collected() as warnings:
         training, card = _windows(chosen, sources, walks, options, notes)
         if validate:

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline
+from mcaptrack.api import labels
 from mcaptrack.api.common import Notes, detail, optional_path, paths_of
 from mcaptrack.api.declared import Argument, Option, declared
-from mcaptrack.api.ingesting import parse_fps
 from mcaptrack.api.options import (
     FILES,
     LABELS,
@@ -21,7 +20,6 @@ from mcaptrack.api.options import (
     Camera,
     Force,
     GroundPlane,
-    LabelFps,
     MinIou,
     PathLike,
     PointOfBox,
@@ -33,13 +31,14 @@ from mcaptrack.api.options import (
     similarity,
 )
 from mcaptrack.api.running import transform_of
-from mcaptrack.choices import Point, Similarity
+from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
 from mcaptrack.evaluation import tuning as searching
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.notices import Notice, collected
 from mcaptrack.registry import Entry, blamed
+from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import detections_and_ground_truth, pair_files
 from mcaptrack.transforms import STAGES, Transform
 
@@ -110,7 +109,14 @@ def tune(
     similarity: Annotated[Similarity | None, similarity("iou; metres after track")] = None,
     gate_m: Annotated[float, gate_m()] = 1.0,
     min_iou: MinIou = 0.5,
-    fps: LabelFps = None,
+    label_format: labels.Format = "auto",
+    columns: labels.Columns = None,
+    classes: labels.Classes = None,
+    class_map: labels.ClassNames = None,
+    first_frame: labels.FirstFrame = None,
+    frames: labels.LabelledFrames = None,
+    fps: labels.LabelFps = None,
+    size: labels.Size = None,
     ground_plane: GroundPlane = None,
     point: PointOfBox = "foot",
     topic: Topic = None,
@@ -178,22 +184,23 @@ def tune(
     if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})
-    is_own = STAGES[stage].is_built_in(type(base))
-    entry = None if is_own else STAGES[stage].entry(type(base))
+    entry = None if STAGES[stage].is_built_in(type(base)) else STAGES[stage].entry(type(base))
     ranges = _ranges(type(base), search, entry)
     chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
+    how = labels.label_options(
+        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
+        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
+    )  # fmt: skip
     notes, trials_file = Notes(), optional_path(study)
     with collected() as warnings:
         if truth is None:
             tasks = _tasks_of_logs(paths_of(inputs), camera, topic, stage, base)
+            labels.warn_of_unused(how, "it is about label files; logs have theirs inside")
         elif not has_tracker:
             raise McaptrackError(f"files of detections are for `stage='track'`; to tune {stage} give logs")
         else:
-            pairs, note_on_pairs = pair_files(paths_of(inputs), paths_of(truth))
-            if note_on_pairs:
-                notes.say(note_on_pairs)
-            tasks = _tasks_of_files(pairs, parse_fps(fps), optional_path(ground_plane), point)
+            tasks = _tasks_of_files(paths_of(inputs), paths_of(truth), how, notes)
         if force and trials_file is not None:
             trials_file.unlink(missing_ok=True)
         proposals = "Optuna" if uses_optuna() else _BY_CHANCE
@@ -206,17 +213,9 @@ def tune(
                 detail(f"trial {trial.number}: {metric} {trial.scores[metric]:.4f} {values}".rstrip())
 
         first, best = searching.tune(
-            base,
-            tasks,
-            ranges,
-            scoring,
-            metric=metric,
-            trials=trials,
-            seed=seed,
-            study=trials_file,
-            on_trial=tell,
+            base, tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=tell,
             entry=entry,
-        )
+        )  # fmt: skip
     settings = ({"tracker": tracker or "sort"} if has_tracker else {}) | dict(best.parameters)
     return TuneResult(
         stage=stage,
@@ -256,12 +255,13 @@ def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -
     return out
 
 
-def _tasks_of_files(
-    pairs: Sequence[tuple[str, Path, Path]], fps: Fraction | None, ground_plane: Path | None, point: Point
-) -> list[Task]:
+def _tasks_of_files(inputs: Sequence[Path], truths: Sequence[Path], how: IngestOptions, notes: Notes) -> list[Task]:
+    pairs, note_on_pairs = pair_files(inputs, truths)
+    if note_on_pairs:
+        notes.say(note_on_pairs)
     tasks = []
-    for name, path, labels in pairs:
-        detected = detections_and_ground_truth(path, labels, fps, ground_plane, point)
+    for name, path, truth in pairs:
+        detected = detections_and_ground_truth(path, truth, how)
         tasks.append(Task(name, detected.detections, detected.ground_truth, {"ground_planes": detected.planes}))
     return tasks
 

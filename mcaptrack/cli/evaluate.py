@@ -78,7 +78,8 @@ class Evaluate(Once["Scores"]):
 
     def data(self, done: Scores) -> dict[str, Any]:
         """Return the scores as values of JSON."""
-        return {"results": done.rows()}
+        labelled = [{"sequence": name, **how._asdict()} for name, how in done.labelled.items()]
+        return {"results": done.rows(), "labelled": labelled}
 
     def print_result(self, done: Scores, talk: common.Talk) -> None:
         """Print the scores, or write them to a file, and draw curves."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -42,7 +42,7 @@ from mcaptrack.evaluation.metrics.displacement import Displacement, combine_disp
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
-from mcaptrack.schema.provenance import Provenance
+from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES
@@ -95,6 +95,15 @@ class Candidate:
     classes: Mapping[int, str] = field(default_factory=dict)  # names of the classes in the rows
 
 
+class Labelled(NamedTuple):
+    """Which frames of the ground truth were labelled, as ``--frames`` names them, None for all of them; and how that is
+    known: by "frames" (the option), by the "file", or assumed by its first and last "labels".
+    """
+
+    frames: str | None = None
+    by: str | None = None
+
+
 @dataclass
 class EvaluationInput:
     """One sequence: its ground truth and the tracks to be scored against it."""
@@ -103,6 +112,7 @@ class EvaluationInput:
     ground_truth: Sequence[Frame]
     candidates: Sequence[Candidate]
     classes: Mapping[int, str] = field(default_factory=dict)  # names of the classes of the ground truth
+    labelled: Labelled = Labelled()
 
 
 # Scores of 3D tracks averaged over recalls (AMOTA, sAMOTA), with the scores of tracks that they need.
@@ -227,8 +237,11 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
         forecasts = opened.frames(name, PREDICTIONS) if name in opened.channels else None
         names = class_names(opened.channel(topic).metadata)
         candidates.append(Candidate(topic, mode, opened.frames(topic, TRACKS), forecasts, name, classes=names))
-    names = class_names(opened.channel(camera_at(opened, prefix).truth).metadata)
-    return EvaluationInput(opened.path.stem, ground_truth, candidates, names)
+    metadata = opened.channel(camera_at(opened, prefix).truth).metadata
+    how = Provenance.from_metadata(metadata)
+    parameters = how.parameters if how is not None and how.transform == INGEST else {}
+    labelled = Labelled(parameters.get("frames"), parameters.get("frames_by"))
+    return EvaluationInput(opened.path.stem, ground_truth, candidates, class_names(metadata), labelled)
 
 
 def _own_forecasts(opened: log.Log, topic: str) -> str:
@@ -392,11 +405,13 @@ def sequence_of_files(
     track_frames: Sequence[Frame],
     files: int,
     classes: tuple[Mapping[int, str], Mapping[int, str]] = ({}, {}),
+    labelled: tuple[str | None, str | None] = (None, None),
 ) -> EvaluationInput:
     """One of ``files`` files of tracks, with its ground truth, as a sequence.
 
-    ``classes`` are the names of the classes of the ground truth and of the tracks.
+    ``classes`` are the names of the classes of the ground truth and of the tracks, ``labelled`` says which frames were
+    labelled.
     """
     group = f"{files} files" if files > 1 else ""
     candidate = Candidate(tracks.name, None, track_frames, group=group, classes=classes[1])
-    return EvaluationInput(name, truth_frames, [candidate], classes[0])
+    return EvaluationInput(name, truth_frames, [candidate], classes[0], Labelled(*labelled))

@@ -80,11 +80,11 @@ class _PredictionClock(NamedTuple):
         ids = joined.rows["track_id"].astype(np.int64)
         return Positions(self.regular.to_step(joined.row_ns), ids, on_ground(joined.rows))
 
-    def resampled(self, ground_truth: Sequence[Frame]) -> Positions:
-        """The positions of tracks with other times, resampled to the ticks that their frames cover."""
+    def resampled(self, ground_truth: Sequence[Frame]) -> tuple[Positions, Ints]:
+        """The positions of tracks with other times, resampled to the ticks that their frames cover; and these ticks."""
         ticks = self.regular.ticks(frame_times(ground_truth), seconds_to_ns(MAX_GAP_S))
-        end_ns = self.last_ns + self.regular.step_ns / 2
-        return self.positions(resample_frames(ground_truth, ticks[ticks <= end_ns]))
+        ticks = ticks[ticks <= self.last_ns + self.regular.step_ns / 2]
+        return self.positions(resample_frames(ground_truth, ticks)), self.regular.to_step(ticks)
 
 
 class _ForecastArrays(NamedTuple):
@@ -164,7 +164,8 @@ def score_forecasts(
     arrays = _arrays(frames, tracks, name)
     if arrays is None:
         return None
-    return displacement(arrays.clock.resampled(ground_truth), arrays.clock.positions(tracks), arrays.forecasts)
+    people, labelled = arrays.clock.resampled(ground_truth)
+    return displacement(people, arrays.clock.positions(tracks), arrays.forecasts, labelled=labelled)
 
 
 class ForecastErrorFrames(NamedTuple):
@@ -278,7 +279,7 @@ def find_forecast_errors(
     parts = list(spans_of(row_ends(frames)))
     whole = _arrays(frames, tracks, name) if len(parts) == 1 else None
     clock = _clock(frames, tracks) if len(frames) else None
-    people = (clock or _NOTHING.clock).resampled(ground_truth or ())
+    people, labelled = (clock or _NOTHING.clock).resampled(ground_truth or ())
     scores, errors = FORECAST_SCORES.empty(len(frames)), FrameCollector(FORECAST_ERRORS)
     times, numbers, has_truth = frame_times(frames), frame_numbers(frames), bool(np.isfinite(people.xy_m).any())
     for low, high in parts:
@@ -293,7 +294,9 @@ def find_forecast_errors(
         span = (int(times[low]), int(times[high - 1])) if len(parts) > 1 else None
         paths, offline = (arrays.clock.positions(some, span, arrays.forecasts) for some in (tracks, later))
         if has_truth:
-            false = _compare(arrays, pair_forecasts(people, paths, arrays.forecasts), rows, "truth_id", "")
+            false = _compare(
+                arrays, pair_forecasts(people, paths, arrays.forecasts, labelled=labelled), rows, "truth_id", ""
+            )
             of_part["false_forecasts"] = np.bincount(arrays.message[false], minlength=high - low)
             of_part["scored"] = _mean(arrays.message, rows, of_part, "")
         _compare(arrays, pair_forecasts(offline, paths, arrays.forecasts), rows, "later_id", "later_")

@@ -6,14 +6,15 @@ Letters: I tracks, S steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from mcaptrack import log, pipeline, tables
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -21,8 +22,9 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.location import sibling
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
-from mcaptrack.sources.ingest import label_frames
+from mcaptrack.sources.ingest import IngestOptions, label_frames
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE
 from mcaptrack.training.recipe import Recipe
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows
@@ -45,13 +47,11 @@ class Scene:
         return Windows.cut(self.xy_m, recipe.past, recipe.steps, recipe.least, recipe.stride, number)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class SourceOptions:
-    """Options of sources that don't specify them: frames per second, ground plane, channel of a log."""
+    """Options of label files, and the channel of logs and tables."""
 
-    fps: Fraction | None = None
-    ground_plane: Path | None = None
-    point: Literal["foot", "center"] = "foot"
+    labels: IngestOptions = IngestOptions()
     topic: str | None = None
 
 
@@ -83,20 +83,23 @@ def _files(path: Path) -> list[Path]:
 
 
 def _from_labels(path: Path, options: SourceOptions, step_s: float) -> list[Scene]:
-    labels = read_labels(path, role="truth")
+    given = options.labels
+    wanted = given.classes or ONLY_PEOPLE
+    role: Role = "truth"
+    how = (given.label_format, role, given.first_of(role), given.columns, wanted)
+    labels = read_labels(path, *how, class_map=given.class_map)
     if not labels.has_ids:
         raise McaptrackError(f"{path} has boxes without track ids; predictors learn from tracks")
-    fps = options.fps
+    fps = given.fps
     if fps is None:
         fps = labels.facts.fps
     if fps is None and labels.facts.interval_s is None:
         raise McaptrackError(f"{path}: how many frames a second? Say it with `fps=`")
     if fps is None:  # annotated at the rate of prediction
         fps = Fraction(labels.step / step_s).limit_denominator(1000)
-    plane = options.ground_plane
-    if labels.xy_m is None and plane is None:
+    if labels.xy_m is None and given.ground_plane is None:
         raise McaptrackError(f"{path} is in pixels; give its homography with `ground_plane=`")
-    frames = label_frames({"truth": path}, fps, plane, options.point)["truth"]
+    frames = label_frames({"truth": path}, replace(given, fps=fps))["truth"]
     first = next((number for number, frame in enumerate(frames) if len(frame.rows)), 0)
     return [_scene(path.stem, frames[first:], step_s, ())]  # windows begin with the first label
 

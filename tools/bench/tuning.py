@@ -15,6 +15,7 @@ from pathlib import Path
 
 from mcaptrack.evaluation import EvaluateOptions
 from mcaptrack.evaluation.tuning import Task, trial_scores
+from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import detections_and_ground_truth
 from mcaptrack.transforms import Sort
 
@@ -30,7 +31,7 @@ def main() -> None:
     folders = sorted(path for path in (options.folder / "mot15").iterdir() if path.is_dir())
     tasks = []
     for path in folders:
-        both = detections_and_ground_truth(path / "det/det.txt", path / "gt/gt.txt", None, None, "foot")
+        both = detections_and_ground_truth(path / "det/det.txt", path / "gt/gt.txt", IngestOptions())
         tasks.append(Task(path.name, both.detections, both.ground_truth, {}))
     scoring = EvaluateOptions(similarities=("iou",))
     with tempfile.TemporaryDirectory() as name:

@@ -383,7 +383,13 @@ class PairedForecasts(NamedTuple):
     frames: int
 
 
-def pair_forecasts(ground_truth: Positions, tracks: Positions, forecasts: Forecasts, t_obs: int = 4) -> PairedForecasts:
+def pair_forecasts(
+    ground_truth: Positions,
+    tracks: Positions,
+    forecasts: Forecasts,
+    t_obs: int = 4,
+    labelled: Ints | None = None,
+) -> PairedForecasts:
     """Assign the forecasts made for tracks to people by their past positions.
 
     Parameters
@@ -395,6 +401,8 @@ def pair_forecasts(ground_truth: Positions, tracks: Positions, forecasts: Foreca
         On the same clock as the other two. The order of rows has no influence.
     t_obs : int
         The number of past positions to compare.
+    labelled : int array, optional
+        The steps that the ground truth describes. Forecasts with another one from 0 on in their past are not judged.
 
     Returns
     -------
@@ -413,10 +421,15 @@ def pair_forecasts(ground_truth: Positions, tracks: Positions, forecasts: Foreca
     """
     horizon = forecasts.mean_m.shape[1]
     people, paths = _sorted_positions(ground_truth, fill=False), _sorted_positions(tracks, fill=True)
-    steps = np.unique(forecasts.step)
+    counts = np.ones(len(forecasts.step), bool)
+    for back in range(t_obs) if labelled is not None else ():
+        step = forecasts.step - back
+        counts &= (step < 0) | np.isin(step, np.asarray(labelled))
+    steps = np.unique(forecasts.step[counts])
     has_past, has_future = people.is_continuous(1 - t_obs), people.is_continuous(horizon)
     place = paths.find(forecasts.id, forecasts.step)
     is_judged = (place >= 0) & paths.is_continuous(1 - t_obs)[place] if len(paths.slot) else np.zeros(len(place), bool)
+    is_judged &= counts
     subject = np.flatnonzero(has_past & np.isin(people.step, steps))
     subject = subject[np.argsort(people.step[subject], kind="stable")]
     judged = np.flatnonzero(is_judged)
@@ -476,7 +489,12 @@ def _best(cost: Floats, row: Ints, column: Ints, which: Ints, down: Ints, across
 
 
 def displacement(
-    ground_truth: Positions, tracks: Positions, forecasts: Forecasts, t_obs: int = 4, tau_m2: float = TAU_M2
+    ground_truth: Positions,
+    tracks: Positions,
+    forecasts: Forecasts,
+    t_obs: int = 4,
+    tau_m2: float = TAU_M2,
+    labelled: Ints | None = None,
 ) -> Displacement:
     """Compare the forecasts made for tracks with the true future of the people assigned to the tracks.
 
@@ -491,6 +509,8 @@ def displacement(
         The number of past positions by which tracks are assigned to people.
     tau_m2 : float, m^2
         Forecasts of tracks farther than this from a person count as false [1]_.
+    labelled : int array, optional
+        The steps that the ground truth describes, as in ``pair_forecasts``.
 
     Returns
     -------
@@ -511,7 +531,7 @@ def displacement(
     >>> round(found["ADE_m"], 3), round(found["FDE_m"], 3), found["recall"]
     (0.8, 1.2, 1.0)
     """
-    pairs = pair_forecasts(ground_truth, tracks, forecasts, t_obs)
+    pairs = pair_forecasts(ground_truth, tracks, forecasts, t_obs, labelled)
     is_known = np.isfinite(pairs.offset_m).all(axis=(1, 2))
     number = pairs.forecast[is_known]
     errors = forecast_errors(pairs.offset_m[is_known], forecasts.cov_m2[number], forecasts.shapes(number))

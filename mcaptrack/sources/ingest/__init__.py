@@ -242,7 +242,7 @@ def _warn_unused(job: IngestJob, options: IngestOptions) -> None:
     is_calibrated = bool(options.calibration) or any(topic.endswith(f"/{CALIBRATION}") for topic in job.report.messages)
     is_sized = bool(job.options.calibration) and not job.pictures
     uses: dict[str, tuple[object, *tuple[str, ...]]] = {
-        "there is no label file": (job.has_labels, "label_format", "columns"),
+        "there is no label file": (job.has_labels, "label_format", "columns", "frame_ranges", "class_map"),
         "no label file has boxes in pictures": (
             is_sized or any(labels.boxes_px is not None for labels in job.labels.values()), "size",
         ),

@@ -5,7 +5,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Set
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -21,10 +21,10 @@ from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.camera_path import Verdict, poses_of
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.notices import Notice, warn
+from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
 from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
-from mcaptrack.schema.classes import classes_beside_rows, only_class, without_class
+from mcaptrack.schema.classes import ClassMap, classes_beside_rows, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
@@ -33,6 +33,7 @@ from mcaptrack.sources.cameras import corrected_plane
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.ingest.calibration import Calibrated, GivenCalibration
 from mcaptrack.sources.ingest.labels.checks import find_outside
+from mcaptrack.sources.ingest.labels.frames import FrameRanges, share_numbers, warn_of_firsts
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
 from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE, WantedClasses, describe_classes
 from mcaptrack.sources.ingest.labels.table import BoxTable, refuse
@@ -60,14 +61,15 @@ MOTION: Final = "motion"
 
 #: Options that apply only to videos, and options that are written otherwise than they are named here.
 FOR_VIDEOS: Final = ("image_format", "quality", "keyframe_interval_s")
-_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "frame"}
+_WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "frame", "frame_ranges": "frames"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class IngestOptions:
     """The parameters of ``mcaptrack.ingest``, which explains them, as values: paths, fractions, names of columns.
 
-    ``labels`` are label files by role; ``frame_id`` is its ``frame``.
+    ``labels`` are label files by role; ``frame_id`` is its ``frame``, and ``frame_ranges`` its ``frames`` if these are
+    no number.
     """
 
     camera: str = "camera"
@@ -83,13 +85,15 @@ class IngestOptions:
     point: Point = "foot"
     labels: Mapping[Role, Path] = field(default_factory=dict)
     label_format: str = "auto"
-    first_frame: int | None = None
+    first_frame: int | Mapping[str, int] | None = None
     frames: int | None = None
+    frame_ranges: FrameRanges | None = None
     role: InputRole | None = None
     motion: Path | None = None
     columns: Mapping[str, str] | None = None
     size: tuple[int, int] | None = None
     classes: WantedClasses | None = None
+    class_map: ClassMap | None = None
     frame_id: str | None = None
     scene: str | None = None
 
@@ -102,6 +106,10 @@ class IngestOptions:
             keyframe_interval_s=self.keyframe_interval_s,
             fps=self.fps,
         )
+
+    def first_of(self, role: Role | None) -> int | None:
+        """The number of the first picture in files with this role; None if it wasn't given."""
+        return self.first_frame.get(role or "") if isinstance(self.first_frame, Mapping) else self.first_frame
 
     def given(self, *names: str) -> str:
         """The first of these options that was given, as a user writes it; "" if none was."""
@@ -233,6 +241,7 @@ class IngestJob:
             raise McaptrackError(f"{options.ground_plane} and {names} are both a ground plane; give one")
         self.labels: dict[Role, BoxTable] = {role: self.read(path, role) for role, path in options.labels.items()}
         self.motions = read_motions(options.motion) if options.motion else None
+        share_numbers(self.labels)
 
     def read(self, path: Path, role: Role | None) -> BoxTable:
         """Read a label file with the format options. Without a role, it is that of tracks if the file has ids."""
@@ -243,8 +252,10 @@ class IngestJob:
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        given = (options.label_format, role, options.first_frame, options.columns, wanted)
-        labels = read_labels(path, *given, in_parts=True)
+        given = (options.label_format, role, options.first_of(role), options.columns, wanted)
+        labels = read_labels(path, *given, in_parts=True, class_map=options.class_map)
+        if role is None and isinstance(options.first_frame, Mapping):
+            return self.read(path, labels.role)
         if labels.role == "detections" and labels.boxes_px is None:
             raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
         return labels
@@ -302,12 +313,7 @@ class IngestJob:
     def report_assumptions(self) -> None:
         """Report what is assumed about the labels, and what of them is left out."""
         all_labels = self.labels.values()
-        firsts = {labels.first_frame: f"frame {labels.first_frame} of {labels.path}" for labels in all_labels}
-        if len(firsts) > 1:
-            warn(
-                f"{' and '.join(firsts.values())} are assumed to be the same picture; `first_frame=` sets the number",
-                "clock",
-            )
+        warn_of_firsts(all_labels)
         for role, labels in self.labels.items():
             path = labels.path
             self.report_table(role, labels)
@@ -428,12 +434,20 @@ class IngestJob:
     def write_labels(self, writer: log.LogWriter, plane: GroundPlane | None, timeline: Timeline) -> None:
         """Write the labels, each frame at the time of its picture."""
         for role, labels in self.labels.items():
-            placed = timeline.place(labels, self.report.lost)
-            if role == "corrections":  # frames beyond those that were looked at stay as they are
-                placed = placed.between(int(labels.labelled[0]), int(labels.labelled[-1]))
+            with collected() as warned:
+                placed = timeline.place(labels, role, self.report.lost, self.ranges_of(role))
             parameters = {"file": labels.path.name, "format": labels.format} | self.label_parameters(role, labels)
+            if placed.ranges is not None:
+                parameters |= {"frames": str(placed.ranges), "frames_by": placed.by}
             frames = self.frames(role, plane, placed)
-            self.write_rows(writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels)
+            self.write_rows(
+                writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels,
+                warnings=[(notice.code, notice.message) for notice in warned if notice.code == "labelled"],
+            )  # fmt: skip
+
+    def ranges_of(self, role: Role) -> FrameRanges | None:
+        """The frames that a user says were labelled: of the ground truth, if there is any."""
+        return self.options.frame_ranges if role == "truth" or "truth" not in self.roles else None
 
     def write_motion(self, writer: log.LogWriter, timeline: Timeline, size: tuple[int, int]) -> None:
         """Write the motion of the camera, if it was given; pictures have this width and height."""
@@ -449,11 +463,14 @@ class IngestJob:
 
     def label_parameters(self, role: Role, labels: BoxTable) -> dict[str, Any]:
         """Additional parameters in the provenance of labels."""
-        out: dict[str, Any] = {} if self.options.first_frame is None else {"first_frame": labels.first_frame}
+        is_stated = self.options.first_of(role) is not None or (labels.format, labels.first_frame) == ("mot", 0)
+        out: dict[str, Any] = {"first_frame": labels.first_frame} if is_stated else {}
         if self.options.columns:
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
         if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
+        if self.options.class_map is not None:
+            out["class_map"] = str(self.options.class_map)
         if self.options.size and labels.boxes_px is not None:
             out["size"] = "{}x{}".format(*self.options.size)
         return out
@@ -471,9 +488,10 @@ class IngestJob:
         parameters: Mapping[str, Any],
         labels: BoxTable | None = None,
         frame_id: str = "",
+        warnings: Sequence[Sequence[str]] = (),
     ) -> None:
         """Write a channel of the camera; ``parameters`` are those in its provenance, ``labels`` the file that it is of,
-        and ``frame_id`` the frame of reference of its positions.
+        ``frame_id`` the frame of reference of its positions, and ``warnings`` are kept with it.
 
         Frames are generated several times, for the digest and for the channel, so that they are never all in memory.
         """
@@ -489,7 +507,7 @@ class IngestJob:
         of_rows = digest(messages(), classes_beside_rows(class_id, names))
         provenance = Provenance(
             INGEST, parameters, self.pictures, digest=of_rows, classes=names, class_id=class_id, frame_id=frame_id,
-            plugins=plugins,
+            plugins=plugins, warnings=warnings,
         )  # fmt: skip
         topic, record = f"{self.prefix}/{suffix}", record_of(schema, self.encoding)
         channel = writer.add_channel(topic, record, self.encoding, provenance.to_metadata())

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.choices import Point, Role
+from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
@@ -33,11 +33,11 @@ from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
 from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
+from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, described, share_numbers
 from mcaptrack.sources.ingest.labels.reading import read_labels
-from mcaptrack.sources.ingest.labels.roles import WantedClasses, describe_classes
+from mcaptrack.sources.ingest.labels.roles import describe_classes
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.timeline import (
-    MAX_FRAMES,
     ExistingLabels,
     Placed,
     Timeline,
@@ -128,8 +128,16 @@ class LabelJob(IngestJob):
         self._clock = ("", False)  # remark on times that don't come from pictures, and whether they are assumed
         self._other_rates: list[str] = []
         self._start_ns = options.start_ns or 0
+        beside: list[Numbered] = []
         if into is not None:
             self.prefix, self.pictures = camera_of(into, options.camera)
+            existing = labels_of(into, self.prefix).items()
+            beside = [
+                Numbered(f"{topic} of {into.path}", "mot", 0, 0, labels.frames - 1)
+                for topic, labels in existing
+                if labels.counts_from_0
+            ]
+        share_numbers(self.labels, beside)
         if into is not None and "corrections" in self.labels:
             self.labels["corrections"] = with_new_ids(into, self.prefix, self.labels["corrections"])
             self.frame_id = frame_of(into, self.pictures) if self.pictures else ""
@@ -268,7 +276,10 @@ class LabelJob(IngestJob):
         if frame_counts:
             return max(frame_counts), frame_counts[max(frame_counts)]
         counts = [count_frames(labels) for labels in self.labels.values()]
-        return max(*counts, *(label.frames for label in existing.values()), 1), "the last label"
+        last = max(*counts, *(label.frames for label in existing.values()), 1)
+        ends = [end for _, end in self.options.frame_ranges.ranges if end] if self.options.frame_ranges else []
+        stated = min(max(ends, default=0) - next(iter(self.labels.values())).first_frame, MAX_FRAMES)
+        return (stated, "`frames=`") if stated > last else (last, "the last label")
 
     def _check_overlap(self, into: log.Log, timeline: Timeline) -> None:
         """Check that labels without pictures overlap in time with the log."""
@@ -294,8 +305,7 @@ class LabelJob(IngestJob):
             writer.add_metadata(CLOCK, {"start_ns": str(self._start_ns)})
         self.write_plane(writer, self.ground, int(self.timeline.t_ns[0]))
         if self.into is not None and "corrections" in self.labels:
-            labels = self.labels["corrections"]
-            placed = self.timeline.place(labels, []).between(int(labels.labelled[0]), int(labels.labelled[-1]))
+            placed = self.timeline.place(self.labels["corrections"], "corrections", [])
             warn_uncovered(self.into, f"{self.prefix}/{CORRECTED}", placed)
         self.write_labels(writer, self.ground, self.timeline)
         self.write_motion(writer, self.timeline, self._size)
@@ -306,7 +316,12 @@ class LabelJob(IngestJob):
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The labels of a role as frames, including empty frames."""
-        return list(self.frames(role, self.ground, self.timeline.place(self.labels[role], self.report.lost))())
+        return self.placed_frames(role)[0]
+
+    def placed_frames(self, role: Role) -> tuple[list[Frame], Placed]:
+        """As ``all_frames``, and which frames these are."""
+        placed = self.timeline.place(self.labels[role], role, self.report.lost, self.ranges_of(role))
+        return list(self.frames(role, self.ground, placed)()), placed
 
 
 def _seconds(t_ns: int) -> str:
@@ -323,19 +338,12 @@ def _known(labels: BoxTable) -> _Known:
     return _Known(info.fps, info.frames, SEQINFO) if info else _Known(None, None, "")
 
 
-def label_frames(
-    files: Mapping[Role, Path],
-    fps: Fraction | None,
-    ground_plane: Path | None,
-    point: Point,
-    classes: WantedClasses | None = None,
-) -> dict[Role, list[Frame]]:
+def label_frames(files: Mapping[Role, Path], options: IngestOptions) -> dict[Role, list[Frame]]:
     """Read label files with a common clock as frames, without writing a log.
 
     Raises McaptrackError as ``ingest`` does. For comparisons only the order and intervals of times matter, so files
-    without a frame rate get one frame per second unless ``fps`` is given.
+    without a frame rate get one frame per second unless the options give one.
     """
-    options = IngestOptions(fps=fps, ground_plane=ground_plane, point=point, classes=classes)
     job = LabelJob([(role, path) for role, path in files.items()], options, default_fps=Fraction(1))
     job.report_assumptions()
     return {role: job.all_frames(role) for role in files}
@@ -429,8 +437,8 @@ class Boxes3DJob(IngestJob):
         for stated, path in (*inputs, *options.labels.items()):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
-            given = (options.label_format, stated, options.first_frame, options.columns, options.classes)
-            rows = read_labels(path, *given, scene=options.scene)
+            given = (options.label_format, stated, options.first_of(stated), options.columns, options.classes)
+            rows = read_labels(path, *given, scene=options.scene, class_map=options.class_map)
             role = rows.role
             if not rows.in_space:
                 raise McaptrackError(f"{path} holds boxes in pictures, and {self.source} holds 3D boxes")
@@ -442,7 +450,8 @@ class Boxes3DJob(IngestJob):
         self._topic = boxes_topic(into, options.camera) if into else ""
         if self._topic and options.camera == DEFAULT_CAMERA:
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
-        self.boxes = {role: self._at_times(self._placed(rows)) for role, rows in self.boxes.items()}
+        share_numbers(self.boxes)
+        self.boxes = {role: self._at_times(self._described(self._placed(rows))) for role, rows in self.boxes.items()}
 
     @property
     def roles(self) -> Set[Role]:
@@ -461,6 +470,21 @@ class Boxes3DJob(IngestJob):
         text = f": boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
         (rows.find if reason == "assumed" else rows.remark)(text)
         return replace(rows, facts=replace(rows.facts, frame_id=frame_id))
+
+    def _described(self, rows: BoxTable) -> BoxTable:
+        """Rows of the frames that were labelled, which are also those without boxes between others."""
+        ranges = self.ranges_of(rows.role)
+        if rows.facts.is_timed:
+            if ranges is not None:
+                raise McaptrackError(f"{rows.path} has times, which say what it describes; leave `frames=` out")
+            return rows
+        at = rows.labelled
+        if rows.role == "truth" and not rows.facts.states_labelled and at[-1] - at[0] < MAX_FRAMES:
+            at = np.arange(at[0], at[-1] + 1, rows.step)
+        shown = described(rows, "tracks", at, rows.labelled, ranges, str(rows.path)) if ranges else None
+        at = at if shown is None else at[shown.pictures]
+        kept = np.isin(rows.frame, at)
+        return replace(rows if kept.all() else rows.take(kept), facts=replace(rows.facts, labelled=at))
 
     def _at_times(self, rows: BoxTable) -> BoxTable:
         t_ns, labelled = self._times(rows, rows.frame, rows.labelled)
@@ -535,9 +559,12 @@ class Boxes3DJob(IngestJob):
     def _parameters(self, role: Role) -> dict[str, Any]:
         options = self.options
         parameters: Mapping[str, Any] = {
-            "first_frame": options.first_frame,
+            "first_frame": options.first_of(role),
+            "frames": str(ranges) if (ranges := self.ranges_of(role)) else None,
+            "frames_by": "frames" if ranges else None,
             "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
             "classes": options.classes.text if options.classes and role != "detections" else None,
+            "class_map": str(options.class_map) if options.class_map else None,
             "scene": options.scene,
             "fps": None if options.fps is None else str(options.fps),
         }

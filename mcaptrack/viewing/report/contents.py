@@ -333,6 +333,8 @@ def _score(opened: log.Log, out: LogReport) -> None:
         return
     out.results = outcome.results
     out.notes += outcome.notes
+    if out.sequence.labelled.frames is not None:
+        out.notes.append(f"only the frames {out.sequence.labelled.frames} of the ground truth were labelled and scored")
 
 
 def _classes(opened: log.Log, out: LogReport, topic: str) -> tuple[dict[int, str], dict[int, str]]:

@@ -211,13 +211,11 @@ def check_first_frame(table: BoxTable, asked: Asked) -> None:
     if facts.is_timed or facts.times_s is not None:
         return
     if asked.first_frame is not None:
-        facts.first_frame = asked.first_frame
-    elif facts.states_labelled and facts.first_frame == facts.labelled[0] > 1:
-        text = f": its first picture has the number {facts.first_frame}, and is assumed to be the first picture"
-        table.find(f"{text}; `first_frame=` sets the number", "clock")
+        facts.first_frame, facts.is_first_assumed = asked.first_frame, False
     if facts.first_frame is None:
         least = int(min(facts.labelled.min(initial=MAX_FRAME), table.frame.min()))
         facts.first_frame = min(least, 1)
+        facts.is_first_assumed = least > 0
         if least > 0:
             text = f": frames begin with {least}; frame {facts.first_frame} is assumed to be the first"
             table.find(f"{text} picture, `first_frame=` sets the number", "clock")

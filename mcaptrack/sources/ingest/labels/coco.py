@@ -194,8 +194,11 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
         rows.add(number, entry, frame_of)
     out = rows.done()
     facts = out.facts
-    facts.labelled, facts.states_labelled = np.unique(np.array(frames, np.int64)), True
-    facts.first_frame = int(facts.labelled[0]) if len(frames) else 0
+    is_labelled = np.array([image.get("is_labeled") is not False for image in images], bool)  # PoseTrack
+    numbers = np.array(frames, np.int64)
+    facts.labelled, facts.states_labelled = np.unique(numbers[is_labelled]), True
+    facts.first_frame = int(numbers.min()) if len(numbers) else 0
+    facts.is_first_assumed = facts.first_frame > 0
     facts.sizes = {
         frame: (_float(image["width"]), _float(image["height"]))
         for frame, image in zip(frames, images, strict=True)
@@ -206,6 +209,8 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
         ((width, height),) = sizes
         facts.size = (int(width), int(height))
     out.remark(f": {len(images)} images, in order of {order}")
+    if not is_labelled.all():
+        out.remark(f": {int((~is_labelled).sum())} images are not labelled (is_labeled)")
     if order == _BY_LIST and len(images) > 1:
         text = ": its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
         out.find(f"{text} is taken as that of the pictures", "clock")

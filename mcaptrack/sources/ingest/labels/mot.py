@@ -67,10 +67,11 @@ class Mot(Format):
         values, at = read_numbers(file.path, file.lines(), what, 8, parse, _split)
         score, kind = values[:, 6], values[:, 7]
         facts = LabelFacts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
+        facts.is_first_assumed = facts.first_frame == 1  # some programs number frames from 0 in this format, too
         facts.not_counting, facts.scores_truth = "score 0", False
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=values[:, 2:6], score=score,
-            class_id=np.full(len(values), PERSON), counts=score != 0,
+            class_id=np.full(len(values), NO_CLASS), counts=score != 0,
         )  # fmt: skip
         tens = np.array(sample).reshape(-1, 2)
         kind = np.where(np.isfinite(kind) & (kind < 2**31), kind, NO_CLASS)
@@ -109,6 +110,8 @@ def _name(table: BoxTable, kind: Ints, tens: Floats) -> None:
     if facts.names is None and np.isin(stated, [*names]).all():
         facts.names, facts.named_by = names, "format"
         table.class_id = np.where(kind == NO_CLASS, PERSON, kind)
+        if without := int((kind == NO_CLASS).sum()):
+            table.find(": {0} boxes without a class (-1 in column 8) are taken as people", "classes", without)
         table.aside[(kind == 0) if is_visdrone else np.isin(kind, _DISTRACTORS)] = REGION if is_visdrone else FORGIVEN
         facts.region = "ignored regions" if is_visdrone else ""
     people = [number for number, name in (facts.names or {}).items() if is_person(name)]

@@ -17,11 +17,12 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import refuse_special
 from mcaptrack.registry import BUILT_IN, find
+from mcaptrack.schema.classes import ClassMap
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, check
 from mcaptrack.sources.ingest.labels.format import PLACES, Format, LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package, recognised
-from mcaptrack.sources.ingest.labels.roles import WantedClasses, settled
+from mcaptrack.sources.ingest.labels.roles import WantedClasses, rename, settled
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Extent
 from mcaptrack.sources.ingest.labels.text import lines_of, split
 
@@ -92,6 +93,7 @@ def read_labels(
     wanted: WantedClasses | None = None,
     in_parts: bool = False,
     scene: str | None = None,
+    class_map: ClassMap | None = None,
 ) -> BoxTable:
     """Read a label file.
 
@@ -114,6 +116,8 @@ def read_labels(
         itself, and sorted by frame.
     scene : str, optional
         The name of a part of a data set.
+    class_map : ClassMap, optional
+        Names of classes by what the file calls them.
 
     Returns
     -------
@@ -127,7 +131,7 @@ def read_labels(
     """
     refuse_special(path)
     file = label_file(path, label_format)
-    asked = Asked(label_format, role, columns or {}, scene, wanted, first_frame)
+    asked = Asked(label_format, role, columns or {}, scene, wanted, first_frame, class_map)
     made = known_format(file, label_format, columns)
     if made is None:
         file.refuse_binary()
@@ -140,7 +144,7 @@ def read_labels(
     if file.is_folder and not made.reads_folders:
         raise McaptrackError(f"{path} is a folder, and {name} labels are a file")
     is_alike = role == "detections" or (role in ("tracks", None) and (wanted is None or wanted.is_people))
-    if in_parts and made.in_parts and is_alike and path.stat().st_size >= _LONG_BYTES:
+    if in_parts and made.in_parts and is_alike and class_map is None and path.stat().st_size >= _LONG_BYTES:
         table = _read_in_parts(file, made, replace(asked, role=role or "tracks"))
         if table is not None:
             return table
@@ -155,6 +159,8 @@ def read_by(made: Format, file: LabelFile, asked: Asked) -> BoxTable:
     table = made.read(file, asked)
     table.facts.found_by = "content" if asked.label_format == _AUTO else "option"
     with made.checking() if isinstance(made, FormatOfPackage) else nullcontext():
+        if asked.class_map is not None:
+            rename(table, asked.class_map)
         check(table, asked)
         role = asked.role or ("tracks" if table.has_ids else "detections")
         table = settled(table, role, asked.classes).in_order()
@@ -223,6 +229,7 @@ def _read_in_parts(file: LabelFile, made: Format, asked: Asked) -> BoxTable | No
     facts = tables[0].facts
     facts.labelled = np.unique(np.concatenate([part.labelled for part in tables]))
     facts.first_frame = min(part.first_frame for part in tables)
+    facts.is_first_assumed = all(part.facts.is_first_assumed for part in tables)
     out = replace(
         tables[0],
         stored=(),

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Bools, Ints
-from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
+from mcaptrack.notices import warn
+from mcaptrack.schema.classes import PERSON, UNKNOWN, ClassMap, is_person
 from mcaptrack.sources.ingest.labels.table import (
     FORGIVEN,
     NO_CLASS,
@@ -86,6 +87,23 @@ def describe_classes(ids: NDArray[np.integer], counts: Ints, names: Mapping[int,
     called = [f"{number} {names.get(number, '')}".strip() for number in ids.tolist()]
     counted = [f"{name} ({count})" for name, count in zip(called, counts.tolist(), strict=True)]
     return list_names(counted, _MAX_LISTED)
+
+
+def rename(table: BoxTable, class_map: ClassMap) -> None:
+    """Give classes the names of a map, by their number in the source or their name there."""
+    facts, numbers = table.facts, np.unique(table.class_id)
+    own = facts.names or {}
+    are_texts = facts.numbering is not None
+    names = {} if are_texts else {int(n): name for n in numbers if n != NO_CLASS and (name := class_map.name(int(n)))}
+    names = {number: class_map.name(name) or name for number, name in own.items()} | names
+    if names == own:
+        said = list_names([*own.values()] or [f"{number:g}" for number in numbers if number != NO_CLASS], _NAMED)
+        warn(
+            f"{table.path}: `class_map=` changes nothing here: its classes are {said or 'not stated'}",
+            "option-not-used",
+        )
+        return
+    facts.names, facts.named_by = names, "the option"
 
 
 def settled(table: BoxTable, role: Role, wanted: WantedClasses | None, may_be_empty: bool = False) -> BoxTable:

@@ -23,7 +23,7 @@ from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.notices import Code
-from mcaptrack.schema.classes import UNKNOWN
+from mcaptrack.schema.classes import UNKNOWN, ClassMap
 from mcaptrack.schema.provenance import Plugin
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ class LabelFacts:
         How the format was found: "option" or "content".
     first_frame : int, optional
         The number of the first picture; None until it is known.
+    is_first_assumed : bool
+        Whether the source doesn't tell it.
     times_s : float array (F,), optional, s
         Rising times of labelled frames, if the source has times; its frames are then places in them.
     is_timed : bool
@@ -103,6 +105,7 @@ class LabelFacts:
     format: str
     found_by: str = ""
     first_frame: int | None = None
+    is_first_assumed: bool = False
     times_s: Floats | None = None
     is_timed: bool = False
     fps: Fraction | None = None
@@ -128,7 +131,7 @@ class LabelFacts:
 
     @property
     def meaning(self) -> tuple[Any, ...]:
-        """How classes were understood, which is the same in all parts of a file."""
+        """The meaning of classes, which is the same in all parts of a file."""
         return self.names, self.named_by, self.is_normalised
 
     def to_json(self) -> dict[str, Any]:
@@ -336,8 +339,12 @@ class BoxTable:
     @property
     def step(self) -> int:
         """The step of labelled frames: 12 if every twelfth frame is labelled."""
+        return self.step_of(self.labelled)
+
+    def step_of(self, frames: Ints) -> int:
+        """The step of the numbers (F,) of labelled frames, which rise."""
         least = 2 if self.facts.interval_s is not None else _SPARSE_FRAMES
-        return int(np.gcd.reduce(np.diff(self.labelled))) if len(self.labelled) >= least else 1
+        return int(np.gcd.reduce(np.diff(frames))) if len(frames) >= least else 1
 
     def columns(self, rows: Ints | Bools | slice = slice(None)) -> dict[str, Any]:
         """The columns of some rows by name."""
@@ -416,7 +423,7 @@ class Asked:
     ``role`` is what its rows are, None: tracks if they have ids; ``columns`` are names of the columns of a table by
     what they hold; ``scene`` the name of a part of a data set; ``classes`` are those of tracks and ground truth
     (detections keep all), by default people, and of boxes in space all; ``first_frame`` is the number of the first
-    picture.
+    picture; ``class_map`` are names of classes by what the source calls them.
     """
 
     label_format: str = "auto"
@@ -425,3 +432,4 @@ class Asked:
     scene: str | None = None
     classes: WantedClasses | None = None
     first_frame: int | None = None
+    class_map: ClassMap | None = None

@@ -33,33 +33,35 @@ from mcaptrack.schema.framing import joined_parts
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import DEFAULT_CAMERA, provenance_of
 from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, FrameRanges, described
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.sources.video import is_video_codec, read_head
 from mcaptrack.transforms import STAGES
 
-#: The largest frame number: more than three days at 30 frames a second.
-MAX_FRAMES: Final = 10_000_000
 #: Limits for unlabelled frames of a file without pictures: in total, and for each labelled frame.
 _EMPTY_FRAMES: Final = 100_000
 _EMPTY_A_LABELLED: Final = 100
 #: Intervals up to this multiple of the smallest are one frame.
 _ALIKE: Final = 1.5
+#: Times differ from those of pictures if it is by more than this, and by this share of half an interval.
+_EXACT_MS: Final = 1.0
+_NEAR: Final = 0.2
 #: Pictures match a frame rate if none deviates by more than this share of a frame.
 _OFF_FRAMES: Final = Fraction(1, 2)
 
 
 class Placed(NamedTuple):
-    """The labelled frames of a file (F,): their numbers in the file, picture indexes from 0, and times in ns."""
+    """The labelled frames of a file (F,): their numbers in the file, picture indexes from 0, and times in ns.
+
+    ``ranges`` are the frames that were labelled where it isn't all of them, and ``by`` is how that is known.
+    """
 
     number: Ints
     index: Ints  # type: ignore[assignment]  # hides tuple.index, which is not needed here
     t_ns: Ints
-
-    def between(self, first: int, last: int) -> Placed:
-        """The frames with numbers from ``first`` to ``last`` in the file."""
-        inside = (self.number >= first) & (self.number <= last)
-        return Placed(self.number[inside], self.index[inside], self.t_ns[inside])
+    ranges: FrameRanges | None = None
+    by: str = ""
 
 
 @dataclass(frozen=True)
@@ -128,19 +130,22 @@ class Timeline:
         gaps = np.diff(self.t_ns) / np.diff(self.index)
         return NS_PER_S / float(np.median(gaps)) if len(gaps) else 0.0
 
-    def place(self, labels: BoxTable, lost: list[str]) -> Placed:
+    def place(self, labels: BoxTable, role: Role, lost: list[str], ranges: FrameRanges | None = None) -> Placed:
         """Assign the labelled frames of a file to pictures, including frames without labels in between.
+
+        ``ranges`` are the frames that a user says were labelled.
 
         Raises McaptrackError if there are labels before the first or after the last picture. If pictures are known to
         be lost, such labels are reported in ``lost`` instead.
         """
         path = labels.path
         if labels.times_s is not None:
-            return self._place_by_time(path, labels.times_s)
+            return self._place_by_time(labels, labels.times_s, role, ranges)
         every = self._every(labels)
         frame, count = labels.extent.frames
-        at = (frame - labels.first_frame) // every
         end = int(self.index[-1]) + 1
+        self._choose_first(labels, every, end)
+        at = (frame - labels.first_frame) // every
         if at[0] < 0:
             raise McaptrackError(
                 f"{path}: its first label is of frame {frame[0]}, and frame {labels.first_frame} is assumed to "
@@ -154,14 +159,19 @@ class Timeline:
         missing = int(count[(at < end) & ~np.isin(at, self.index)].sum())
         if missing:
             lost.append(f"{path}: {missing} labels are of frames with missing pictures")
-        step = labels.step // every or 1
-        is_labelled = self.index % step == (int(labels.labelled[0]) - labels.first_frame) // every % step
-        return Placed(
-            every * self.index[is_labelled] + labels.first_frame, self.index[is_labelled], self.t_ns[is_labelled]
-        )
+        return self._described(labels, role, every * self.index + labels.first_frame, labels.labelled, ranges, None)
 
-    def _place_by_time(self, path: Path, seconds: Floats) -> Placed:
+    def _described(
+        self, labels: BoxTable, role: Role, number: Ints, at: Ints, ranges: FrameRanges | None, place: Ints | None
+    ) -> Placed:
+        """The pictures that a file describes, as ``described``; ``place`` (P,) are their numbers in its rows."""
+        shown = described(labels, role, number, at, ranges, self.of)
+        some = shown.pictures
+        return Placed((number if place is None else place)[some], self.index[some], self.t_ns[some], *shown[1:])
+
+    def _place_by_time(self, labels: BoxTable, seconds: Floats, role: Role, ranges: FrameRanges | None) -> Placed:
         """Assign frames that have times to the nearest pictures: times of the log, or times since the first picture."""
+        path = labels.path
         half = float(np.median(np.diff(self.t_ns))) / 2 if len(self.t_ns) > 1 else NS_PER_S / 2
         first, last = int(self.t_ns[0]), int(self.t_ns[-1])
         since = seconds * NS_PER_S - first  # exact enough: 256 ns today
@@ -187,9 +197,13 @@ class Timeline:
         if len(same):
             first_s, other = seconds[same[0]], seconds[same[0] + 1]
             raise McaptrackError(f"{path}: {first_s:.9g} and {other:.9g} s are nearest to the same of {self.of}")
-        number = np.full(len(self.t_ns), -1)
-        number[nearest] = np.arange(len(seconds))
-        return Placed(number, self.index, self.t_ns)
+        off_ms = float(np.abs(pictures[nearest] - since).max(initial=0.0)) / 1e6
+        if off_ms > max(_EXACT_MS, half / 1e6 * _NEAR):
+            text = f"{path}: its times are up to {off_ms:.3g} ms from those of {self.of}, and belong to the nearest one"
+            warn(f"{text} (up to half an interval, {half / 1e6:.3g} ms)", "clock")
+        place = np.full(len(self.t_ns), -1)
+        place[nearest] = np.arange(len(seconds))
+        return self._described(labels, role, self.index, self.index[nearest], ranges, place)
 
     def _every(self, labels: BoxTable) -> int:
         """The step of frame numbers in a label file, which may use the numbers in the names of images."""
@@ -198,6 +212,29 @@ class Timeline:
         if int(labels.labelled[-1]) > labels.first_frame:
             warn(f"{labels.path} counts frames as the names of {self.of} do, every {self.every}", "clock")
         return self.every
+
+    def _choose_first(self, labels: BoxTable, every: int, end: int) -> None:
+        """Choose the number of the first picture by that of the last one where the file doesn't tell, and warn of it.
+
+        A file that was taken to count from 0, as others do, counts from 1 if it has a label one after the last picture.
+        The numbers of images that begin later are those of pictures if they fit; otherwise the first one is the first.
+        """
+        first, last = labels.first_frame, int(labels.labelled[-1])
+        if not labels.facts.is_first_assumed or first == 1:
+            return
+        if first == 0:
+            if last // every == end:
+                labels.facts.first_frame = 1
+                warn(f"{labels.path}: frame {last} is taken to be the last of {end} pictures, counted from 1", "clock")
+            return
+        text = "is assumed to be the first picture"
+        if last // every <= end != (last - first) // every + 1:
+            labels.facts.first_frame = int(last // every == end)
+            text = f"is taken to be picture {first - labels.first_frame} of {end}, counted from 0"
+        warn(
+            f"{labels.path}: its first image has the number {first}, and {text}; `first_frame=` sets the number",
+            "clock",
+        )
 
     def _beyond(self, labels: BoxTable, beyond: int, end: int) -> str:
         """The error for labels after frame ``end`` of the file, the last picture."""
@@ -412,11 +449,14 @@ def _may_be_video(opened: log.Log, topic: str) -> bool:
 
 
 class ExistingLabels(NamedTuple):
-    """Labels in a log: their sorted times, the number of frames, and the frame rate if it is known."""
+    """Labels in a log: their sorted times, the number of frames, the frame rate if it is known, and whether their file
+    counts them from 0 although its format may count from 1.
+    """
 
     t_ns: NDArray[np.int64]
     frames: int
     fps: Fraction | None
+    counts_from_0: bool
 
 
 def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
@@ -429,7 +469,7 @@ def labels_of(opened: log.Log, prefix: str) -> dict[str, ExistingLabels]:
             value = provenance.parameters.get("fps")
             fps = parse_fps(value) if isinstance(value, str) else None
             frames = 1 + max(message.sequence for message in opened.messages(channel.topic, int(t_ns[-1])))
-            out[channel.topic] = ExistingLabels(t_ns, frames, fps)
+            out[channel.topic] = ExistingLabels(t_ns, frames, fps, provenance.parameters.get("first_frame") == 0)
     return out
 
 

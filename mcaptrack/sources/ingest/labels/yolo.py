@@ -26,7 +26,7 @@ _NOT_LABELS: Final = (*LISTS, *_READMES, "train.txt", "val.txt", "test.txt")
 #: So many files of a folder tell whether it is of this kind.
 _LOOKED_AT: Final = 100
 _MAX_FILES: Final = 1_000_000
-_WHAT: Final = "YOLO (class x y width height [confidence] [id])"
+_ROW: Final = "YOLO (class x y width height [confidence] [id])"
 
 
 def _label_files(folder: Path) -> list[Path]:
@@ -69,7 +69,7 @@ class Yolo(Format):
         by = "their names" if numbers else "their order"
         remarks = [f"{folder}: {len(files)} files, frames are numbered by {by}"]
         numbers = numbers or list(range(len(files)))
-        parts = [read_numbers(path, lines_of(path), _WHAT, 7, _parse, str.split) for path in files]
+        parts = [read_numbers(path, lines_of(path), _ROW, 7, _parse, str.split) for path in files]
         counts = [len(part.values) for part in parts]
         ends = np.cumsum(counts)
         if ends[-1] > MAX_ROWS:
@@ -86,6 +86,7 @@ class Yolo(Format):
         facts = LabelFacts(
             folder, "yolo", is_normalised=True, first_class=0, labelled=np.array(sorted(numbers), np.int64)
         )
+        facts.states_labelled = 0 in counts  # others write no files without boxes
         table = BoxTable(
             facts=facts, at=at, frame=frame, id=track_id, score=score, class_id=rows[:, 0], remarks=remarks,
             boxes_px=np.concatenate([rows[:, 1:3] - rows[:, 3:5] / 2, rows[:, 3:5]], axis=1),

@@ -1,0 +1,96 @@
+"""Rows of a file that isn't a table, gathered one after the other: of JSON, mostly.
+
+Letters: N rows, C numbers of a box.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Floats
+from mcaptrack.sources.ingest.labels.table import NO_ID, NOTHING, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import MAX_ROWS, ClassNames, TrackIds, is_count, is_number
+
+_MAX_NAME: Final = 256
+
+
+class GatheredRows:
+    """Rows as they come: boxes in pictures, or in metres, which are all the same kind.
+
+    ``what`` names a row in messages, as "label".
+    """
+
+    def __init__(self, facts: LabelFacts, what: str) -> None:
+        self.facts, self._what = facts, what
+        self._values, self._boxes, self._places = array("d"), array("d"), list[str]()
+        self._ids, self._names = TrackIds(), ClassNames()
+
+    def refuse(self, place: str, problem: str) -> McaptrackError:
+        """The error for a row at this place in the file."""
+        return McaptrackError(f"{self.facts.path}: {self._what} {place} {problem}")
+
+    def numbers(self, place: str, content: Any, keys: Sequence[Any]) -> list[float]:
+        """The numbers with these keys, or at these places. Raises McaptrackError if there aren't all."""
+        try:
+            values = [content[key] for key in keys]
+        except (KeyError, IndexError, TypeError):
+            values = [None]
+        if not all(map(is_number, values)) or (isinstance(content, list) and len(content) != len(keys)):
+            listed = ", ".join(map(str, keys))
+            raise self.refuse(place, f"has no box of {len(keys)} numbers ({listed}): {str(content)[:60]}")
+        return [float(value) if abs(value) < 1e300 else np.inf for value in values]
+
+    def add(
+        self,
+        place: str,
+        frame: float,
+        box: Sequence[float],
+        track: Any = None,
+        name: Any = None,
+        score: Any = None,
+        *,
+        observed: bool = True,
+        counts: bool = True,
+        aside: int = NOTHING,
+    ) -> None:
+        """Add a row. ``track`` is a number or a text, ``name`` that of its class. Raises McaptrackError if not."""
+        if isinstance(track, str):
+            track = (int(track) if is_count(track, 15) else self._ids.number(track[:_MAX_NAME])) if track else None
+        for value, key in ((track, "id"), (score, "score")):
+            if value is not None and not is_number(value):
+                raise self.refuse(place, f"has a {key} that is no number: {str(value)[:40]!r}")
+        if name is not None and not isinstance(name, str):
+            raise self.refuse(place, f"has a class that is no text: {str(name)[:40]!r}")
+        kind = self._names.number(name or "")
+        own, stated = NO_ID if track is None else track, np.nan if score is None else score
+        self._values.extend((frame, own, kind, stated, observed, counts, aside))
+        self._boxes.extend(box)
+        self._places.append(place)
+        if len(self._places) > MAX_ROWS:
+            raise McaptrackError(f"{self.facts.path} has more than {MAX_ROWS} boxes; give it in parts")
+
+    def table(self) -> BoxTable:
+        """All rows. Raises McaptrackError if there are none."""
+        count, facts = len(self._places), self.facts
+        if not count:
+            raise McaptrackError(f"{facts.path} holds no boxes")
+        values: Floats = np.frombuffer(self._values, np.float64).reshape(count, -1)
+        boxes: Floats = np.frombuffer(self._boxes, np.float64).reshape(count, -1).copy()
+        frame, own, kind, score, observed, counts, aside = values.T
+        track_id, said = self._ids.of(facts.path, own)
+        names = self._names.names
+        facts.names, facts.numbering, facts.named_by = (names, {}, "file") if names else (None, None, "")
+        places = self._places
+        return BoxTable(
+            facts=facts, at=lambda row: f"{facts.path}: {self._what} {places[row]}", frame=frame, id=track_id,
+            boxes_px=boxes if boxes.shape[1] == 4 else None, boxes_m=boxes if boxes.shape[1] == 7 else None,
+            xy_m=boxes if boxes.shape[1] == 2 else None, score=score, class_id=kind,
+            observed=None if observed.all() else observed == 1, counts=None if counts.all() else counts == 1,
+            aside=aside.astype(int) if aside.any() or not counts.all() else None,
+            remarks=said,
+        )  # fmt: skip
