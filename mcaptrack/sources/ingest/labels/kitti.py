@@ -146,9 +146,9 @@ class KittiFrames(PictureFormat):
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The pictures of a folder."""
         for path in files_in(file.path, ".txt"):
-            picture, self.where = Picture(path.name, []), str(path)
+            picture, self.where = Picture(path.name, []), path.name
             for number, line in lines_of(path):
-                self.where, cells = f"{path}:{number}", line.split()
+                self.where, cells = f"{path.name}:{number}", line.split()
                 check_columns(cells, 15, 17)
                 track = cells.pop(1) if len(cells) == 17 else None
                 (box,) = as_boxes(np.array([cells[4:8]], float)).tolist()

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.sources.ingest.labels.format import LabelFile
+from mcaptrack.sources.ingest.labels.format import MAX_LINE, LabelFile
 from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape
 
 _MAX_PIXELS: Final = 2**31
@@ -53,7 +52,7 @@ def _unpacked(text: str) -> list[int]:
 
 
 class Mots(PictureFormat):
-    """Text of MOTS, sorted by frame: boxes are those around the masks."""
+    """Text of MOTS: boxes are those around the masks."""
 
     name, title = "mots", "MOTS"
     row = "`frame id class height width rle`"
@@ -65,11 +64,12 @@ class Mots(PictureFormat):
 
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The frames of a file."""
-        rows = ((number, line.split()) for number, line in file.lines())
-        for frame, group in groupby(rows, key=lambda row: row[1][0]):
-            picture = Picture(frame, [])
-            for number, (_, track, kind, height, width, counts) in group:
-                self.where, picture.size = f"{file.path}:{number}", (width, height)
-                box = box_of_mask({"size": (height, width), "counts": counts})
-                picture.shapes.append(Shape(box, _NAMES.get(kind, kind), None, track))
-            yield picture
+        pictures = dict[str, Picture]()
+        for number, line in file.lines(MAX_LINE):
+            self.where = f"line {number}"
+            frame, track, kind, height, width, counts = line.split()
+            picture = pictures.setdefault(str(int(frame)), Picture(frame, [], (width, height)))
+            box = box_of_mask({"size": (height, width), "counts": counts})
+            picture.shapes.append(Shape(box, _NAMES.get(kind, kind), None, track))
+        self.where = ""
+        yield from pictures.values()

@@ -5,8 +5,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
-import math
-from array import array
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,16 +16,16 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, ClassNames, TrackIds, numbers_of_names
+from mcaptrack.sources.ingest.labels.gathered import GatheredRows
+from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import numbers_of_names
 from mcaptrack.sources.video.image_folder import natural_order
 
 _MAX_PICTURES: Final = 1_000_000
 _MAX_NAME: Final = 256
 #: The name that regions have whose boxes don't count.
 _REGION: Final = "dontcare"
-#: Numbers of a row: picture, left, top, width, height, score, class, id.
-_COLUMNS: Final = 8
+_WHOLE: Final = re.compile(r"-?\d{1,15}")
 
 
 @dataclass
@@ -68,12 +67,14 @@ def files_in(folder: Path, suffix: str) -> list[Path]:
 
 
 class PictureFormat(Format):
-    """Base of formats that describe pictures one by one: a subclass yields these. ``is_normalised``: boxes are in
-    shares of the picture's size, and ``where`` is the place that is read, if it isn't the file.
+    """Base of formats that describe pictures one by one: a subclass yields these.
+
+    ``is_normalised``: boxes are in shares of the picture's size; None: the numbers tell. ``where`` is the place that is
+    read, if it isn't the file as a whole.
     """
 
     name: ClassVar[str]
-    is_normalised: ClassVar[bool] = False
+    is_normalised: ClassVar[bool | None] = None
     where: str = ""
 
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
@@ -82,64 +83,44 @@ class PictureFormat(Format):
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The boxes of all pictures. The numbers in their names are those of frames, otherwise their order."""
-        rows, places, pictures = array("d"), list[str](), list[Picture]()
-        names, ids, other = ClassNames(), TrackIds(), Counter[str]()
+        facts = LabelFacts(file.path, self.name, is_normalised=self.is_normalised, states_labelled=True)
+        rows, pictures, other = GatheredRows(facts, "picture"), list[Picture](), Counter[str]()
         try:
             for picture in self.pictures(file):
-                where = self.where or f"{file.path}: {picture.name[:_MAX_NAME]}"
                 for shape in picture.shapes:
+                    name = None if shape.label in (None, "") else str(shape.label)
+                    aside = REGION if name is not None and name.lower() == _REGION else NOTHING
+                    score = None if shape.score is None else float(shape.score)
                     left, top, width, height = (float(number) for number in shape.box)
-                    label = names.number(str(shape.label)) if shape.label not in (None, "") else NO_CLASS
-                    score = math.nan if shape.score is None else float(shape.score)
-                    rows.extend((len(pictures), left, top, width, height, score, label, _id(ids, shape.id)))
-                    places.append(where)
+                    box, place = (left, top, width, height), self.where or picture.name[:_MAX_NAME]
+                    rows.add(place, len(pictures), box, _track(shape.id), name, score, aside=aside)
                 other.update(picture.other)
                 picture.shapes = []
                 pictures.append(picture)
-                if max(len(places), len(pictures)) > MAX_ROWS:
-                    raise McaptrackError(f"{file.path} has more than {MAX_ROWS} rows; give it in parts")
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             text = f"no {error}" if isinstance(error, KeyError) else str(error)
-            what = f"{self.title} ({self.row.strip('`')})"
-            raise McaptrackError(f"{self.where or file.path}: not {what}: {text[:200]}") from None
-        if not pictures:
-            raise McaptrackError(f"{file.path} holds no labels of {self.title}")
-        table = self._table(file.path, np.frombuffer(rows).reshape(-1, _COLUMNS), pictures, names.names, ids)
-        table.at = places.__getitem__
+            where = f"{file.path}: {self.where}" if self.where else f"{file.path}"
+            raise McaptrackError(f"{where}: not {self.title} ({self.row.strip('`')}): {text[:200]}") from None
+        table = rows.table()
+        numbers = numbers_of_names([picture.name for picture in pictures])
+        by = "the numbers in their names" if numbers else "their order"
+        frames = np.array(numbers or range(len(pictures)), np.int64)
+        table.frame, facts.labelled = frames[table.frame.astype(np.int64)], np.unique(frames)
+        facts.first_frame, facts.is_first_assumed = int(frames.min()), int(frames.min()) > 0
+        facts.region = "DontCare" if table.aside is not None else ""
+        sizes = ((frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True))
+        stated = {frame: (float(size[0]), float(size[1])) for frame, size in sizes if size}
+        facts.sizes = {frame: size for frame, size in stated.items() if min(size) > 0} or None
+        if len(different := set(stated.values())) == 1 and len(facts.sizes or ()) == len(pictures):
+            ((width, height),) = different
+            facts.size = (int(width), int(height))
+        table.remark(f": {len(pictures)} pictures, frames are numbered by {by}")
         if other:
             counted = ", ".join(f"{count} {kind}" for kind, count in other.most_common())
             table.find(f": left out are shapes that are no boxes: {counted}")
         return table
 
-    def _table(self, path: Path, rows: Any, pictures: list[Picture], names: dict[int, str], ids: TrackIds) -> BoxTable:
-        numbers = numbers_of_names([picture.name for picture in pictures])
-        by = "the numbers in their names" if numbers else "their order"
-        frames = np.array(numbers or range(len(pictures)), np.int64)
-        facts = LabelFacts(path, self.name, is_normalised=self.is_normalised, labelled=np.unique(frames))
-        facts.states_labelled, facts.first_frame = True, int(frames.min())
-        if names:
-            facts.names, facts.numbering, facts.named_by = names, {}, "file"
-        sizes = ((frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True))
-        stated = {frame: (float(size[0]), float(size[1])) for frame, size in sizes if size}
-        facts.sizes = {frame: size for frame, size in stated.items() if min(size) > 0} or None
-        if len(different := set(stated.values())) == 1 and facts.sizes:
-            ((width, height),) = different
-            facts.size = (int(width), int(height))
-        track_id, said = ids.of(path, rows[:, 7])
-        regions = [number for number, name in names.items() if name.lower() == _REGION]
-        aside = np.where(np.isin(rows[:, 6], regions), REGION, NOTHING) if regions else None
-        facts.region = "DontCare" if regions else ""
-        remarks = [f"{path}: {len(pictures)} pictures, frames are numbered by {by}", *said]
-        return BoxTable(
-            facts=facts, frame=frames[rows[:, 0].astype(np.int64)], id=track_id, boxes_px=rows[:, 1:5],
-            score=rows[:, 5], class_id=rows[:, 6], aside=aside, remarks=remarks,
-        )  # fmt: skip
 
-
-def _id(ids: TrackIds, value: Any) -> float:
-    if value is None or value == "":
-        return NO_ID
-    try:
-        return float(value)
-    except ValueError:
-        return ids.number(str(value)[:_MAX_NAME])
+def _track(value: Any) -> Any:
+    """The id of a track, as a number if a text is one."""
+    return int(value) if isinstance(value, str) and _WHOLE.fullmatch(value) else value

@@ -61,7 +61,7 @@ class Voc(PictureFormat):
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The pictures of a file or of a folder."""
         for path in files_in(file.path, ".xml") if file.is_folder else [file.path]:
-            root, self.where = _Tree(path).tree(), str(path)
+            root, self.where = _Tree(path).tree(), path.name
             if root.tag != _ROOT:
                 raise ValueError(f"it begins with <{root.tag[:40]}>")
             sides = [root.findtext(f"size/{side}") for side in ("width", "height")]
@@ -74,7 +74,11 @@ class Voc(PictureFormat):
                 if each.findtext("deleted") == "1" or not (points or any(corners)):
                     picture.other.update([each.findtext("type") or "without a box"])
                     continue
-                box = around(points or [corners[:2], corners[2:]])
+                if points:
+                    box = around(points)
+                else:
+                    left, top, right, bottom = (float(end or "") for end in corners)
+                    box = [left, top, right - left, bottom - top]
                 picture.shapes.append(Shape(box, each.findtext("name"), each.findtext("score"), _track_of(each)))
             yield picture
 
