@@ -22,7 +22,7 @@ from pyarrow import feather
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN
+from mcaptrack.registry import BUILT_IN, find
 from mcaptrack.sources.ingest.labels.checks import CHECKS
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 
@@ -472,6 +472,14 @@ def test_every_format_and_every_check_is_here():
     assert set(BROKEN) == {*CHECKS, "classes"}
 
 
+def test_the_page_of_formats_has_the_table_of_the_registry():
+    page = (Path(__file__).parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
+    formats = {name: find("label_format", name).cls for name in BUILT_IN["label_format"]}
+    assert [f"| `{name}` | {form.title} | {form.row} |" in page for name, form in formats.items()] == [True] * len(
+        formats
+    )
+
+
 def has(name: str) -> set[str]:
     """The columns and facts of a format, as they are declared here."""
     writer = WRITERS[name]
@@ -569,3 +577,43 @@ def test_a_first_picture_that_is_assumed_is_said(name, tmp_path, pictures):
         role="truth" if WRITERS[name].tracks else "detections",
     )
     assert "clock" in [notice.code for notice in result.warnings]
+
+
+def test_positions_in_metres_have_a_hint_that_works(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("frame,ped_id,pos_x,pos_y\n1,7,1.5,2.5\n2,7,1.6,2.5\n")
+    with pytest.raises(McaptrackError) as refused:
+        mcaptrack.ingest(path, tmp_path / "a.mcap", fps=10)
+    (hint,) = re.findall(r"positions in metres are read with `columns='(.*)'`", str(refused.value))
+    result = mcaptrack.ingest(path, tmp_path / "a.mcap", fps=10, columns=hint)
+    with mcaptrack.open(result.log) as log:
+        rows = log.array("tracks", "/camera/tracks")
+    assert (rows["x_m"].tolist(), rows["track_id"].tolist()) == ([1.5, 1.6], [7, 7])
+
+
+#: Rows of MOTChallenge, names beside them, and the classes of detections, by hand.
+NAMED: dict[str, tuple[list[str], dict[str, str], dict[int, str], list[int]]] = {
+    "visdrone": (["1,0,0"] * 2 + ["4,0,1", "2,1,2"], {}, {1: "pedestrian", 4: "car"}, [1, 1, 4, 1]),
+    "ten columns without a meaning": (["1,-1,-1", "3,-1,-1"], {}, {}, [1, 3]),
+    "COCO in ten columns": (["0,-1,-1", "2,-1,-1"], {}, {}, [1, 3]),
+    "places in the world": (["7,8,9", "-3.5,2,0"], {}, {}, [1, 1]),
+    "labels of CVAT": (["1,1.0", "2,1.0"], {"labels.txt": "car\nperson\n"}, {3: "car", 1: "person"}, [3, 1]),
+    "names from 0": (["0,1", "2,1"], {"classes.txt": "person\nbike\ncar"}, {1: "person", 2: "car"}, [1, 2]),
+    "a file of names": (["1,1", "2,1"], {"my.names": "car\nperson"}, {3: "car", 1: "person"}, [3, 1]),
+    "a data.yaml": (["0,1", "2,1"], {"data.yaml": "names: [person, bike, car]"}, {1: "person", 2: "car"}, [1, 2]),
+    "MOT17": (["1,1", "3,0.5"], {}, {1: "pedestrian", 3: "car"}, [1, 3]),
+}
+
+
+@pytest.mark.parametrize(("ends", "files", "classes", "ids"), NAMED.values(), ids=NAMED)
+def test_column_8_of_motchallenge_is_a_class_where_it_can_be_one(ends, files, classes, ids, tmp_path):
+    path = tmp_path / "gt.txt"
+    path.write_text("".join(f"1,{n},{100 * n},20,30,60,1,{end}\n" for n, end in enumerate(ends, start=1)))
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    table = read_labels(path, role="detections")
+    assert (table.classes, table.class_id.tolist()) == (classes, ids)
+    people = read_labels(path, role="tracks")
+    assert people.id.tolist() == [n for n, kind in enumerate(ids, start=1) if kind == 1]
+    is_nameless = not classes and set(ids) != {1}
+    assert ("classes" in [code for _, code in table.doubts]) == is_nameless

@@ -275,7 +275,6 @@ KINDS: dict[str, tuple[Callable[[Path], Path], str, str]] = {
     "json lines, packed": (lambda p: written(p / "a.jsonl.gz", gzip.compress("\n".join(map(json.dumps, ROWS)).encode())), "records", ALL),
     "json rows": (lambda p: written(p / "a.json", ROWS), "records", ALL),
     "json columns": (lambda p: written(p / "a.json", {key: {str(k): row[key] for k, row in enumerate(ROWS)} for key in KEYS}), "records", ALL),
-    "json split": (lambda p: written(p / "a.json", {"columns": KEYS, "index": [0, 1, 2, 3], "data": SCENE}), "records", ALL),
     "json boxes": (lambda p: written(p / "a.json", [{"frame": r[0], "name": r[2], "class": ("person", "car").index(r[2]), "track_id": r[1], "confidence": r[7], "box": coordinates(*r[3:7])} for r in SCENE]), "records", ALL),
     "voc": (lambda p: each(p / "voc", voc), "voc", NEITHER),
     "voc, inside": (lambda p: each(p / "Annotations", voc).parent, "voc", NEITHER),

@@ -69,6 +69,8 @@ class IngestResult:
         Whether there were label files.
     uses_camera : bool
         Whether anything was written below the name of the camera.
+    labels : dict
+        The facts about label files by role: format, clock, classes and labelled frames, and where these are from.
     changes : dict or None
         What corrections changed: numbers of boxes that are the same, moved, added and removed, and ids of tracks that
         were joined, split, added and removed; None if there were none.
@@ -83,6 +85,7 @@ class IngestResult:
     warnings: tuple[Notice, ...]
     has_labels: bool
     uses_camera: bool
+    labels: Mapping[str, Mapping[str, Any]]
     changes: Mapping[str, Any] | None
 
     @classmethod
@@ -99,6 +102,7 @@ class IngestResult:
             warnings=tuple(dict.fromkeys(warnings)),
             has_labels=report.has_labels,
             uses_camera=report.uses_camera,
+            labels=report.facts,
             changes=changes,
         )
 

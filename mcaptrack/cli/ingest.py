@@ -55,6 +55,7 @@ class Ingest(EachLog["IngestResult"]):
             "messages": done.messages,
             "notes": [with_flags(note) for note in (*done.notes, *done.details)],
             "lost": [with_flags(loss) for loss in done.lost],
+            **({"labels": done.labels} if done.labels else {}),
             **({"changes": done.changes} if done.changes is not None else {}),
         }
 

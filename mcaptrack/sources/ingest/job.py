@@ -440,10 +440,10 @@ class IngestJob:
             if placed.ranges is not None:
                 parameters |= {"frames": str(placed.ranges), "frames_by": placed.by}
             frames = self.frames(role, plane, placed)
+            warnings = [(notice.code, notice.message) for notice in warned if notice.code == "labelled"]
             self.write_rows(
-                writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels,
-                warnings=[(notice.code, notice.message) for notice in warned if notice.code == "labelled"],
-            )  # fmt: skip
+                writer, TOPIC_OF.get(role, role), SCHEMA_OF[role], frames, parameters, labels, warnings=warnings
+            )
 
     def ranges_of(self, role: Role) -> FrameRanges | None:
         """The frames that a user says were labelled: of the ground truth, if there is any."""
@@ -502,6 +502,11 @@ class IngestJob:
             return encoded(schema, without if only else frames(), PROTOBUF)
 
         classes = {} if labels is None else labels.classes
+        if labels is not None:
+            warnings = [
+                *((code, text.replace(str(labels.path), labels.path.name)) for text, code in labels.doubts),
+                *warnings,
+            ]
         names, class_id = {str(number): name for number, name in sorted(classes.items())}, str(only) if only else ""
         plugins = {"label_format": labels.facts.plugin} if labels is not None and labels.facts.plugin else {}
         of_rows = digest(messages(), classes_beside_rows(class_id, names))

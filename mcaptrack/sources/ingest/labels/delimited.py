@@ -465,7 +465,8 @@ HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
     "name": ("classname", "categoryname", "labelname", "name"),
-    "id": ("trackid", "trackerid", "pedestrianid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid"),
+    "id": ("trackid", "trackerid", "pedestrianid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid",
+           "pedid", "personid", "agentid"),
 }  # fmt: skip
 #: Keys of which several columns may fit; the first header of the list above is read.
 _RANKED: Final = ("frame", "t", "class", "id")
@@ -549,11 +550,11 @@ def choose_columns(where: str, header: Sequence[str], chosen: Mapping[str, str])
         complete.sort(key=lambda pair: -len(chosen.keys() & pair))
         if not complete:
             x, y = (_fitting(_HEADERS_3D[key], plain, {}) or _by_end(key, header, {}) for key in _PLACE[:2])
-            metres = f"x_m={header[x[0]]},y_m={header[y[0]]}" if x and y else ""
-            metres = f"of positions in metres with `columns={metres!r}`, " if metres else ""
+            hint = f"x_m={header[x[0]]},y_m={header[y[0]]}" if x and y else ""
+            positions = f"; positions in metres are read with `columns={hint!r}`" if hint else ""
             raise McaptrackError(
                 f"{where}: no columns for {' and '.join(axis[0])} (or {' and '.join(axis[1])}) of boxes; {shown}; name "
-                f"those {metres}of boxes in pixels with `columns='x=left,y=top,w=width,h=height,frame=frame'`"
+                f"them with `columns='x=left,y=top,w=width,h=height,frame=frame'`{positions}"
             )
         for key in {key for pair in axis for key in pair} - set(complete[0]):
             out.pop(key, None)

@@ -142,8 +142,6 @@ class LabelFile:
         content = self.json if self.is_json else None
         if not isinstance(content, dict):
             return content if isinstance(content, list) else []
-        if set(content) >= {"columns", "data"} and isinstance(content["columns"], list):
-            return [dict(zip(map(str, content["columns"]), row, strict=False)) for row in content["data"]]
         columns = [*content.values()]
         if columns and all(isinstance(column, dict) and column.keys() == columns[0].keys() for column in columns):
             return [{name: content[name][row] for name in content} for row in columns[0]]

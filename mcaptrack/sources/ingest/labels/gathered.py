@@ -22,17 +22,17 @@ _MAX_NAME: Final = 256
 class GatheredRows:
     """Rows as they come: boxes in pictures, or in metres, which are all the same kind.
 
-    ``what`` names a row in messages, as "label".
+    ``noun`` names a row in messages, as "label".
     """
 
-    def __init__(self, facts: LabelFacts, what: str) -> None:
-        self.facts, self._what = facts, what
+    def __init__(self, facts: LabelFacts, noun: str) -> None:
+        self.facts, self._noun = facts, noun
         self._values, self._boxes, self._places = array("d"), array("d"), list[str]()
         self._ids, self._names = TrackIds(), ClassNames()
 
     def refuse(self, place: str, problem: str) -> McaptrackError:
         """The error for a row at this place in the file."""
-        return McaptrackError(f"{self.facts.path}: {self._what} {place} {problem}")
+        return McaptrackError(f"{self.facts.path}: {self._noun} {place} {problem}")
 
     def numbers(self, place: str, content: Any, keys: Sequence[Any]) -> list[float]:
         """The numbers with these keys, or at these places. Raises McaptrackError if there aren't all."""
@@ -87,7 +87,7 @@ class GatheredRows:
         facts.names, facts.numbering, facts.named_by = (names, {}, "file") if names else (None, None, "")
         places = self._places
         return BoxTable(
-            facts=facts, at=lambda row: f"{facts.path}: {self._what} {places[row]}", frame=frame, id=track_id,
+            facts=facts, at=lambda row: f"{facts.path}: {self._noun} {places[row]}", frame=frame, id=track_id,
             boxes_px=boxes if boxes.shape[1] == 4 else None, boxes_m=boxes if boxes.shape[1] == 7 else None,
             xy_m=boxes if boxes.shape[1] == 2 else None, score=score, class_id=kind,
             observed=None if observed.all() else observed == 1, counts=None if counts.all() else counts == 1,

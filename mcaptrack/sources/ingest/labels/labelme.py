@@ -24,7 +24,7 @@ class Labelme(PictureFormat):
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The pictures of a file or of a folder."""
         for path in files_in(file.path, ".json") if file.is_folder else [file.path]:
-            content, self.where = LabelFile(path).json, path.name
+            self.where, content = path.name, LabelFile(path).json
             sides = content.get("imageWidth"), content.get("imageHeight")
             name = str(content.get("imagePath") or path.name)
             picture = Picture(name, [], sides if all(sides) else None)

@@ -39,13 +39,13 @@ class TrajnetPP(Format):
         for number, line in file.lines():
             try:
                 entry = json.loads(line)
-                kind, content = next(iter(entry.items()))
-            except (ValueError, RecursionError, AttributeError, StopIteration):
+                scene, track = entry.get("scene"), entry.get("track")
+            except (ValueError, RecursionError, AttributeError):
                 raise McaptrackError(f"{file.path}:{number}: not a line of Trajnet++: {line.strip()[:60]}") from None
-            if kind == "scene" and isinstance(content, dict):
-                scenes[str(content.get("id"))] = content
-            elif kind == "track" and isinstance(content, dict):
-                tracks.append((number, content))
+            if isinstance(scene, dict):
+                scenes[str(scene.get("id"))] = scene
+            if isinstance(track, dict):
+                tracks.append((number, track))
         chosen = _chosen(file, scenes, asked.scene)
         for number, content in tracks:
             frame, x, y = rows.numbers(str(number), content, ("f", "x", "y"))

@@ -5,46 +5,28 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
-from xml.etree.ElementTree import Element, TreeBuilder
+from xml.etree.ElementTree import Element, ParseError, fromstring
 
-from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
+from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.format import LabelFile
 from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape, around, files_in
 
-_MAX_DEPTH: Final = 32
 #: All of a file is in memory as a tree.
 _MAX_BYTES: Final = 64 * 2**20
 _ROOT: Final = "annotation"
 
 
-class _Tree(XmlReader):
-    """Builds the tree of an XML file."""
-
-    writer = "Pascal VOC"
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._builder, self._depth = TreeBuilder(), 0
-
-    def start(self, name: str, attributes: dict[str, str]) -> None:
-        self._depth += 1
-        if self._depth > _MAX_DEPTH:
-            self.fail("nested deeper than labels are")
-        self._builder.start(name, attributes)
-
-    def end(self, name: str) -> None:
-        self._depth -= 1
-        self._builder.end(name)
-
-    def text(self, text: str) -> None:
-        self._builder.data(text)
-
-    def tree(self) -> Element:
-        """The first element, with all that is in it. Raises McaptrackError if it isn't valid or too large."""
-        if self.path.stat().st_size > _MAX_BYTES:
-            self.fail(f"more than {_MAX_BYTES} bytes of XML; give it in parts")
-        self.parse([self.path.read_bytes()])
-        return self._builder.close()
+def _tree(path: Path) -> Element:
+    """The first element of XML, with all that is in it. Raises ValueError if it is too large or invalid, or has a
+    document type, which may hold entities.
+    """
+    text = opened(path).read(_MAX_BYTES + 1).decode("utf-8-sig")  # no other encoding, which may hide what it holds
+    if len(text) > _MAX_BYTES or "<!DOCTYPE" in text:
+        raise ValueError(f"more than {_MAX_BYTES} bytes, or a document type, which isn't read")
+    try:
+        return fromstring(text)
+    except ParseError as error:
+        raise ValueError(f"not valid XML: {error}") from None
 
 
 class Voc(PictureFormat):
@@ -61,7 +43,8 @@ class Voc(PictureFormat):
     def pictures(self, file: LabelFile) -> Iterator[Picture]:
         """The pictures of a file or of a folder."""
         for path in files_in(file.path, ".xml") if file.is_folder else [file.path]:
-            root, self.where = _Tree(path).tree(), path.name
+            self.where = path.name
+            root = _tree(path)
             if root.tag != _ROOT:
                 raise ValueError(f"it begins with <{root.tag[:40]}>")
             sides = [root.findtext(f"size/{side}") for side in ("width", "height")]
