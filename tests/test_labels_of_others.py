@@ -404,7 +404,7 @@ def test_a_column_of_times_may_hold_dates(cell, t_ns, tmp_path):
         ("a.csv.zst", zstandard.compress(text().encode())[:-1], "can't be decompressed: it is cut off"),
         ("a.xml", "<fcd-export><timestep/></fcd-export>", "its tool xml2csv.py makes CSV of it"),
         ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]><annotation/>', "a document type"),
-        ("a.json", [{"frame": 0, "id": 1, "speed": 3}], "no columns for x"),
+        ("a.json", [{"frame": 0, "id": 1, "speed": 3}], "is JSON (a list with frame, id, speed) of no label format"),
         ("a.jsonl", '{"frame": 0, "x": 1}\n{"frame": 0, "x": }\n', "a.jsonl:2: not valid JSON"),
         (
             "a.json",

@@ -659,6 +659,13 @@ def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
     return are_metres(header, chosen)
 
 
+def hold_places(header: Sequence[str]) -> bool:
+    """Whether any of the columns holds a number of a place, by its name."""
+    plain = {*_plain(header)}
+    keys = (*((key, HEADERS[key]) for key in _OF_BOXES), *((key, _HEADERS_3D[key]) for key in _PLACE))
+    return any(plain & {*names} for _, names in keys)
+
+
 def are_metres(header: Sequence[str], chosen: Mapping[str, str]) -> bool:
     """Whether columns with these names hold boxes or positions in metres, or are ``chosen`` as such by key."""
     plain = _plain(header)

@@ -184,7 +184,7 @@ class LabelFile:
         if not number or self.is_json:
             return McaptrackError(f"{self.path} holds no boxes")
         text = f"a row of {len(split(line))} columns fits no label format ({formats}): {line.strip()[:_SHOWN]}"
-        if any(cell[:1].isalpha() for cell in split(line)):
+        if "," in line and any(cell[:1].isalpha() for cell in split(line)):
             text += "; a table with names of classes needs a first line that names its columns, separated by commas, "
             text += "semicolons or tabs: frame,id,class,left,top,width,height,score"
         return McaptrackError(f"{self.path}:{number}: {text}")

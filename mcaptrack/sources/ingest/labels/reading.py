@@ -54,7 +54,7 @@ def known_format(file: LabelFile, label_format: str = _AUTO, columns: Mapping[st
         made = _made(name)
         if (not columns or "columns" in made.takes) and made.recognises(file):
             return made
-    return _made(_TABLE) if columns else recognised(file)
+    return _made("records" if file.is_json else _TABLE) if columns else recognised(file)
 
 
 def label_file(path: Path, label_format: str = _AUTO) -> LabelFile:

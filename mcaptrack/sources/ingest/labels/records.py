@@ -13,6 +13,7 @@ from mcaptrack.sources.ingest.labels.delimited import (
     SEPARATOR,
     Opened,
     are_metres,
+    hold_places,
     read_table,
     read_table_3d,
     records,
@@ -38,15 +39,13 @@ class Records(Format):
     takes = ("columns",)
 
     def recognises(self, file: LabelFile) -> bool:
-        """Whether a file begins so, or is JSON of rows with more than one value each."""
+        """Whether a file begins so, or is JSON of rows with a place in each."""
         if file.head.startswith((_PARQUET, _ARROW, _STREAM)) or file.has_json_lines:
             return True
         try:
-            rows = file.records if file.is_json else []
+            return file.is_json and hold_places(records(file).header)
         except McaptrackError:
             return False
-        values = rows[0].values() if rows and isinstance(rows[0], dict) else ()
-        return any(not isinstance(value, list | dict) for value in values)
 
     def holds_3d(self, file: LabelFile, columns: Mapping[str, str]) -> bool:
         """Whether the columns are those of boxes or positions in metres."""

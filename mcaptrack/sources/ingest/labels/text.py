@@ -50,6 +50,8 @@ def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lin
                 number += 1
                 if len(line) > most:
                     raise McaptrackError(f"{path}:{number}: a line of more than {most} characters is no row")
+                if is_wide and "\0" in line:
+                    raise UnicodeError
                 if line.strip() and (has_comments or not line.lstrip().startswith("#")):
                     yield number, line
     except UnicodeError:

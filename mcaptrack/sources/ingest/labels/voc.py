@@ -20,11 +20,12 @@ def _tree(path: Path) -> Element:
     """The first element of XML, with all that is in it. Raises ValueError if it is too large or invalid, or has a
     document type, which may hold entities.
     """
-    text = opened(path).read(_MAX_BYTES + 1).decode("utf-8-sig")  # no other encoding, which may hide what it holds
+    with opened(path) as stream:
+        text = stream.read(_MAX_BYTES + 1).decode("utf-8-sig")  # no other encoding, which may hide what it holds
     if len(text) > _MAX_BYTES or "<!DOCTYPE" in text:
         raise ValueError(f"more than {_MAX_BYTES} bytes, or a document type, which isn't read")
     try:
-        return fromstring(text)
+        return fromstring(text)  # noqa: S314 without a document type it is harmless
     except ParseError as error:
         raise ValueError(f"not valid XML: {error}") from None
 
