@@ -617,3 +617,31 @@ def test_column_8_of_motchallenge_is_a_class_where_it_can_be_one(ends, files, cl
     assert people.id.tolist() == [n for n, kind in enumerate(ids, start=1) if kind == 1]
     is_nameless = not classes and set(ids) != {1}
     assert ("classes" in [code for _, code in table.doubts]) == is_nameless
+
+
+#: What replaces a number, a text or null.
+ODD = (b"null", b"[]", b"{}", b"-1", b"1e999", b"NaN", b'""', b"true", b"9" * 400, b"\xff", b"\0", b'"x"', b"1e18")
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_files_are_read_or_refused_in_a_line(name, tmp_path):
+    rng = np.random.default_rng(7)
+    path = WRITERS[name].write(tmp_path, WALK)
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    for number in range(40):
+        file = files[number % len(files)]
+        data = file.read_bytes()
+        spots = list(re.finditer(rb'-?\d+\.?\d*|"[^"]*"|null', data))
+        spot = spots[rng.integers(len(spots))] if spots else None
+        cut = int(rng.integers(len(data)))
+        damaged = data[:cut] if spot is None or number % 4 == 3 else b""
+        if spot is not None and not damaged:
+            damaged = data[: spot.start()] + ODD[rng.integers(len(ODD))] + data[spot.end() :]
+        file.write_bytes(damaged)
+        for role in ("truth", "detections", None):
+            try:
+                read_labels(path, name, role)
+                read_labels(path, "auto", role)
+            except McaptrackError as error:
+                assert "\n" not in str(error), error
+        file.write_bytes(data)

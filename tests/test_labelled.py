@@ -235,6 +235,8 @@ def test_first_frame_is_of_all_files_or_of_each_kind(tmp_path):
     assert evaluated(tr, gt, first_frame={"truth": 0, "tracks": 1}) == (0.8, ["clock"])
     assert evaluated(tr, gt, first_frame="truth=0, tracks=1")[0] == 0.8
     assert evaluated(tr, gt, first_frame=0)[0] < 0
+    with pytest.raises(McaptrackError, match=r"gt.txt: its first frame is 0, before `first_frame=2`"):
+        evaluated(tr, gt, first_frame=2)
     assert parse_first_frames(3) == parse_first_frames("3") == 3
     for wrong in (-1, "a", "truth=", "cars=1", "truth=-1", 1.5, "", {"truth": "x"}):
         with pytest.raises(McaptrackError, match="`first_frame=` is a whole number from 0 to"):

@@ -127,6 +127,11 @@ def compare_files(
             job.report_assumptions()
             truth, placed = job.placed_frames("truth")
             return AlignedFiles(truth, job.all_frames("tracks"), [], _names_of(both), _labelled(placed))
+    for labels in both.values():
+        if len(labels.frame) and (least := int(labels.labelled[0])) < labels.first_frame:
+            raise McaptrackError(
+                f"{labels.path}: its first frame is {least}, before `first_frame={labels.first_frame}`"
+            )
     share_numbers(both)
     warn_of_firsts(labels for labels in both.values() if len(labels.frame))
     for text, code in (doubt for labels in both.values() for doubt in labels.doubts):

@@ -127,7 +127,11 @@ def _table(path: Path, columns: tuple[str, ...]) -> dict[str, Any]:
     if missing:
         listed = ", ".join(table.column_names)[:200]
         raise McaptrackError(f"{path} has no column {missing[0]}, as Argoverse 2 has; its columns are {listed}")
-    return {name: table.column(name).to_pylist() for name in columns}
+    try:
+        table.validate(full=True)
+        return {name: table.column(name).to_pylist() for name in columns}
+    except (UnicodeDecodeError, pa.ArrowException, ValueError) as error:
+        raise McaptrackError(f"{path} is damaged: {str(error).splitlines()[0][:80]}") from None
 
 
 def _floats(path: Path, table: dict[str, Any], names: tuple[str, ...]) -> Floats:

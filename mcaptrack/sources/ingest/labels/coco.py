@@ -19,7 +19,7 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.masks import box_of_mask
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import FrameNames, TrackIds, is_count, is_number, numbers_of_names
+from mcaptrack.sources.ingest.labels.text import FrameNames, TrackIds, as_float, is_count, is_number, numbers_of_names
 
 _MAX_ROWS: Final = 10_000_000
 _MAX_CLASSES: Final = 65536
@@ -143,10 +143,7 @@ def _whole_of_text(value: Any) -> Any:
 
 
 def _float(value: Any, missing: float = math.nan) -> float:
-    try:
-        return missing if value is None else float(value)
-    except OverflowError:
-        return math.inf
+    return missing if value is None else as_float(value)
 
 
 def _results(path: Path, content: list[Any]) -> BoxTable:

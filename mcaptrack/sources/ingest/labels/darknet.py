@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat
 
 
 class Darknet(PictureFormat):
@@ -18,13 +18,13 @@ class Darknet(PictureFormat):
         """Whether JSON is a list of pictures with objects."""
         return {"frame_id", "objects"} <= set(file.keys) and isinstance(file.json, list)
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of a file."""
         for entry in file.json:
-            picture = Picture(str(entry.get("filename") or entry["frame_id"]), [])
+            picture = LabelledPicture(str(entry.get("filename") or entry["frame_id"]), [])
             for each in entry["objects"]:
                 place = each["relative_coordinates"]
                 x, y, width, height = (float(place[key]) for key in ("center_x", "center_y", "width", "height"))
-                label = each.get("name") or each["class_id"]
-                picture.shapes.append(Shape((x - width / 2, y - height / 2, width, height), label, each["confidence"]))
+                box, label = (x - width / 2, y - height / 2, width, height), each.get("name") or each["class_id"]
+                picture.shapes.append(LabelledShape(box, label, each["confidence"]))
             yield picture

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape, around
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around
 
 
 class Datumaro(PictureFormat):
@@ -18,13 +18,13 @@ class Datumaro(PictureFormat):
         """Whether JSON has items and categories."""
         return {"items", "categories"} <= set(file.keys) and isinstance(file.json, dict)
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of a file."""
         content = file.json
         labels = [entry["name"] for entry in content["categories"].get("label", {}).get("labels", [])]
         for item in content["items"]:
             height, width = (item.get("image") or {}).get("size") or (None, None)
-            picture = Picture(str(item["id"]), [], (width, height) if width else None)
+            picture = LabelledPicture(str(item["id"]), [], (width, height) if width else None)
             for each in item["annotations"]:
                 more, number = each.get("attributes") or {}, each.get("label_id")
                 if each["type"] == "bbox":
@@ -35,5 +35,5 @@ class Datumaro(PictureFormat):
                     picture.other[str(each["type"])] += 1
                     continue
                 label = None if number is None else labels[number]
-                picture.shapes.append(Shape(box, label, more.get("score"), more.get("track_id")))
+                picture.shapes.append(LabelledShape(box, label, more.get("score"), more.get("track_id")))
             yield picture

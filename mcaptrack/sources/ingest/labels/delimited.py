@@ -637,7 +637,7 @@ _PARTS: Final = re.compile(r"[\s._/]+")
 
 
 def _by_end(key: str, header: Sequence[str], taken: Mapping[str, int]) -> list[int]:
-    """The columns whose names end with one of a key, after a dot or "_": the last two words, or the last one if no
+    """The columns with names that end with one of a key, after a dot or "_": the last two words, or the last one if no
     other column has it.
     """
     words = [_PARTS.split(name.strip().lower()) for name in header]

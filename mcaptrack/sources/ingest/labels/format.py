@@ -88,7 +88,7 @@ class LabelFile:
 
     @cached_property
     def entries(self) -> list[Path]:
-        """What a folder holds."""
+        """The content of a folder, in natural order."""
         return sorted(self.path.iterdir(), key=natural_order) if self.is_folder else []
 
     @cached_property

@@ -14,7 +14,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.table import NO_ID, NOTHING, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, ClassNames, TrackIds, is_count, is_number
+from mcaptrack.sources.ingest.labels.text import MAX_ROWS, ClassNames, TrackIds, as_float, is_count, is_number
 
 _MAX_NAME: Final = 256
 
@@ -43,7 +43,7 @@ class GatheredRows:
         if not all(map(is_number, values)) or (isinstance(content, list) and len(content) != len(keys)):
             listed = ", ".join(map(str, keys))
             raise self.refuse(place, f"has no box of {len(keys)} numbers ({listed}): {str(content)[:60]}")
-        return [float(value) if abs(value) < 1e300 else np.inf for value in values]
+        return [as_float(value) for value in values]
 
     def add(
         self,
@@ -67,7 +67,7 @@ class GatheredRows:
         if name is not None and not isinstance(name, str):
             raise self.refuse(place, f"has a class that is no text: {str(name)[:40]!r}")
         kind = self._names.number(name or "")
-        own, stated = NO_ID if track is None else track, np.nan if score is None else score
+        own, stated = NO_ID if track is None else as_float(track), np.nan if score is None else as_float(score)
         self._values.extend((frame, own, kind, stated, observed, counts, aside))
         self._boxes.extend(box)
         self._places.append(place)

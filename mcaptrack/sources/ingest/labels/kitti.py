@@ -14,7 +14,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape, files_in
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, files_in
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import (
     ClassNames,
@@ -143,14 +143,14 @@ class KittiFrames(PictureFormat):
         cells = next(filter(None, texts), [])
         return len(cells) in (15, 16, 17) and cells[0][:1].isalpha()
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of a folder."""
         for path in files_in(file.path, ".txt"):
-            picture, self.where = Picture(path.name, []), path.name
+            picture, self.where = LabelledPicture(path.name, []), path.name
             for number, line in lines_of(path):
                 self.where, cells = f"{path.name}:{number}", line.split()
                 check_columns(cells, 15, 17)
                 track = cells.pop(1) if len(cells) == 17 else None
                 (box,) = as_boxes(np.array([cells[4:8]], float)).tolist()
-                picture.shapes.append(Shape(box, cells[0], cells[15] if len(cells) == 16 else None, track))
+                picture.shapes.append(LabelledShape(box, cells[0], cells[15] if len(cells) == 16 else None, track))
             yield picture

@@ -15,7 +15,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.gathered import GatheredRows
-from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.table import MAX_FRAME, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_ROWS, is_number
 
 _TYPE: Final = "videorectangle"
@@ -49,8 +49,9 @@ class LabelStudio(Format):
         rows, count, duration, filled = GatheredRows(facts, "result"), 0, 0.0, 0
         for order, region in enumerate(_regions(task)):
             value = region["value"]
-            count = max(count, int(value["framesCount"]) if is_number(value.get("framesCount")) else 0)
-            duration = max(duration, float(value["duration"]) if is_number(value.get("duration")) else 0)
+            stated = [value.get(key) for key in ("framesCount", "duration")]
+            if all(is_number(number) and 0 < number <= MAX_FRAME for number in stated):
+                count, duration = max(count, int(stated[0])), max(duration, float(stated[1]))
             labels = value.get("labels")
             name = labels[0] if isinstance(labels, list) and labels else None
             for frame, box, is_stated in _boxes(rows, str(order), value["sequence"], count):
@@ -98,6 +99,8 @@ def _boxes(
 ) -> Iterator[tuple[int, tuple[float, ...], bool]]:
     """The frame, the box in shares of the picture, and whether it is stated, of a sequence."""
     keys = sorted((tuple(rows.numbers(place, entry, _BOX)), entry.get("enabled", True)) for entry in sequence)
+    if any(not 0 <= frame <= MAX_FRAME for (frame, *_), _ in keys):
+        raise rows.refuse(place, f"has a frame that is not from 0 to {MAX_FRAME}")
     for number, ((frame, *box), is_enabled) in enumerate(keys):
         first, start = int(frame), np.array(box) / 100
         yield first, tuple(start), True

@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.sources.ingest.labels.format import MAX_LINE, LabelFile
-from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat
 
 _MAX_PIXELS: Final = 2**31
-#: Classes of MOTS; the last one marks regions whose tracks don't count.
+#: Classes of MOTS; the last one marks regions in which tracks don't count.
 _NAMES: Final = {"1": "car", "2": "pedestrian", "10": "DontCare"}
 
 
@@ -62,14 +62,14 @@ class Mots(PictureFormat):
         cells = file.row.split()
         return len(cells) == 6 and all(cell.isdecimal() for cell in cells[:5]) and not cells[5].isdecimal()
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The frames of a file."""
-        pictures = dict[str, Picture]()
+        pictures = dict[str, LabelledPicture]()
         for number, line in file.lines(MAX_LINE):
             self.where = f"line {number}"
             frame, track, kind, height, width, counts = line.split()
-            picture = pictures.setdefault(str(int(frame)), Picture(frame, [], (width, height)))
+            picture = pictures.setdefault(str(int(frame)), LabelledPicture(frame, [], (width, height)))
             box = box_of_mask({"size": (height, width), "counts": counts})
-            picture.shapes.append(Shape(box, _NAMES.get(kind, kind), None, track))
+            picture.shapes.append(LabelledShape(box, _NAMES.get(kind, kind), None, track))
         self.where = ""
         yield from pictures.values()

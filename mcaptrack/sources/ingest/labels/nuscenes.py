@@ -12,7 +12,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import ClassNames, headings, numbered
+from mcaptrack.sources.ingest.labels.text import MAX_WHOLE, ClassNames, as_float, headings, numbered
 
 TABLES: Final = ("scene", "sample", "sample_annotation", "instance", "category")
 #: The classes of the detection and tracking tasks, and the categories that they consist of.
@@ -167,7 +167,7 @@ def _text(folder: Path, table: str, row: Mapping[str, Any], key: str) -> str:
 
 def _number(folder: Path, table: str, row: Mapping[str, Any], key: str) -> int:
     value = row.get(key)
-    if isinstance(value, bool) or not isinstance(value, int):
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) > MAX_WHOLE:
         raise McaptrackError(f"{folder / table}.json: {key} has to be a whole number, not {str(value)[:40]!r}")
     return value
 
@@ -179,4 +179,4 @@ def _numbers(folder: Path, row: Mapping[str, Any], key: str, count: int) -> list
         raise McaptrackError(
             f"{folder / 'sample_annotation'}.json: {key} has to be {count} numbers, not {str(value)[:60]}"
         )
-    return [float(number) for number in numbers]
+    return [as_float(number) for number in numbers]

@@ -1,4 +1,4 @@
-"""What formats share that describe pictures one by one: each has a name, perhaps a size, and boxes.
+"""Formats that describe pictures one by one share this: each has a name, perhaps a size, and boxes.
 
 Letters: N rows.
 """
@@ -23,13 +23,13 @@ from mcaptrack.sources.video.image_folder import natural_order
 
 _MAX_PICTURES: Final = 1_000_000
 _MAX_NAME: Final = 256
-#: The name that regions have whose boxes don't count.
+#: The name of regions in which boxes don't count.
 _REGION: Final = "dontcare"
 _WHOLE: Final = re.compile(r"-?\d{1,15}")
 
 
 @dataclass
-class Shape:
+class LabelledShape:
     """A box of a picture: corners or size in ``box`` as left, top, width, height, px, and what is known of it."""
 
     box: Sequence[Any]
@@ -39,13 +39,13 @@ class Shape:
 
 
 @dataclass
-class Picture:
+class LabelledPicture:
     """A picture: its name, or its number; its width and height in px, if they are known; what is in it; and the number
     of shapes by kind that are no boxes.
     """
 
     name: str
-    shapes: list[Shape]
+    shapes: list[LabelledShape]
     size: tuple[Any, Any] | None = None
     other: Counter[str] = field(default_factory=Counter)
 
@@ -77,14 +77,14 @@ class PictureFormat(Format):
     is_normalised: ClassVar[bool | None] = None
     where: str = ""
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of a file or a folder. KeyError, TypeError, ValueError and AttributeError say what is wrong."""
         raise NotImplementedError
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The boxes of all pictures. The numbers in their names are those of frames, otherwise their order."""
         facts = LabelFacts(file.path, self.name, is_normalised=self.is_normalised, states_labelled=True)
-        rows, pictures, other = GatheredRows(facts, "picture"), list[Picture](), Counter[str]()
+        rows, pictures, other = GatheredRows(facts, "picture"), list[LabelledPicture](), Counter[str]()
         try:
             for picture in self.pictures(file):
                 for shape in picture.shapes:

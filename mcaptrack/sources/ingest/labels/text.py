@@ -5,6 +5,7 @@ Letters: N rows, C columns.
 
 from __future__ import annotations
 
+import math
 import re
 from array import array
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
@@ -27,6 +28,8 @@ MAX_ROWS: Final = 10_000_000
 #: The largest number of characters of a row of numbers.
 MAX_ROW: Final = 4096
 _UTF16: Final = (BOM_UTF16_LE, BOM_UTF16_BE)
+#: Whole numbers of JSON can't be larger: as microseconds they are times.
+MAX_WHOLE: Final = 2**53
 #: The number of characters of a line that errors show.
 _LINE_SHOWN: Final = 60
 #: The number of class names of a file, at most: there are data sets with 21,841 classes.
@@ -77,6 +80,14 @@ def states_number(text: str) -> bool:
 def is_number(value: Any) -> bool:
     """Whether a value of JSON is a number."""
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def as_float(value: float) -> float:
+    """A number of JSON, also one that is too large."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
 
 
 def split(line: str) -> list[str]:

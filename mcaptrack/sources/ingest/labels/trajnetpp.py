@@ -53,7 +53,9 @@ class TrajnetPP(Format):
                 others += 1
                 continue
             rows.add(str(number), frame, (x, y), content.get("p"), "person")
-        rates = {scene["fps"] for scene in scenes.values() if is_number(scene.get("fps")) and scene["fps"] > 0}
+        rates = {
+            scene["fps"] for scene in scenes.values() if is_number(scene.get("fps")) and 0.001 < scene["fps"] <= 10_000
+        }
         table = rows.table()
         if len(rates) == 1:
             facts.interval_s = 1 / Fraction(str(rates.pop())).limit_denominator(1001)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape, around
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around
 
 _PROJECT: Final = "_via_img_metadata"
 _CELLS: Final = ("region_shape_attributes", "region_attributes")
@@ -30,7 +30,7 @@ class Via(PictureFormat):
         pictures = _pictures(file.json) if file.keys else []
         return bool(pictures) and isinstance(pictures[0], dict) and {"filename", "regions"} <= set(pictures[0])
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of a file."""
         if file.is_json:
             for entry in _pictures(file.json):
@@ -53,8 +53,8 @@ def _pictures(content: Any) -> list[Any]:
     return [*content.values()] if isinstance(content, dict) else content
 
 
-def _picture(name: str, regions: Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> Picture:
-    picture = Picture(name, [])
+def _picture(name: str, regions: Iterator[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> LabelledPicture:
+    picture = LabelledPicture(name, [])
     for shape, more in regions:
         if shape["name"] == "rect":
             box = [shape[key] for key in ("x", "y", "width", "height")]
@@ -68,5 +68,5 @@ def _picture(name: str, regions: Iterator[tuple[Mapping[str, Any], Mapping[str, 
         label = next((more[key] for key in _CLASSES if key in more), others[0] if len(others) == 1 else None)
         if isinstance(label, dict):  # boxes to tick: {"person": true}
             label = next((key for key, is_set in label.items() if is_set), None)
-        picture.shapes.append(Shape(box, label, None, track))
+        picture.shapes.append(LabelledShape(box, label, None, track))
     return picture

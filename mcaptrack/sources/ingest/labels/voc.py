@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape, around, files_in
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around, files_in
 
 #: All of a file is in memory as a tree.
 _MAX_BYTES: Final = 64 * 2**20
@@ -41,7 +41,7 @@ class Voc(PictureFormat):
         """Whether it is XML that begins so, or a folder of it."""
         return (_first(file) if file.is_folder else file).root == _ROOT
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of a file or of a folder."""
         for path in files_in(file.path, ".xml") if file.is_folder else [file.path]:
             self.where = path.name
@@ -51,7 +51,7 @@ class Voc(PictureFormat):
             sides = [root.findtext(f"size/{side}") for side in ("width", "height")]
             sides = sides if all(sides) else [root.findtext(f"imagesize/{side}") for side in ("ncols", "nrows")]
             name = root.findtext("filename") or path.name
-            picture = Picture(name, [], (sides[0], sides[1]) if all(sides) else None)
+            picture = LabelledPicture(name, [], (sides[0], sides[1]) if all(sides) else None)
             for each in root.iterfind("object"):
                 corners = [each.findtext(f"bndbox/{key}") for key in ("xmin", "ymin", "xmax", "ymax")]
                 points = [[point.findtext("x"), point.findtext("y")] for point in each.iterfind("polygon/pt")]
@@ -63,7 +63,9 @@ class Voc(PictureFormat):
                 else:
                     left, top, right, bottom = (float(end or "") for end in corners)
                     box = [left, top, right - left, bottom - top]
-                picture.shapes.append(Shape(box, each.findtext("name"), each.findtext("score"), _track_of(each)))
+                picture.shapes.append(
+                    LabelledShape(box, each.findtext("name"), each.findtext("score"), _track_of(each))
+                )
             yield picture
 
 

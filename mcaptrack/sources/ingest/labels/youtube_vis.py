@@ -8,7 +8,7 @@ from typing import Any
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels.format import LabelFile
 from mcaptrack.sources.ingest.labels.masks import box_of_mask
-from mcaptrack.sources.ingest.labels.pictures import Picture, PictureFormat, Shape
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat
 
 
 class YoutubeVis(PictureFormat):
@@ -25,7 +25,7 @@ class YoutubeVis(PictureFormat):
         tracks = content["annotations"] if content and {"videos", "annotations"} <= keys else None
         return bool(tracks) and isinstance(tracks, list) and bool({"bboxes", "segmentations"} & set(tracks[0]))
 
-    def pictures(self, file: LabelFile) -> Iterator[Picture]:
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of the video."""
         content: Any = file.json if isinstance(file.json, dict) else {"annotations": file.json}
         tracks = content["annotations"]
@@ -37,11 +37,11 @@ class YoutubeVis(PictureFormat):
         count = max(map(len, boxes), default=0)
         names = video.get("file_names") or [str(number) for number in range(count)]
         size = (video["width"], video["height"]) if video.get("width") else None
-        pictures = [Picture(str(name), [], size) for name in names]
+        pictures = [LabelledPicture(str(name), [], size) for name in names]
         for number, (track, of_pictures) in enumerate(zip(tracks, boxes, strict=True)):
             label = categories.get(track["category_id"], track["category_id"])
             for picture, box in zip(pictures, of_pictures, strict=True):
                 if box:
                     sides = box_of_mask(box) if isinstance(box, dict) else box
-                    picture.shapes.append(Shape(sides, label, track.get("score"), track.get("id", number)))
+                    picture.shapes.append(LabelledShape(sides, label, track.get("score"), track.get("id", number)))
         yield from pictures
