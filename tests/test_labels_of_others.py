@@ -353,6 +353,13 @@ def test_programs_that_write_metres_are_known_by_their_columns(tmp_path):
         written(tmp_path / "echo.csv", f"{echo}1777636800000000001,0,1777636800000000001,map,0.75,2.5\n")
     )
     assert (where, labels.frame.tolist()) == ([[0.75, 2.5]], [1777636800000000001])
+    table = pa.table({"t": [0.5, 1.0], "track_uuid": ["a", "a"], "x_m": [0.75, 1.0], "y_m": [2.5, 3.0]})
+    pa.parquet.write_table(table, tmp_path / "a.parquet")
+    labels, where = places(tmp_path / "a.parquet")
+    assert labels.format == "records"
+    assert (where, labels.frame.tolist(), labels.id.tolist()) == (
+        [[0.75, 2.5], [1, 3]], [500_000_000, 1_000_000_000], [1, 1]
+    )  # fmt: skip
     vadere = "pedestrianId simTime x-PID1 y-PID1 targetId-PID2\n1 0.4 0.75 2.5 1\n"
     labels, where = places(written(tmp_path / "postvis.traj", vadere))
     assert (where, labels.frame.tolist(), labels.id.tolist()) == ([[0.75, 2.5]], [400_000_000], [1])

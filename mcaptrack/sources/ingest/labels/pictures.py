@@ -96,6 +96,8 @@ class PictureFormat(Format):
                     rows.add(place, len(pictures), box, _track(shape.id), name, score, aside=aside)
                 other.update(picture.other)
                 picture.shapes = []
+                if picture.size is not None:
+                    picture.size = float(picture.size[0]), float(picture.size[1])
                 pictures.append(picture)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             text = f"no {error}" if isinstance(error, KeyError) else str(error)
@@ -109,7 +111,7 @@ class PictureFormat(Format):
         facts.first_frame, facts.is_first_assumed = int(frames.min()), int(frames.min()) > 0
         facts.region = "DontCare" if table.aside is not None else ""
         sizes = ((frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True))
-        stated = {frame: (float(size[0]), float(size[1])) for frame, size in sizes if size}
+        stated = {frame: size for frame, size in sizes if size is not None and np.isfinite(size).all()}
         facts.sizes = {frame: size for frame, size in stated.items() if min(size) > 0} or None
         if len(different := set(stated.values())) == 1 and len(facts.sizes or ()) == len(pictures):
             ((width, height),) = different

@@ -53,8 +53,12 @@ class Records(Format):
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a table."""
-        read = read_table_3d if self.holds_3d(file, asked.columns) else read_table
-        return read(_table(file), "records", asked.columns)
+        table = _table(file)
+        if are_metres(table.header, asked.columns):
+            rows = read_table_3d(table, asked.columns)
+            rows.facts.format = "records"
+            return rows
+        return read_table(table, "records", asked.columns)
 
 
 def _table(file: LabelFile) -> Opened:
@@ -66,7 +70,8 @@ def _of_arrow(file: LabelFile) -> Opened:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    path, schema, batches = file.path, pa.schema([]), iter(())
+    path, schema = file.path, pa.schema([])
+    batches: Iterator[pa.RecordBatch]
     try:
         source = pa.OSFile(str(path))
         if file.head.startswith(_PARQUET):

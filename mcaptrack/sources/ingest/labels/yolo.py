@@ -51,8 +51,8 @@ class Yolo(Format):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a folder holds label files that begin with numbers, or are all empty."""
-        rows = (LabelFile(path).cells for path in _label_files(file.path)[:_LOOKED_AT]) if file.is_folder else iter(())
-        rows = list(rows)
+        files = _label_files(file.path)[:_LOOKED_AT] if file.is_folder else []
+        rows = [LabelFile(path).cells for path in files]
         return bool(rows) and all(map(states_number, next(filter(None, rows), [])))
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
