@@ -397,6 +397,7 @@ def test_a_column_of_times_may_hold_dates(cell, t_ns, tmp_path):
     assert labels.frame.tolist() == [t_ns]
     labels = read_labels(written(tmp_path / "b.csv", f"time,x,y,w,h\n{cell},1,2,3,4\n"), role=None)
     assert labels.times_s.tolist() == [t_ns / 1e9]
+    assert [code for _, code in labels.doubts] == ["clock"] * cell.endswith(".5")  # without a zone
 
 
 @pytest.mark.parametrize(

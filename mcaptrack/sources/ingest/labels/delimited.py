@@ -367,10 +367,10 @@ def read_table(table: Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
     def frame_of(text: str) -> float:
         return float(text) if states_number(text) else frames.number(text.strip())
 
-    unit = unit_of(header[places["t"]])[1] if "t" in places else 1.0
+    unit, without_zone = unit_of(header[places["t"]])[1] if "t" in places else 1.0, list[str]()
 
     def time_of(text: str) -> float:
-        t_ns = iso_ns(text)
+        t_ns = iso_ns(text, without_zone)
         return table.number_in(text) * unit if t_ns is None else t_ns / NS_PER_S
 
     cells = _Cells(table, places, {"frame": frame_of, "id": id_of, "t": time_of})
@@ -395,6 +395,7 @@ def read_table(table: Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
         )
         facts.times_s, rows.frame = np.unique(seconds, return_inverse=True)
         facts.first_frame = 0
+        _warn_of_zone(rows, without_zone)
     if name == "supervision" and header[places.get("frame", 0)].lower() == _FRAME_INDEX:
         facts.first_frame = 0
     return rows.with_boxes(cells.stacked(key for key in _OF_BOXES if key in places))
@@ -414,11 +415,16 @@ _ISO: Final = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-def iso_ns(text: str) -> int | None:
-    """A date and time of ISO 8601 in nanoseconds from 1970 on, in UTC unless it names a zone; None if it is none."""
+def iso_ns(text: str, without_zone: list[str]) -> int | None:
+    """A date and time of ISO 8601 in nanoseconds from 1970 on, in UTC unless it names a zone; None if it is none.
+
+    The first one that names none is added to ``without_zone``.
+    """
     match = _ISO.fullmatch(text.strip())
     if match is None:
         return None
+    if match[3] is None and not without_zone:
+        without_zone.append(text.strip())
     zone = match[3] if match[3] not in (None, "Z", "UTC") else "+00:00"
     since = datetime.fromisoformat(match[1] + zone) - _EPOCH
     return (since.days * 86_400 + since.seconds) * NS_PER_S + int((match[2] or "").ljust(9, "0"))
@@ -678,10 +684,10 @@ def are_metres(header: Sequence[str], chosen: Mapping[str, str]) -> bool:
 def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
     """The rows of a table of boxes or positions in metres. Raises McaptrackError."""
     path, places = table.path, _choose_columns_3d(table.where, table.header, chosen)
-    times, ids = list[int](), list[str]()
+    times, ids, without_zone = list[int](), list[str](), list[str]()
 
     def time_in(text: str) -> float:
-        times.append(_exact_ns(table.decimal(text), unit_of(table.header[places["t"]])[1]))
+        times.append(_exact_ns(table.decimal(text), unit_of(table.header[places["t"]])[1], without_zone))
         return 0.0
 
     def id_in(text: str) -> float:
@@ -709,6 +715,7 @@ def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
         id=track_id, boxes_m=boxes, score=cells.column("score"), class_id=np.nan_to_num(kind, nan=NO_CLASS),
         velocity=cells.stacked(_VELOCITY), remarks=remarks,
     )  # fmt: skip
+    _warn_of_zone(rows, without_zone)
     comments = comments_of(path) if table.delimiter and "t" not in places else []
     rate = next(filter(None, map(_RATE.match, comments)), None)
     if rate is not None and float(rate[1]) > 0:
@@ -758,10 +765,15 @@ def _choose_columns_3d(where: str, header: Sequence[str], chosen: Mapping[str, s
     return out
 
 
-def _exact_ns(text: str, unit: float) -> int:
+def _warn_of_zone(rows: BoxTable, without_zone: list[str]) -> None:
+    for text in without_zone:
+        rows.find(f": its times name no time zone ({text[:40]}); they are taken as UTC", "clock")
+
+
+def _exact_ns(text: str, unit: float, without_zone: list[str]) -> int:
     """A time in nanoseconds, exactly."""
     try:
-        t_ns = iso_ns(text)
+        t_ns = iso_ns(text, without_zone)
         t_ns = t_ns if t_ns is not None else int((Decimal(text) * round(unit * NS_PER_S)).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError):
         raise ValueError(f"{text[:30]!r} in the column of times is no number") from None
