@@ -100,7 +100,7 @@ def test_other_headers_and_units(header, line, options, tmp_path):
         (HEADER, LINES, {"columns": "x=x_m,x_m=y_m"}, "names x, and 3D boxes have none"),
         (HEADER, [LINES[0].replace("car", "car,van")], {}, "12 columns, and the header has 11"),
         (HEADER, LINES, {"classes": "bus"}, "has no class 'bus'"),
-        (HEADER, LINES, {"scene": "scene-1"}, "`scene=` is for nuScenes, not for csv"),
+        (HEADER, LINES, {"scene": "scene-1"}, "`scene=` is for nuScenes, "),
     ],
 )  # fmt: skip
 def test_what_cannot_be_boxes_in_metres_is_refused_in_one_line(header, lines, options, words, tmp_path):

@@ -129,7 +129,7 @@ class _Parser(XmlReader):
     others: Counter[str] = field(default_factory=Counter)
     tracks: list[_Track] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
-    images: dict[int, None] = field(default_factory=dict)
+    images: dict[int, tuple[str, str]] = field(default_factory=dict)
     rotated: int = 0
     interpolated: int = 0
     task: str | None = None
@@ -173,7 +173,7 @@ class _Parser(XmlReader):
             self._image = self._whole(id_text, "the id of an image")
             if self._image in self.images:
                 self.fail(f"image {self._image} is there before; give one file for each task")
-            self.images[self._image] = None
+            self.images[self._image] = (attributes.get("width", ""), attributes.get("height", ""))
         elif name == "box" and self._track is not None:
             self._add_to_track(self._track, attributes)
         elif name == "box" and self._image is not None:
@@ -325,7 +325,14 @@ def _table(path: Path, parser: _Parser) -> BoxTable:
     values: Floats = np.frombuffer(parser.values, np.float64).reshape(-1, _COLUMNS)
     names = parser.labels.names
     facts = LabelFacts(path, "cvat", first_frame=0, names=names or None, numbering={} if names else None)
-    facts.named_by, facts.size = "file" if names else "", _size(parser)
+    facts.named_by, facts.size = (
+        "file" if names else "",
+        _size(*(parser.meta.get(of, "") for of in ("width", "height"))),
+    )
+    sizes = {frame: size for frame, texts in parser.images.items() if (size := _size(*texts)) is not None}
+    facts.sizes = sizes or None
+    if sizes and set(sizes) == set(parser.images) and len(set(sizes.values())) == 1:
+        facts.size = next(iter(sizes.values()))
     facts.labelled, facts.states_labelled, doubt = _frames(parser, values[:, 0])
     rows = BoxTable(
         facts=facts, at=lambda row: f"{path}:{values[row, 8]:.0f}", frame=values[:, 0], id=values[:, _ID],
@@ -351,9 +358,8 @@ def _table(path: Path, parser: _Parser) -> BoxTable:
     return rows
 
 
-def _size(parser: _Parser) -> tuple[int, int] | None:
-    """Width and height of the pictures, by the description of the task."""
-    width, height = (parser.meta.get(name, "") for name in ("width", "height"))
+def _size(width: str, height: str) -> tuple[int, int] | None:
+    """Width and height of pictures; None if they aren't stated."""
     return (int(width), int(height)) if is_count(width, 6) and is_count(height, 6) and int(width) else None
 
 

@@ -1,6 +1,6 @@
 """Formats of labels: each is a class in a module of its own, and a line in the registry.
 
-To add one, write a module like ``trajnet``, name it in ``registry.BUILT_IN["label_format"]``, and add a file of it to
+To add one, write a module like ``sdd``, name it in ``registry.BUILT_IN["label_format"]``, and add a file of it to
 tests/test_border.py. Nothing else names a format.
 """
 

@@ -96,7 +96,7 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     names, ids, kinds, times, boxes, quaternions, tokens = ClassNames(), [], [], [], [], [], []
     unseen = 0
     for row in _table(folder, "sample_annotation"):
-        if row.get("sample_token") not in samples:
+        if _text(folder, "sample_annotation", row, "sample_token") not in samples:
             continue
         tokens.append(_text(folder, "sample_annotation", row, "token"))
         instance = _text(folder, "sample_annotation", row, "instance_token")

@@ -140,7 +140,7 @@ def read_labels(
     for option in ("columns", "scene"):
         if getattr(asked, option) and option not in made.takes:
             takers = [other.title for other in map(_made, BUILT_IN["label_format"]) if option in other.takes]
-            raise McaptrackError(f"{path}: `{option}=` is for {' and '.join(takers[::-1])}, not for {name}")
+            raise McaptrackError(f"{path}: `{option}=` is for {', '.join(takers[::-1])}, not for {name}")
     if file.is_folder and not made.reads_folders:
         raise McaptrackError(f"{path} is a folder, and {name} labels are a file")
     is_alike = role == "detections" or (role in ("tracks", None) and (wanted is None or wanted.is_people))

@@ -78,6 +78,6 @@ def _is_of(scene: dict[str, Any] | None, track: dict[str, Any], frame: float) ->
     """Whether a position is of a scene."""
     if scene is None:
         return True
-    first, last = scene.get("s"), scene.get("e")
-    is_inside = not is_number(first) or not is_number(last) or first <= frame <= last
+    ends: list[Any] = [scene.get("s"), scene.get("e")]
+    is_inside = not all(map(is_number, ends)) or ends[0] <= frame <= ends[1]
     return is_inside and track.get("scene_id", scene.get("id")) == scene.get("id")
