@@ -167,7 +167,11 @@ def check_shares(table: BoxTable, _: Asked) -> None:
     largest = parts.max(axis=1, initial=0)
     if facts.is_normalised:
         table.refuse(
-            largest > _MOST_SHARE, lambda row: f"{largest[row]:g} is no share of the picture's size, as its boxes are"
+            largest > _MOST_SHARE,
+            lambda row: (
+                f"{largest[row]:g} is no share of the picture's size, as its boxes are; "
+                "boxes in pixels are read as a table (`label_format='csv'`)"
+            ),
         )
     elif facts.is_normalised is None and (np.abs(boxes) <= _MOST_SHARE).all() and (boxes != np.rint(boxes)).any():
         facts.is_normalised = True

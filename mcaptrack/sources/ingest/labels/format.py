@@ -179,7 +179,9 @@ class LabelFile:
         if self.is_json and self.json != []:
             kind = "an object" if isinstance(self.json, dict) else "a list"
             keys = f" with {', '.join(self.keys)}"[:300] if self.keys else ""
-            return McaptrackError(f"{self.path} is JSON ({kind}{keys}) of no label format ({formats})")
+            is_of_pictures = {"data", "annotations"} <= set(self.keys) or "annotation_id" in self.keys
+            hint = "; export tasks of Label Studio with pictures as COCO or Pascal VOC" if is_of_pictures else ""
+            return McaptrackError(f"{self.path} is JSON ({kind}{keys}) of no label format ({formats}){hint}")
         number, line = next(lines_of(self.path, MAX_LINE), (0, ""))
         if not number or self.is_json:
             return McaptrackError(f"{self.path} holds no boxes")
