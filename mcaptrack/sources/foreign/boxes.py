@@ -59,7 +59,7 @@ from mcaptrack.sources.foreign.fields import (
     shape_of_message,
     shape_of_type,
 )
-from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.flatten import message_reader, message_type_of
 from mcaptrack.sources.foreign.known_types import KNOWN, Known
 
 _KIND: Final = "message_reader"
@@ -643,21 +643,3 @@ def decoded_messages(
     """
     read = message_reader(opened, topic, make)
     return ((message, read(message)) for message in opened.timed(topic))
-
-
-def message_reader(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
-) -> Callable[[log.Message], Any]:
-    """A function that decodes messages of a channel; both raise errors as ``decoded_messages`` does."""
-    try:
-        decode = make(message_type_of(opened, topic))
-    except McaptrackError as error:
-        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
-
-    def read(message: log.Message) -> Any:
-        try:
-            return decode(message.payload)
-        except McaptrackError as error:
-            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
-
-    return read

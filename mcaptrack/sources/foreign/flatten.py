@@ -15,6 +15,7 @@ import numpy as np
 from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.foreign.decoding import (
@@ -58,6 +59,24 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
             "definitions",
         )
     return kinds[topic]
+
+
+def message_reader(
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
+) -> Callable[[log.Message], Any]:
+    """A function that decodes messages of a channel by what ``make`` makes for their type; errors name the place."""
+    try:
+        decode = make(message_type_of(opened, topic))
+    except McaptrackError as error:
+        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
+
+    def read(message: log.Message) -> Any:
+        try:
+            return decode(message.payload)
+        except McaptrackError as error:
+            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
+
+    return read
 
 
 def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
