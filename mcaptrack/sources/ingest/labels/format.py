@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, TypeVar
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import read_beginning, read_json
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
 from mcaptrack.sources.ingest.labels.text import MAX_ROW, Lines, lines_of, split
@@ -21,6 +21,9 @@ _BEGIN_BYTES: Final = 4096
 MAX_LINE: Final = 65536
 _MAX_BYTES: Final = 512 * 2**20
 _SHOWN: Final = 60
+_LISTED: Final = 10
+
+Part = TypeVar("Part")
 
 
 class LabelFile:
@@ -93,6 +96,20 @@ class LabelFile:
             return McaptrackError(f"{self.path} holds no boxes")
         text = f"a row of {len(split(line))} columns fits no label format ({formats}): {line.strip()[:_SHOWN]}"
         return McaptrackError(f"{self.path}:{number}: {text}")
+
+
+def chosen_part(path: Path, parts: Mapping[str, Part], wanted: str | None, noun: str, where: str = "") -> Part:
+    """The part of a file, a ``noun``, with this name, or the only one.
+
+    Raises McaptrackError if there is none, or if there are several and none is named.
+    """
+    if wanted is None and len(parts) == 1:
+        return next(iter(parts.values()))
+    if wanted is None or wanted not in parts:
+        what = f"no {noun} {wanted!r:.60}" if wanted else f"{len(parts)} {noun}s"
+        listed = list_names(sorted(parts), _LISTED)
+        raise McaptrackError(f"{path} has {what}{where}; choose one with `scene=`: {listed}")
+    return parts[wanted]
 
 
 class Format:

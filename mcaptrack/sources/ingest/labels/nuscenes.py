@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_WHOLE, ClassNames, as_float, headings, numbered
 
@@ -32,7 +32,6 @@ _CLASSES: Final = {
 }
 _CLASS_OF: Final = {category: name for name, categories in _CLASSES.items() for category in categories}
 _NS_PER_US: Final = 1000
-_SHOWN: Final = 10
 #: The frame of reference, by the name that converters to MCAP give it.
 FRAME: Final = "map"
 
@@ -134,12 +133,7 @@ def _read(path: Path, scene: str | None) -> BoxTable:
 
 def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> str:
     tokens = {_text(folder, "scene", row, "name"): _text(folder, "scene", row, "token") for row in scenes}
-    if wanted is None and len(tokens) == 1:
-        return next(iter(tokens.values()))
-    if wanted is None or wanted not in tokens:
-        what = f"no scene {wanted!r:.60}" if wanted else f"{len(tokens)} scenes"
-        raise McaptrackError(f"{folder} has {what}; choose one with `scene=`: {list_names(sorted(tokens), _SHOWN)}")
-    return tokens[wanted]
+    return chosen_part(folder, tokens, wanted, "scene")
 
 
 def _table(folder: Path, name: str) -> Iterator[dict[str, Any]]:
