@@ -292,7 +292,7 @@ def _default_span(kind: np.dtype[Any]) -> Span:
 
 def measured(count: int) -> list[int]:
     """The numbers of the pictures, all over ``count`` of them, in which the range of values is measured."""
-    return np.unique(np.linspace(0, count - 1, min(_MEASURED, count)).astype(int)).tolist()
+    return [int(at) for at in np.unique(np.linspace(0, count - 1, min(_MEASURED, count)).astype(int))]
 
 
 def measured_span(parts: Iterable[Samples]) -> Span | None:

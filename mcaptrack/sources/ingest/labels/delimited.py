@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from itertools import chain
@@ -32,7 +32,6 @@ from mcaptrack.sources.ingest.labels.text import (
     TrackIds,
     headings,
     lines_of,
-    numbered,
     read_numbers,
 )
 
@@ -194,12 +193,15 @@ class _Cells:
         """Columns (N, K) side by side."""
         return np.stack([self.column(key) for key in keys], axis=-1)
 
-    def name_classes(self, facts: LabelFacts) -> Floats:
-        """The classes of rows (N,), with their names in the facts: numbers, with the names beside them, or names."""
+    def name_classes(self, facts: LabelFacts, has_numbers: bool = True) -> Floats:
+        """The classes of rows (N,), with their names in the facts: numbers, with the names beside them, or names.
+
+        Unless it ``has_numbers``, classes are names in any case.
+        """
         columns, texts = self.columns, self.classes.names
         kind, name = columns.get("class"), columns.get("name")
         facts.named_by = "file"
-        if kind is not None and texts and all(_is_number(text) for text in texts.values()):
+        if has_numbers and kind is not None and texts and all(_is_number(text) for text in texts.values()):
             stated = np.isfinite(kind)
             number = np.full(len(kind), float(NO_CLASS))
             number[stated] = np.array([float(text) for text in texts.values()])[kind[stated].astype(int)]
@@ -254,9 +256,7 @@ class Csv(Format):
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a table."""
-        if self.holds_3d(file, asked.columns):
-            return _read_table_3d(_opened(file), asked.columns)
-        return _read_table(_opened(file), "csv", asked.columns)
+        return _read_table(_opened(file), "csv", asked.columns, self.holds_3d(file, asked.columns))
 
 
 class Supervision(Format):
@@ -291,10 +291,10 @@ class Supervision(Format):
         return _read_table(table, "supervision", asked.columns)
 
 
-def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
+def _read_table(table: _Opened, name: str, chosen: Mapping[str, str], in_space: bool = False) -> BoxTable:
     path, header = table.path, table.header
-    places = choose_columns(table.where, header, chosen)
-    frames, ids = FrameNames(), TrackIds()
+    places = (_choose_columns_3d if in_space else choose_columns)(table.where, header, chosen)
+    frames, ids, times = FrameNames(), TrackIds(), list[int]()
 
     def id_of(text: str) -> float:
         try:
@@ -305,17 +305,26 @@ def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTabl
     def frame_of(text: str) -> float:
         return float(text) if _is_number(text) else frames.number(text.strip())
 
-    cells = _Cells(table, places, {"frame": frame_of, "id": id_of})
-    track_id, said = ids.of(path, cells.column("id"))
-    remarks, facts = [cells.remark, *said], LabelFacts(path, name)
+    def exact_time_of(text: str) -> float:
+        times.append(_exact_ns(table.decimal(text), unit_of(header[places["t"]])[1]))
+        return 0.0
+
+    cells = _Cells(table, places, {"frame": frame_of, "id": id_of} | ({"t": exact_time_of} if in_space else {}))
+    (track_id, said), facts = ids.of(path, cells.column("id")), LabelFacts(path, name)
+    rows = BoxTable(
+        facts=facts, at=cells.at, frame=cells.column("frame"), id=track_id, score=cells.column("score"),
+        class_id=cells.name_classes(facts, has_numbers=not in_space), remarks=[cells.remark, *said],
+    )  # fmt: skip
+    if in_space:
+        rows.boxes_m, rows.velocity = _boxes_3d(cells, path), cells.stacked(_VELOCITY)
+        if "t" in places:
+            facts.is_timed, rows.frame = True, np.array(times, np.int64)
+        return rows.with_boxes(rows.boxes_m[:, :6])
+    rows.boxes_px = _boxes(cells.columns)
     are_rows = "id" in places and header[places["id"]].lower() == "id" and "id" not in chosen
     if are_rows and len(np.unique(track_id)) == len(track_id) > 1:
-        remarks.append(f"{path}: every box has another {header[places['id']]}, so it numbers rows, not tracks")
-        track_id = np.full(len(track_id), float(NO_ID))
-    rows = BoxTable(
-        facts=facts, at=cells.at, frame=cells.column("frame"), id=track_id, boxes_px=_boxes(cells.columns),
-        score=cells.column("score"), class_id=cells.name_classes(facts), remarks=remarks,
-    )  # fmt: skip
+        rows.remark(f": every box has another {header[places['id']]}, so it numbers rows, not tracks")
+        rows.id = np.full(len(track_id), float(NO_ID))
     if "t" in places:
         seconds = cells.columns["t"] * unit_of(header[places["t"]])[1]
         rows.refuse(
@@ -433,28 +442,39 @@ def _fitting(names: Sequence[str], plain: Sequence[str], taken: Mapping[str, int
     return [at for name in names for at, cell in enumerate(plain) if cell == name and at not in taken.values()]
 
 
+def _guessed(
+    where: str, header: Sequence[str], chosen: Mapping[str, str], headers: Mapping[str, tuple[str, ...]],
+    skipped: Collection[str], ranked: Collection[str],
+) -> dict[str, int]:  # fmt: skip
+    """The columns that the user names, and those that others of the ``headers`` fit, but for keys that are ``skipped``.
+
+    Of several columns that fit a key, the first is taken of those that are ``ranked``; others are refused.
+    """
+    out, plain = _named(where, header, chosen), _plain(header)
+    for key, names in headers.items():
+        fits = [] if key in out or key in skipped else _fitting(names, plain, out)
+        # In headers of MOTChallenge (bb_left, ..., conf, x, y, z), x and y are a place in the world.
+        fits = [at for at in fits if plain[at].startswith("bb")] or fits
+        if len(fits) > 1 and key not in ranked:
+            if len({header[at] for at in fits}) < len(fits):
+                shown = f"its columns are {', '.join(header)}"[:300]
+                raise McaptrackError(f"{where}: several columns are named {header[fits[0]]}; {shown}")
+            text = " and ".join(header[at] for at in fits)
+            raise McaptrackError(
+                f"{where}: {text} could both be {key}; choose with `columns={key + '=' + header[fits[0]]!r}`"
+            )
+        if fits:
+            out[key] = fits[0]
+    return out
+
+
 def choose_columns(where: str, header: Sequence[str], chosen: Mapping[str, str]) -> dict[str, int]:
     """The index of the column for each key: those ``chosen`` by name, and guesses for the other keys.
 
     Raises McaptrackError if a column doesn't exist, if guesses are ambiguous, or if no box or frame can be made.
     """
     shown = f"its columns are {', '.join(header)}"[:300]
-    out, plain = _named(where, header, chosen), _plain(header)
-    skipped = _superseded(out)
-    for key, names in HEADERS.items():
-        fits = _fitting(names, plain, out)
-        if key in out or key in skipped or not fits:
-            continue
-        # In headers of MOTChallenge (bb_left, ..., conf, x, y, z), x and y are a place in the world.
-        fits = [at for at in fits if plain[at].startswith("bb")] or fits
-        if len(fits) > 1 and key not in _RANKED:
-            if len({header[at] for at in fits}) < len(fits):
-                raise McaptrackError(f"{where}: several columns are named {header[fits[0]]}; {shown}")
-            text = " and ".join(header[at] for at in fits)
-            raise McaptrackError(
-                f"{where}: {text} could both be {key}; choose with `columns={key + '=' + header[fits[0]]!r}`"
-            )
-        out[key] = fits[0]
+    out, plain = _guessed(where, header, chosen, HEADERS, _superseded(chosen), _RANKED), _plain(header)
     for axis in _SPANS:
         complete = [pair for pair in axis if all(key in out for key in pair)]
         complete.sort(key=lambda pair: -len(chosen.keys() & pair))
@@ -483,7 +503,7 @@ def choose_columns(where: str, header: Sequence[str], chosen: Mapping[str, str])
     return out
 
 
-def _superseded(chosen: Mapping[str, int]) -> set[str]:
+def _superseded(chosen: Mapping[str, str]) -> set[str]:
     """Keys that aren't guessed, because others that the user named say the same."""
     out = {key for key, other in (("frame", "t"), ("t", "frame")) if other in chosen}
     for axis in _SPANS:
@@ -502,8 +522,6 @@ _QUATERNION: Final = ("qw", "qx", "qy", "qz")
 _VELOCITY: Final = ("vx_m_per_s", "vy_m_per_s")
 _SHARED: Final = ("t", "frame", "id", "class", "name", "score")
 _AXES: Final = "xyz"
-#: Ids of boxes without a track.
-_NO_IDS: Final = ("-1", "-1.0")
 
 
 def _of_axis(axis: str) -> tuple[str, ...]:
@@ -516,7 +534,7 @@ def _of_axis(axis: str) -> tuple[str, ...]:
 
 
 #: Headers by key, without blanks, "_", "-", "." and brackets, and in lower case.
-_HEADERS_3D: Final[Mapping[str, tuple[str, ...]]] = {
+_HEADERS_3D: Final[dict[str, tuple[str, ...]]] = {
     **{f"{axis}_m": _of_axis(axis) for axis in _AXES},
     "length_m": ("lengthm", "length", "lm", "l", "dx", "sizex"),
     "width_m": ("widthm", "width", "wm", "w", "dy", "sizey"),
@@ -547,42 +565,14 @@ def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
     return set(_PLACE) <= keys and bool(keys & {*_HEADING, "qw"})
 
 
-def _read_table_3d(table: _Opened, chosen: Mapping[str, str]) -> BoxTable:
-    path, places = table.path, _choose_columns_3d(table.where, table.header, chosen)
-    times, ids = list[int](), list[str]()
-
-    def time_in(text: str) -> float:
-        times.append(_exact_ns(table.decimal(text), unit_of(table.header[places["t"]])[1]))
-        return 0.0
-
-    def id_in(text: str) -> float:
-        ids.append(text.strip())
-        return 0.0
-
-    cells = _Cells(table, places, {"t": time_in, "id": id_in})
-    remarks, heading = [cells.remark], cells.columns.get("heading_rad", np.radians(cells.column("heading_deg")))
-    if "qw" in places:
+def _boxes_3d(cells: _Cells, path: Path) -> Floats:
+    """Boxes (N, 7) in metres, with headings in radians, of rows that may lack a box."""
+    heading = cells.columns.get("heading_rad", np.radians(cells.column("heading_deg")))
+    if "qw" in cells.columns:
         has_box, heading = np.isfinite(cells.column("x_m")), cells.none.copy()
         kept = np.flatnonzero(has_box)
         heading[has_box] = headings(cells.stacked(_QUATERNION)[has_box], path, lambda row: cells.at(int(kept[row])))[0]
-    track_id = np.full(len(cells.none), NO_ID)
-    if "id" in places:
-        is_known = np.array([not is_empty(text) and text not in _NO_IDS for text in ids], bool)
-        track_id[is_known], are_numbers = numbered([ids[row] for row in np.flatnonzero(is_known)])
-        if not are_numbers:
-            remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
-    facts = LabelFacts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
-    facts.names = (cells.names if "name" in places else cells.classes).names
-    boxes = np.column_stack([cells.stacked((*_PLACE, *_SIZE)), heading])
-    kind = cells.column("name" if "name" in places else "class")
-    rows = BoxTable(
-        facts=facts, at=cells.at, frame=np.array(times, np.int64) if "t" in places else cells.column("frame"),
-        id=track_id, boxes_m=boxes, score=cells.column("score"), class_id=np.nan_to_num(kind, nan=NO_CLASS),
-        velocity=cells.stacked(_VELOCITY), remarks=remarks,
-    )  # fmt: skip
-    if not facts.names:
-        facts.names, facts.numbering, facts.named_by = None, None, ""
-    return rows.with_boxes(boxes[:, :6])
+    return np.column_stack([cells.stacked((*_PLACE, *_SIZE)), heading])
 
 
 def _choose_columns_3d(where: str, header: Sequence[str], chosen: Mapping[str, str]) -> dict[str, int]:
@@ -591,13 +581,10 @@ def _choose_columns_3d(where: str, header: Sequence[str], chosen: Mapping[str, s
     if others := [key for key in chosen if key not in (*KEYS_3D, *_SHARED)]:
         text = f"`columns=` names {others[0]}, and 3D boxes have none; they have {', '.join(KEYS_3D)}"
         raise McaptrackError(f"{where}: {text}")
-    out, plain = _named(where, header, chosen), _plain(header)
     either = ({*_HEADING, *_QUATERNION}, {"t", "frame"})
-    for key, names in (*_HEADERS_3D.items(), *((key, HEADERS[key]) for key in _SHARED)):
-        fits = _fitting(names, plain, out)
-        if key in out or not fits or any(key in group and group & chosen.keys() for group in either):
-            continue
-        out[key] = fits[0]
+    skipped = {key for group in either if group & chosen.keys() for key in group}
+    headers = _HEADERS_3D | {key: HEADERS[key] for key in _SHARED}
+    out = _guessed(where, header, chosen, headers, skipped, headers)
     for other in (
         {"heading_deg"} if "heading_rad" in out else set(),
         set(_QUATERNION)
