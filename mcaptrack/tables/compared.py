@@ -165,7 +165,7 @@ def _boxes_3d(tracks: Path, ground_truth: Path, options: IngestOptions) -> Align
     together = replace(_may_lack(options), frame_id=FRAME)
     with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], together) as job:
         job.report_assumptions()
-        classes = (job.boxes["truth"].classes, job.boxes["tracks"].classes)
+        classes = _names_of(job.labels)
         ranges = options.frame_ranges
         labelled = (str(ranges), "frames") if ranges else (None, None)
         frames = job.all_frames("truth"), job.all_frames("tracks")

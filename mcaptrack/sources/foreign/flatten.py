@@ -20,6 +20,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.foreign.decoding import (
     decoder_with_errors,
+    frame_named,
     protobuf_class,
     protobuf_unpacker,
     unpacker,
@@ -59,6 +60,15 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
             "definitions",
         )
     return kinds[topic]
+
+
+def frame_of(opened: log.Log, topic: str) -> str:
+    """Return the frame of the first message of a channel; "" if there is none, or it can't be read."""
+    try:
+        decode = decoder_with_errors(message_type_of(opened, topic), frame_named)
+        return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
+    except McaptrackError:
+        return ""
 
 
 def message_reader(

@@ -23,7 +23,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.definitions import MessageType
-from mcaptrack.sources.foreign.flatten import message_reader
+from mcaptrack.sources.foreign.flatten import frame_of, message_reader
 
 if TYPE_CHECKING:
     from mcaptrack.sources.video import EncodedPicture, PixelLayout, Recogniser, Samples, Span
@@ -211,7 +211,7 @@ def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
     parts = _sampled(opened, topic, read)
     may_be_depth = bool(parts) and parts[0].shape[2] == 1
     name = (first.format if first.layout else first.pixels or "16uc1").upper()
-    if first.is_depth or (may_be_depth and any(map(_DEPTH.search, (topic, _frame_of(opened, topic))))):
+    if first.is_depth or (may_be_depth and any(map(_DEPTH.search, (topic, frame_of(opened, topic))))):
         facts.depth = name
     if parts and (span := measured_span(parts)) is not None:
         facts.span = span
@@ -219,19 +219,6 @@ def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
         low, high = (f"{value:.4g}" for value in span)
         facts.notes.append(f"{topic}: {of} from {low} to {high}, as measured in it, are shown as black to white")
     return facts
-
-
-def _frame_of(opened: log.Log, topic: str) -> str:
-    """The frame of reference of the first message of a channel; "" if it names none."""
-
-    def frame_id(message: Any) -> str:
-        return str(getattr(getattr(message, "header", message), "frame_id", ""))
-
-    try:
-        read = message_reader(opened, topic, lambda kind: decoder_with_errors(kind, frame_id))
-        return next((str(read(message)) for message in opened.messages(topic)), "")
-    except McaptrackError:
-        return ""
 
 
 # The range of values

@@ -25,9 +25,9 @@ from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.calibrations import frame_named, frame_of
 from mcaptrack.sources.cameras import camera_at
-from mcaptrack.sources.foreign.decoding import decoder_with_errors
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, frame_named
+from mcaptrack.sources.foreign.flatten import frame_of
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag2 import open_recording
 from mcaptrack.sources.ingest.calibration import is_calibration

@@ -469,7 +469,7 @@ class IngestJob:
         out: dict[str, Any] = {"first_frame": labels.first_frame} if is_stated else {}
         if self.options.columns:
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
-        if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
+        if role != "detections" and self.options.classes not in (None, None if labels.in_space else ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
         if self.options.class_map is not None:
             out["class_map"] = str(self.options.class_map)

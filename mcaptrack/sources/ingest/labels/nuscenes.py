@@ -126,7 +126,7 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     facts.usual, facts.states_labelled = frozenset(_CLASSES), True
     facts.labelled = np.unique(np.array(list(samples.values()), np.int64))
     return BoxTable(
-        facts=facts, at=at, frame=np.array(times, np.int64), id=numbered([f"#{track}" for track in ids])[0],
+        facts=facts, at=at, frame=np.array(times, np.int64), id=numbered([f"#{track}" for track in ids]),
         boxes_m=values, score=np.full(len(boxes), np.nan), class_id=np.array(kinds, np.int64), remarks=remarks,
     )  # fmt: skip
 

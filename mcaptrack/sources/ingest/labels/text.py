@@ -192,13 +192,13 @@ class TrackIds:
         return ids, [f"{path}: {said}{', ...' if len(self._texts) > len(shown) else ''}"]
 
 
-def numbered(texts: list[str]) -> tuple[Ints, bool]:
-    """Track ids (N,): the texts as numbers if all are, otherwise numbered from 1 on as they come; and which it is."""
+def numbered(texts: list[str]) -> Ints:
+    """Track ids (N,): the texts as numbers if all are, otherwise numbered from 1 on as they come."""
     whole = [text.removesuffix(".0") for text in texts]
     if all(is_count(text, 16) for text in whole):
-        return np.array([int(text) for text in whole], np.int64), True
+        return np.array([int(text) for text in whole], np.int64)
     numbers: dict[str, int] = {}
-    return np.array([numbers.setdefault(text, len(numbers) + 1) for text in texts], np.int64), False
+    return np.array([numbers.setdefault(text, len(numbers) + 1) for text in texts], np.int64)
 
 
 class FrameNames:
