@@ -17,9 +17,9 @@ from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.transform_tree import OTHER_CLOCK_S, Poses, TransformTree
 from mcaptrack.notices import warn
-from mcaptrack.schema.names import plain_name
+from mcaptrack.schema.names import plain_name, shared_parts
 from mcaptrack.schema.provenance import INGEST
-from mcaptrack.sources.cameras import Camera, provenance_of, shared_parts
+from mcaptrack.sources.cameras import Camera, provenance_of
 from mcaptrack.sources.fixed_frame import poses_at, transforms_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, frame_named, stamp_of
 from mcaptrack.sources.foreign.flatten import frame_of, message_type_of

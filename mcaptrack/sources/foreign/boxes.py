@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import lru_cache
-from itertools import islice, takewhile
+from itertools import islice
 from math import isfinite
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
@@ -32,7 +32,7 @@ from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.classes import COCO, PERSON, UNKNOWN, ClassMap, is_person
-from mcaptrack.schema.names import plain_name
+from mcaptrack.schema.names import plain_name, shared_parts
 from mcaptrack.schema.provenance import Provenance, boxes_of, input_of
 from mcaptrack.sources.foreign.decoding import (
     decoder_with_errors,
@@ -568,7 +568,7 @@ def picture_size_near(opened: log.Log, topic: str, pictures: str = "") -> tuple[
         if size := picture_size(opened, name):
             return size
     calibrations = [channel.topic for channel in opened.channels.values() if holds_calibrations(channel)]
-    for name in sorted(calibrations, key=lambda other: (-_shared(other, topic), other)):
+    for name in sorted(calibrations, key=lambda other: (-shared_parts(other, topic), other)):
         for size in _samples(opened, name, lambda message: (int(message.width), int(message.height)), 1):
             if all(size):
                 return size  # type: ignore[no-any-return]
@@ -579,7 +579,7 @@ def _pictures_near(opened: log.Log, topic: str) -> list[str]:
     from mcaptrack.sources.foreign.picture_messages import holds_pictures
 
     topics = [channel.topic for channel in opened.channels.values() if holds_pictures(channel) and channel.messages]
-    return sorted(topics, key=lambda other: (-_shared(other, topic), other))
+    return sorted(topics, key=lambda other: (-shared_parts(other, topic), other))
 
 
 def picture_stamp_of(message: Any) -> int | None:
@@ -623,12 +623,6 @@ def _times_of_pictures(
         said = f"boxes are taken at their log times, {late_s:.3g} s after their stamps, which no picture has"
         warn(f"{opened.path}: {topic}: {said}", "clock")
     return log_ns, "", "log times"
-
-
-def _shared(topic: str, other: str) -> int:
-    """The number of parts of two topics that are the same, from the first on."""
-    pairs = zip(topic.split("/"), other.split("/"), strict=False)
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 # Messages of a channel

@@ -34,7 +34,6 @@ from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.foreign.flatten import frame_of
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, described, share_numbers
-from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.roles import describe_classes
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.timeline import (
@@ -436,8 +435,7 @@ class Boxes3DJob(IngestJob):
         for stated, path in (*inputs, *options.labels.items()):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
-            given = (options.label_format, stated, options.first_of(stated), options.columns, options.classes)
-            rows = read_labels(path, *given, scene=options.scene, class_map=options.class_map)
+            rows = options.read(path, stated, options.classes)
             role = rows.role
             if not rows.in_space:
                 raise McaptrackError(f"{path} holds boxes in pictures, and {self.source} holds 3D boxes")
