@@ -557,7 +557,7 @@ def test_the_folder_of_nuscenes_holds_one_set_of_tables(tmp_path):
     with pytest.raises(McaptrackError, match=r"v1\.0-mini has no category\.json; nuScenes boxes need scene, sample, "):
         read_labels(tmp_path / "v1.0-mini", role="truth")
     (tmp_path / "v1.0-mini" / "category.json").write_text("{")
-    with pytest.raises(McaptrackError, match=r"category\.json is not JSON"):
+    with pytest.raises(McaptrackError, match=r"category\.json is not valid JSON"):
         read_labels(tmp_path / "v1.0-mini", role="truth")
 
 

@@ -17,10 +17,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import FrameNames, as_float, is_count, is_number, numbers_of_names
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, as_float, is_count, is_number, numbers_of_names
 
 _MAX_CLASSES: Final = 65536
-_MAX_NAME: Final = 256
 #: Keys of the track id of an annotation, and of the frame of an image.
 _TRACK_IDS: Final = ("track_id", "instance_id", "tracker_id")
 _FRAMES: Final = ("frame_id", "frame_index", "mot_frame_id")
@@ -181,7 +180,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
 
 def _key(value: Any) -> str:
     """The id of an image or a video as text; 1.0, as pandas writes it, is 1."""
-    return str(int(value) if isinstance(value, float) and value.is_integer() else value)[:_MAX_NAME]
+    return str(int(value) if isinstance(value, float) and value.is_integer() else value)[:MAX_NAME]
 
 
 def _frames(images: list[dict[str, Any]]) -> tuple[list[int], str]:
@@ -210,6 +209,6 @@ def _categories(path: Path, categories: Any) -> dict[int, str] | None:
         if not isinstance(key, int) or not 0 <= key < 2**31 or not isinstance(name, str) or isinstance(key, bool):
             raise McaptrackError(f"{path}: category {number} has no whole number as its id, or no name")
         if key in out:
-            raise McaptrackError(f"{path}: {key} is the id of several categories, {out[key]} and {name[:_MAX_NAME]}")
-        out[key] = " ".join(name.split())[:_MAX_NAME]
+            raise McaptrackError(f"{path}: {key} is the id of several categories, {out[key]} and {name[:MAX_NAME]}")
+        out[key] = " ".join(name.split())[:MAX_NAME]
     return out

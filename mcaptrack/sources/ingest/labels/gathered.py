@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.table import NO_ID, NOTHING, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, ClassNames, TrackIds, as_float, is_count, is_number
-
-_MAX_NAME: Final = 256
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_ROWS, ClassNames, TrackIds, as_float, is_count, is_number
 
 
 class GatheredRows:
@@ -67,7 +65,7 @@ class GatheredRows:
     ) -> None:
         """Add a row. ``track`` is a number or a text, ``name`` that of its class. Raises McaptrackError if not."""
         if isinstance(track, str):
-            track = (int(track) if is_count(track, 15) else self._ids.number(track[:_MAX_NAME])) if track else None
+            track = (int(track) if is_count(track, 15) else self._ids.number(track[:MAX_NAME])) if track else None
         own, stated = self.number(place, track, "track_id", NO_ID), self.number(place, score, "score")
         if name is not None and not isinstance(name, str):
             raise self.refuse(place, f"has a class that is no text: {str(name)[:40]!r}")

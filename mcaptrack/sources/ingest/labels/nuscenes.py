@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -10,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import read_json
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_WHOLE, ClassNames, as_float, headings, numbered
@@ -32,6 +32,7 @@ _CLASSES: Final = {
 }
 _CLASS_OF: Final = {category: name for name, categories in _CLASSES.items() for category in categories}
 _NS_PER_US: Final = 1000
+_MAX_BYTES: Final = 4 * 2**30
 #: The frame of reference, by the name that converters to MCAP give it.
 FRAME: Final = "map"
 
@@ -138,15 +139,10 @@ def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> st
 
 def _table(folder: Path, name: str) -> Iterator[dict[str, Any]]:
     path = folder / f"{name}.json"
-    try:
-        content = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    if not path.is_file():
         why = ": it is a set without labels" if path.stem == TABLES[2] else ""
-        raise McaptrackError(f"{folder} has no {path.name}{why}; nuScenes boxes need {', '.join(TABLES)}") from None
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        raise McaptrackError(f"{path} is not JSON") from None
+        raise McaptrackError(f"{folder} has no {path.name}{why}; nuScenes boxes need {', '.join(TABLES)}")
+    content = read_json(path, "nuScenes", _MAX_BYTES)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise McaptrackError(f"{path} is not a table of nuScenes, a list of objects")
     yield from content

@@ -31,7 +31,7 @@ MAX_WHOLE: Final = 2**53
 _LINE_SHOWN: Final = 60
 #: The number of class names of a file, at most: there are data sets with 21,841 classes.
 _MAX_NAMES: Final = 65_536
-_MAX_NAME: Final = 256
+MAX_NAME: Final = 256
 
 
 def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lines:
@@ -144,7 +144,7 @@ class ClassNames:
 
     def number(self, name: str) -> int:
         """The number of a name; ``NO_CLASS`` for a blank. Raises ValueError if there are too many names."""
-        name = " ".join(name.split())[:_MAX_NAME]
+        name = " ".join(name.split())[:MAX_NAME]
         if not name:
             return NO_CLASS
         if name not in self._numbers and len(self._numbers) == _MAX_NAMES:
