@@ -26,6 +26,7 @@ from mcaptrack import log
 from mcaptrack.contracts import Box, Box3d, is_in_space
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.boxes import outside
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
@@ -540,12 +541,10 @@ def scale_boxes(where: str, boxes: Floats, size: tuple[int, int] | None) -> str:
         )
         return f"shares of {size[0]}x{size[1]}"
     if size is not None:
-        margin = _MARGIN * np.array(size)
-        outside = int(((ends > size + margin) | (boxes[:, :2] < -margin)).any(axis=1).sum())
-        if outside > len(boxes) * _MARGIN:
-            x, y = ends.max(axis=0)
-            text = f"{outside:,} of {len(boxes):,} boxes reach outside of the pictures of {size[0]} x {size[1]} px"
-            warn(f"{where}: {text}, as far as ({x:.0f}, {y:.0f}): they may be of pictures of another size", "outside")
+        count = int(np.logical_or(*outside(boxes, np.array(size, float))).sum())
+        if count > len(boxes) * _MARGIN:
+            text = f"{count:,} of {len(boxes):,} boxes, or more than half of each, lie outside of the pictures"
+            warn(f"{where}: {text} of {size[0]} x {size[1]} px: they may be of pictures of another size", "outside")
     return "pixels"
 
 
