@@ -22,7 +22,7 @@ from pyarrow import feather
 import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, find
-from mcaptrack.sources.ingest.labels.checks import CHECKS
+from mcaptrack.sources.ingest.labels.checks import OF_ROLE, OF_SOURCE
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 
 NAN = math.nan
@@ -338,7 +338,7 @@ BROKEN: dict[str, list[tuple[list[Row], str, str, str]]] = {
 
 def test_every_format_and_every_check_is_here():
     assert set(WRITERS) == set(BUILT_IN["label_format"])
-    assert set(BROKEN) == {*CHECKS, "classes"}
+    assert set(BROKEN) == {*OF_SOURCE, *OF_ROLE, "classes"}
 
 
 def test_the_page_of_formats_has_the_table_of_the_registry():

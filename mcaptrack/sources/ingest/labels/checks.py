@@ -289,7 +289,6 @@ OF_SOURCE: Final[Mapping[str, Check]] = {
     "size": check_size,
 }
 OF_ROLE: Final[Mapping[str, Check]] = {"ids": check_ids}
-CHECKS: Final[Mapping[str, Check]] = {**OF_SOURCE, **OF_ROLE}
 
 
 def check(table: BoxTable, asked: Asked, checks: Mapping[str, Check] = OF_SOURCE) -> None:
