@@ -23,7 +23,7 @@ from pyarrow import feather
 import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, find
-from mcaptrack.sources.ingest.labels.checks import CHECKS
+from mcaptrack.sources.ingest.labels.checks import OF_ROLE, OF_SOURCE
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 
 NAN = math.nan
@@ -469,7 +469,7 @@ BROKEN: dict[str, list[tuple[list[Row], str, str, str]]] = {
 
 def test_every_format_and_every_check_is_here():
     assert set(WRITERS) == set(BUILT_IN["label_format"])
-    assert set(BROKEN) == {*CHECKS, "classes"}
+    assert set(BROKEN) == {*OF_SOURCE, *OF_ROLE, "classes"}
 
 
 def test_the_page_of_formats_has_the_table_of_the_registry():
@@ -645,3 +645,15 @@ def test_damaged_files_are_read_or_refused_in_a_line(name, tmp_path):
             except McaptrackError as error:
                 assert "\n" not in str(error), error
         file.write_bytes(data)
+
+
+def test_a_video_of_several_is_chosen_while_a_log_is_made(tmp_path):
+    label = {"id": "1", "category": "person", "box2d": {"x1": 1, "y1": 1, "x2": 20, "y2": 40}}
+    frames = [
+        {"name": f"{name}-{number}.jpg", "videoName": name, "frameIndex": number, "labels": [label]}
+        for name, count in (("a", 3), ("b", 5))
+        for number in range(count)
+    ]
+    (tmp_path / "a.json").write_text(json.dumps(frames))
+    out = mcaptrack.ingest(tmp_path / "a.json", tmp_path / "a.mcap", role="truth", fps=10, scene="b")
+    assert out.messages == {"/camera/truth": 5}

@@ -14,7 +14,7 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.job import fitted
 from mcaptrack.sources.ingest.labels import coco as coco_format
-from mcaptrack.sources.ingest.labels import delimited, yolo
+from mcaptrack.sources.ingest.labels import delimited, gathered, yolo
 from mcaptrack.sources.ingest.labels import format as formats
 from mcaptrack.sources.ingest.labels import text as texts
 from mcaptrack.sources.ingest.labels.reading import read_labels
@@ -140,7 +140,7 @@ def test_results_need_an_image(tmp_path):
 
 
 def test_files_have_no_more_boxes_and_classes_than_the_limits(tmp_path, monkeypatch):
-    monkeypatch.setattr(coco_format, "_MAX_ROWS", 2)
+    monkeypatch.setattr(gathered, "MAX_ROWS", 2)
     monkeypatch.setattr(coco_format, "_MAX_CLASSES", 2)
     kinds = [{"id": number, "name": f"n{number}"} for number in range(5, 8)]
     for make in (lambda count: coco([0], [box(0)] * count), lambda count: [box(0)] * count):

@@ -151,9 +151,7 @@ def test_rows_without_sizes_or_heights_are_boxes_too(tmp_path):
     ],
 )
 def test_ids_are_numbers_or_are_numbered_as_they_come(ids, wanted):
-    found, are_numbers = numbered(ids)
-    assert found.tolist() == wanted
-    assert are_numbers == all(one.isascii() and one.removesuffix(".0").isdigit() and len(one) < 17 for one in ids)
+    assert numbered(ids).tolist() == wanted
 
 
 @pytest.mark.parametrize(
@@ -559,7 +557,7 @@ def test_the_folder_of_nuscenes_holds_one_set_of_tables(tmp_path):
     with pytest.raises(McaptrackError, match=r"v1\.0-mini has no category\.json; nuScenes boxes need scene, sample, "):
         read_labels(tmp_path / "v1.0-mini", role="truth")
     (tmp_path / "v1.0-mini" / "category.json").write_text("{")
-    with pytest.raises(McaptrackError, match=r"category\.json is not JSON"):
+    with pytest.raises(McaptrackError, match=r"category\.json is not valid JSON"):
         read_labels(tmp_path / "v1.0-mini", role="truth")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats, Indices
+from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range
 
@@ -100,3 +100,13 @@ def _sweep(a: Floats, b: Floats) -> tuple[Indices, Indices]:
     low = left.searchsorted(a[0] - (b[2] - b[0]).max(), "left")
     high = left.searchsorted(a[2], "right")
     return group_index(high - low), order[ragged_range(low, high - low)]
+
+
+def outside(boxes: Floats, size: Floats) -> tuple[Bools, Bools]:
+    """Mask boxes (N, 4) of left, top, width, height that lie outside of pictures of this size (2,) or these sizes
+    (N, 2) of width and height: as a whole, and by more than half of their area.
+    """
+    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
+    beyond: Bools = np.asarray(((low >= size) | (high <= 0)).any(axis=1))
+    inner = np.maximum(np.minimum(high, size) - np.maximum(low, 0), 0).prod(axis=1)
+    return beyond, np.asarray(~beyond & (inner < boxes[:, 2:].prod(axis=1) / 2))

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import re
+from itertools import takewhile
 from typing import Final
 
 _SEPARATOR: Final = re.compile(r"::|[/.]")
@@ -47,3 +48,9 @@ def ros_type(name: str) -> str:
     """The name of a type as ROS 2 has it: sensor_msgs/msg/Image; those of IDL may have other parts. "" for none."""
     parts = parts_of(name)
     return "{}/msg/{}".format(*parts) if len(parts) == 2 else "/".join(parts)
+
+
+def shared_parts(topic: str, other: str) -> int:
+    """Return the number of parts that the names of two topics begin with together."""
+    pairs = zip(topic.split("/"), other.split("/"), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

@@ -17,12 +17,12 @@ from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.transform_tree import OTHER_CLOCK_S, Poses, TransformTree
 from mcaptrack.notices import warn
-from mcaptrack.schema.names import plain_name
+from mcaptrack.schema.names import plain_name, shared_parts
 from mcaptrack.schema.provenance import INGEST
-from mcaptrack.sources.cameras import Camera, provenance_of, shared_parts
+from mcaptrack.sources.cameras import Camera, provenance_of
 from mcaptrack.sources.fixed_frame import poses_at, transforms_of
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, stamp_of
-from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, frame_named, stamp_of
+from mcaptrack.sources.foreign.flatten import frame_of, message_type_of
 from mcaptrack.sources.pictures import picture_size
 
 if TYPE_CHECKING:
@@ -272,26 +272,11 @@ def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
     return log_ns, stamp_ns, frame_id
 
 
-def frame_of(opened: log.Log, topic: str) -> str:
-    """Return the frame of the first message of a channel; "" if there is none, or it can't be read."""
-    try:
-        decode = decoder_with_errors(message_type_of(opened, topic), frame_named)
-        return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
-    except McaptrackError:
-        return ""
-
-
 def _is_usable(opened: log.Log, topic: str) -> bool:
     try:
         return bool(read_calibrations(opened, topic, is_rectified=False))
     except McaptrackError:
         return False
-
-
-def frame_named(message: Any) -> str:
-    """Return the frame of reference that a message names; "" if it names none."""
-    holder = message.header if hasattr(message, "header") else message
-    return str(getattr(holder, "frame_id", "")).removeprefix("/")
 
 
 def calibration_of(message: Any, is_rectified: bool) -> Calibration:

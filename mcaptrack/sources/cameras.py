@@ -10,7 +10,6 @@ a name of their own: they belong to no pictures.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import takewhile
 from typing import Final, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -19,6 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
+from mcaptrack.schema.names import shared_parts
 from mcaptrack.schema.provenance import FUSE, REFINE, Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
@@ -393,9 +393,3 @@ def _nearest(name: str, others: set[str]) -> str | None:
     shared = {other: shared_parts(name, other) for other in others}
     nearest = [other for other in others if shared[other] == max(shared.values())]
     return nearest[0] if len(nearest) == 1 else None
-
-
-def shared_parts(topic: str, other: str) -> int:
-    """Return the number of parts that the names of two topics begin with together."""
-    pairs = zip(topic.split("/"), other.split("/"), strict=False)
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

@@ -32,7 +32,7 @@ from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions, fitted
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts
-from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography, read_labels
+from mcaptrack.sources.ingest.labels.reading import is_3d, read_homography
 from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE
 from mcaptrack.sources.ingest.labels.table import BoxTable, IgnoredBoxes, LabelFacts
 from mcaptrack.sources.ingest.labels.timeline import Placed, label_rows
@@ -165,7 +165,7 @@ def _boxes_3d(tracks: Path, ground_truth: Path, options: IngestOptions) -> Align
     together = replace(_may_lack(options), frame_id=FRAME)
     with Boxes3DJob([("tracks", tracks), ("truth", ground_truth)], together) as job:
         job.report_assumptions()
-        classes = (job.boxes["truth"].classes, job.boxes["tracks"].classes)
+        classes = _names_of(job.labels)
         ranges = options.frame_ranges
         labelled = (str(ranges), "frames") if ranges else (None, None)
         frames = job.all_frames("truth"), job.all_frames("tracks")
@@ -205,9 +205,7 @@ def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions)
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks(path)
-    wanted = replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks")
-    given = (options.label_format, role, options.first_of(role), options.columns, wanted)
-    labels = read_labels(path, *given, class_map=options.class_map)
+    labels = options.read(path, role, replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks"))
     if options.size is not None and labels.is_normalised:
         labels = fitted(labels, options.size)
     if labels.times_s is not None or labels.is_normalised:

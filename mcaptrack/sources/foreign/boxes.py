@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import lru_cache
-from itertools import islice, takewhile
+from itertools import islice
 from math import isfinite
 from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
@@ -26,13 +26,14 @@ from mcaptrack import log
 from mcaptrack.contracts import Box, Box3d, is_in_space
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.boxes import outside
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.classes import COCO, PERSON, UNKNOWN, ClassMap, is_person
-from mcaptrack.schema.names import plain_name
+from mcaptrack.schema.names import plain_name, shared_parts
 from mcaptrack.schema.provenance import Provenance, boxes_of, input_of
 from mcaptrack.sources.foreign.decoding import (
     decoder_with_errors,
@@ -59,7 +60,7 @@ from mcaptrack.sources.foreign.fields import (
     shape_of_message,
     shape_of_type,
 )
-from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.flatten import message_reader, message_type_of
 from mcaptrack.sources.foreign.known_types import KNOWN, Known
 
 _KIND: Final = "message_reader"
@@ -541,12 +542,10 @@ def scale_boxes(where: str, boxes: Floats, size: tuple[int, int] | None) -> str:
         )
         return f"shares of {size[0]}x{size[1]}"
     if size is not None:
-        margin = _MARGIN * np.array(size)
-        outside = int(((ends > size + margin) | (boxes[:, :2] < -margin)).any(axis=1).sum())
-        if outside > len(boxes) * _MARGIN:
-            x, y = ends.max(axis=0)
-            text = f"{outside:,} of {len(boxes):,} boxes reach outside of the pictures of {size[0]} x {size[1]} px"
-            warn(f"{where}: {text}, as far as ({x:.0f}, {y:.0f}): they may be of pictures of another size", "outside")
+        count = int(np.logical_or(*outside(boxes, np.array(size, float))).sum())
+        if count > len(boxes) * _MARGIN:
+            text = f"{count:,} of {len(boxes):,} boxes, or more than half of each, lie outside of the pictures"
+            warn(f"{where}: {text} of {size[0]} x {size[1]} px: they may be of pictures of another size", "outside")
     return "pixels"
 
 
@@ -569,7 +568,7 @@ def picture_size_near(opened: log.Log, topic: str, pictures: str = "") -> tuple[
         if size := picture_size(opened, name):
             return size
     calibrations = [channel.topic for channel in opened.channels.values() if holds_calibrations(channel)]
-    for name in sorted(calibrations, key=lambda other: (-_shared(other, topic), other)):
+    for name in sorted(calibrations, key=lambda other: (-shared_parts(other, topic), other)):
         for size in _samples(opened, name, lambda message: (int(message.width), int(message.height)), 1):
             if all(size):
                 return size  # type: ignore[no-any-return]
@@ -580,7 +579,7 @@ def _pictures_near(opened: log.Log, topic: str) -> list[str]:
     from mcaptrack.sources.foreign.picture_messages import holds_pictures
 
     topics = [channel.topic for channel in opened.channels.values() if holds_pictures(channel) and channel.messages]
-    return sorted(topics, key=lambda other: (-_shared(other, topic), other))
+    return sorted(topics, key=lambda other: (-shared_parts(other, topic), other))
 
 
 def picture_stamp_of(message: Any) -> int | None:
@@ -626,12 +625,6 @@ def _times_of_pictures(
     return log_ns, "", "log times"
 
 
-def _shared(topic: str, other: str) -> int:
-    """The number of parts of two topics that are the same, from the first on."""
-    pairs = zip(topic.split("/"), other.split("/"), strict=False)
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
-
-
 # Messages of a channel
 
 
@@ -644,21 +637,3 @@ def decoded_messages(
     """
     read = message_reader(opened, topic, make)
     return ((message, read(message)) for message in opened.timed(topic))
-
-
-def message_reader(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
-) -> Callable[[log.Message], Any]:
-    """A function that decodes messages of a channel; both raise errors as ``decoded_messages`` does."""
-    try:
-        decode = make(message_type_of(opened, topic))
-    except McaptrackError as error:
-        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
-
-    def read(message: log.Message) -> Any:
-        try:
-            return decode(message.payload)
-        except McaptrackError as error:
-            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
-
-    return read

@@ -190,3 +190,9 @@ def to_bytes(value: Any) -> bytes:
     if isinstance(value, bytes | list):
         return bytes(value)
     raise ValueError(f"a {type(value).__name__} where bytes belong")
+
+
+def frame_named(message: Any) -> str:
+    """Return the frame of reference that a message names; "" if it names none."""
+    holder = message.header if hasattr(message, "header") else message
+    return str(getattr(holder, "frame_id", "")).removeprefix("/")

@@ -15,10 +15,12 @@ import numpy as np
 from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.sources.foreign.decoding import (
     decoder_with_errors,
+    frame_named,
     protobuf_class,
     protobuf_unpacker,
     unpacker,
@@ -58,6 +60,33 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
             "definitions",
         )
     return kinds[topic]
+
+
+def frame_of(opened: log.Log, topic: str) -> str:
+    """Return the frame of the first message of a channel; "" if there is none, or it can't be read."""
+    try:
+        decode = decoder_with_errors(message_type_of(opened, topic), frame_named)
+        return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
+    except McaptrackError:
+        return ""
+
+
+def message_reader(
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
+) -> Callable[[log.Message], Any]:
+    """A function that decodes messages of a channel by what ``make`` makes for their type; errors name the place."""
+    try:
+        decode = make(message_type_of(opened, topic))
+    except McaptrackError as error:
+        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
+
+    def read(message: log.Message) -> Any:
+        try:
+            return decode(message.payload)
+        except McaptrackError as error:
+            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
+
+    return read
 
 
 def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:

@@ -23,7 +23,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.definitions import MessageType
-from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.flatten import frame_of, message_reader
 
 if TYPE_CHECKING:
     from mcaptrack.sources.video import EncodedPicture, PixelLayout, Recogniser, Samples, Span
@@ -62,9 +62,6 @@ _PNG: Final = b"\x89PNG"
 _DEPTH_HEAD, _ZSTD_HEAD, _BYTES_A_PIXEL = 12, 17, 8
 #: Messages that are searched for the beginning of a video.
 _SEARCHED: Final = 300
-#: Pictures in which the range of values is measured, samples of each, and the shares of the darkest and the brightest
-#: that are cut off.
-_MEASURED, _SAMPLES, _CUT_OFF = 24, 100_000, 0.0002
 
 
 class Picture(NamedTuple):
@@ -183,25 +180,7 @@ def pictures(opened: log.Log, topic: str) -> Iterator[tuple[log.Message, Picture
 def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Picture]:
     """A function that decodes messages of a channel to pictures; both raise errors as ``pictures`` does."""
     facts = facts_of(opened, topic)
-    return reader(opened, topic, lambda kind: picture_decoder(kind, facts))
-
-
-def reader(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
-) -> Callable[[log.Message], Any]:
-    """A function that decodes messages of a channel by what ``make`` makes for their type; errors name the place."""
-    try:
-        decode = make(message_type_of(opened, topic))
-    except McaptrackError as error:
-        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
-
-    def read(message: log.Message) -> Any:
-        try:
-            return decode(message.payload)
-        except McaptrackError as error:
-            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
-
-    return read
+    return message_reader(opened, topic, lambda kind: picture_decoder(kind, facts))
 
 
 def stamps(opened: log.Log, topic: str) -> Ints:
@@ -213,10 +192,10 @@ def stamps(opened: log.Log, topic: str) -> Ints:
 
 
 def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
-    from mcaptrack.sources.video import Recogniser
+    from mcaptrack.sources.video import Recogniser, measured_span
 
     facts = SharedFacts(Recogniser())
-    read = reader(opened, topic, lambda kind: picture_decoder(kind, facts))
+    read = message_reader(opened, topic, lambda kind: picture_decoder(kind, facts))
     first: Picture | None = None
     for message in islice(opened.messages(topic), _SEARCHED):
         try:
@@ -232,9 +211,9 @@ def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
     parts = _sampled(opened, topic, read)
     may_be_depth = bool(parts) and parts[0].shape[2] == 1
     name = (first.format if first.layout else first.pixels or "16uc1").upper()
-    if first.is_depth or (may_be_depth and any(map(_DEPTH.search, (topic, _frame_of(opened, topic))))):
+    if first.is_depth or (may_be_depth and any(map(_DEPTH.search, (topic, frame_of(opened, topic))))):
         facts.depth = name
-    if parts and (span := _span(parts)) is not None:
+    if parts and (span := measured_span(parts)) is not None:
         facts.span = span
         of = "distances" if facts.depth else "values"
         low, high = (f"{value:.4g}" for value in span)
@@ -242,28 +221,15 @@ def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
     return facts
 
 
-def _frame_of(opened: log.Log, topic: str) -> str:
-    """The frame of reference of the first message of a channel; "" if it names none."""
-
-    def frame_id(message: Any) -> str:
-        return str(getattr(getattr(message, "header", message), "frame_id", ""))
-
-    try:
-        read = reader(opened, topic, lambda kind: decoder_with_errors(kind, frame_id))
-        return next((str(read(message)) for message in opened.messages(topic)), "")
-    except McaptrackError:
-        return ""
-
-
 # The range of values
 
 
 def _sampled(opened: log.Log, topic: str, read: Callable[[log.Message], Picture]) -> list[Samples]:
     """The samples (H, W, N) of pictures all over a channel, if they have more than 8 bits; else none."""
-    from mcaptrack.sources.video import wide_samples
+    from mcaptrack.sources.video import measured, wide_samples
 
     times, parts = opened.times(topic), list[Any]()
-    for t_ns in dict.fromkeys(times[np.linspace(0, len(times) - 1, min(_MEASURED, len(times))).astype(int)].tolist()):
+    for t_ns in dict.fromkeys(times[measured(len(times))].tolist()):
         message = next(opened.messages(topic, t_ns, t_ns + 1))
         try:
             samples = wide_samples(read(message).encoded(t_ns, 0, ""))
@@ -273,31 +239,6 @@ def _sampled(opened: log.Log, topic: str, read: Callable[[log.Message], Picture]
             break
         parts.append(samples)
     return parts
-
-
-def _span(parts: Sequence[Samples]) -> Span | None:
-    """The values that become black and white: nearly the least and the greatest; None if all are the same.
-
-    Single pixels that differ from all neighbours don't count, nor do values that stand for none: 0, the greatest whole
-    number, and what is not finite.
-    """
-    import cv2
-
-    pooled = [np.zeros(0, np.float32)]
-    for samples in parts:
-        kind = samples.dtype
-        for channel in np.moveaxis(samples, -1, 0) if samples.size else ():
-            values = cv2.medianBlur(np.ascontiguousarray(channel.astype(np.float32)), 3).ravel()
-            is_value = np.isfinite(values) & (values != 0)
-            if kind.kind in "iu":
-                is_value &= values != np.float32(np.iinfo(kind).max)
-            every = -(-len(values) // _SAMPLES)
-            pooled.append(values[::every][is_value[::every]])
-    values = np.concatenate(pooled)
-    if not len(values):
-        return None
-    low, high = np.quantile(values, [_CUT_OFF, 1 - _CUT_OFF]).tolist()
-    return (low, high) if high > low else None
 
 
 # Messages

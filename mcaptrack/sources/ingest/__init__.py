@@ -26,9 +26,9 @@ from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
-from mcaptrack.sources.calibrations import frame_named, frame_of
 from mcaptrack.sources.cameras import camera_at
-from mcaptrack.sources.foreign.decoding import decoder_with_errors
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, frame_named
+from mcaptrack.sources.foreign.flatten import frame_of
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag2 import open_recording
 from mcaptrack.sources.ingest.calibration import is_calibration
@@ -244,14 +244,13 @@ def _warn_unused(job: IngestJob, options: IngestOptions) -> None:
     is_calibrated = bool(options.calibration) or any(topic.endswith(f"/{CALIBRATION}") for topic in job.report.messages)
     is_sized = bool(job.options.calibration) and not job.pictures
     uses: dict[str, tuple[object, *tuple[str, ...]]] = {
-        "there is no label file": (job.has_labels, "label_format", "columns", "frame_ranges", "class_map"),
+        "there is no label file": (job.has_labels, "label_format", "columns", "frame_ranges", "class_map", "scene"),
         "no label file has boxes in pictures": (
             is_sized or any(labels.boxes_px is not None for labels in job.labels.values()), "size",
         ),
         "there are no tracks and no ground truth": (job.roles - {"detections"}, "classes"),
         "there are no 3D boxes": (isinstance(job, Boxes3DJob), "frame_id"),
         "the input is a folder of images": (not isinstance(job, VideoJob) or not job.video.images, "stream"),
-        "there are no tables of nuScenes": (isinstance(job, Boxes3DJob), "scene"),
         "there is no ground plane": (options.ground_plane or is_calibrated, "point"),
         "there is no calibration": (is_calibrated, "calibration_name", "calibration_unit"),
         "the channels of a recording keep their names": (job.report.uses_camera, "camera"),

@@ -113,6 +113,11 @@ class IngestOptions:
         """The number of the first picture in files with this role; None if it wasn't given."""
         return self.first_frame.get(role or "") if isinstance(self.first_frame, Mapping) else self.first_frame
 
+    def read(self, path: Path, role: Role | None, wanted: WantedClasses | None, in_parts: bool = False) -> BoxTable:
+        """Read a label file as these options say, but for the ``wanted`` classes. Raises McaptrackError."""
+        given = (self.label_format, role, self.first_of(role), self.columns, wanted, in_parts, self.scene)
+        return read_labels(path, *given, self.class_map)
+
     def given(self, *names: str) -> str:
         """The first of these options that was given, as a user writes it; "" if none was."""
         defaults = IngestOptions()
@@ -254,8 +259,7 @@ class IngestJob:
                 f"{path} holds 3D boxes, and {self.source} does not; add them with "
                 f"{call('ingest', path, role=role, into='LOG')}"
             )
-        given = (options.label_format, role, options.first_of(role), options.columns, wanted)
-        labels = read_labels(path, *given, in_parts=True, class_map=options.class_map)
+        labels = options.read(path, role, wanted, in_parts=True)
         if role is None and isinstance(options.first_frame, Mapping):
             return self.read(path, labels.role)
         if labels.role == "detections" and labels.boxes_px is None:
@@ -469,7 +473,7 @@ class IngestJob:
         out: dict[str, Any] = {"first_frame": labels.first_frame} if is_stated else {}
         if self.options.columns:
             out["columns"] = ",".join(f"{key}={name}" for key, name in self.options.columns.items())
-        if role != "detections" and self.options.classes not in (None, ONLY_PEOPLE):
+        if role != "detections" and self.options.classes not in (None, None if labels.in_space else ONLY_PEOPLE):
             out["classes"] = self.options.classes.text
         if self.options.class_map is not None:
             out["class_map"] = str(self.options.class_map)

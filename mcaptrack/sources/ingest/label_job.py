@@ -5,7 +5,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -26,15 +26,14 @@ from mcaptrack.notices import collected, warn
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import frame_times, split_rows, unique_values
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, frame_id_of
-from mcaptrack.sources.calibrations import frame_of
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import DEFAULT_CAMERA, camera_at
 from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
 from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
 from mcaptrack.sources.foreign import holds_pictures
+from mcaptrack.sources.foreign.flatten import frame_of
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, described, share_numbers
-from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.roles import describe_classes
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.timeline import (
@@ -433,30 +432,23 @@ class Boxes3DJob(IngestJob):
         super().__init__(inputs[0][1], replace(options, labels={}), into)
         if name := options.given(*FOR_VIDEOS, "ground_plane", "calibration", "motion", "size", "frames"):
             raise McaptrackError(f"{self.source} holds 3D boxes; {name} is for pictures and boxes in them")
-        self.boxes: dict[Role, BoxTable] = {}
         for stated, path in (*inputs, *options.labels.items()):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
-            given = (options.label_format, stated, options.first_of(stated), options.columns, options.classes)
-            rows = read_labels(path, *given, scene=options.scene, class_map=options.class_map)
+            rows = options.read(path, stated, options.classes)
             role = rows.role
             if not rows.in_space:
                 raise McaptrackError(f"{path} holds boxes in pictures, and {self.source} holds 3D boxes")
-            if role in self.boxes:
+            if role in self.labels:
                 raise McaptrackError(
-                    f"{path} and {self.boxes[role].path} are both {role}; give the role of {path} with `role=`"
+                    f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
                 )
-            self.boxes[role] = rows
+            self.labels[role] = rows
         self._topic = boxes_topic(into, options.camera) if into else ""
         if self._topic and options.camera == DEFAULT_CAMERA:
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
-        share_numbers(self.boxes)
-        self.boxes = {role: self._at_times(self._described(self._placed(rows))) for role, rows in self.boxes.items()}
-
-    @property
-    def roles(self) -> Set[Role]:
-        """The roles of label files."""
-        return self.boxes.keys()
+        share_numbers(self.labels)
+        self.labels = {role: self._at_times(self._described(self._placed(rows))) for role, rows in self.labels.items()}
 
     def _placed(self, rows: BoxTable) -> BoxTable:
         """Rows in the frame of reference that the user says, or the format, or the root of the log's transforms."""
@@ -534,13 +526,9 @@ class Boxes3DJob(IngestJob):
             return 0
         return int(box_times(self.into, self._topic)[0]) if self._topic else self.into.start_ns
 
-    def topics(self) -> Iterator[str]:
-        """The topics that will be written."""
-        yield from (f"{self.prefix}/{role}" for role in self.boxes)
-
     def report_assumptions(self) -> None:
         """Report how the boxes were understood, and what of them is left out."""
-        for role, rows in self.boxes.items():
+        for role, rows in self.labels.items():
             self.report_table(role, rows)
             self.report.facts[role] = rows.facts.to_json()
             text = describe_classes(*rows.extent.classes, rows.classes)
@@ -549,30 +537,23 @@ class Boxes3DJob(IngestJob):
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the boxes."""
         if self.into is None and not has_clock:
-            start = min(int(rows.labelled[0]) for rows in self.boxes.values())
+            start = min(int(rows.labelled[0]) for rows in self.labels.values())
             writer.add_metadata(CLOCK, {"start_ns": str(start)})
-        for role, rows in self.boxes.items():
-            parameters: dict[str, Any] = {"file": rows.path.name, "format": rows.format} | self._parameters(role)
+        for role, rows in self.labels.items():
+            parameters = {"file": rows.path.name, "format": rows.format} | self.label_parameters(role, rows)
             frames = partial(iter, self.all_frames(role))
             self.write_rows(writer, role, SCHEMA_OF[role], frames, parameters, rows, rows.facts.frame_id)
 
-    def _parameters(self, role: Role) -> dict[str, Any]:
-        options = self.options
-        parameters: Mapping[str, Any] = {
-            "first_frame": options.first_of(role),
-            "frames": str(ranges) if (ranges := self.ranges_of(role)) else None,
-            "frames_by": "frames" if ranges else None,
-            "columns": ",".join(f"{key}={name}" for key, name in (options.columns or {}).items()) or None,
-            "classes": options.classes.text if options.classes and role != "detections" else None,
-            "class_map": str(options.class_map) if options.class_map else None,
-            "scene": options.scene,
-            "fps": None if options.fps is None else str(options.fps),
-        }
-        return {name: value for name, value in parameters.items() if value is not None}
+    def label_parameters(self, role: Role, labels: BoxTable) -> dict[str, Any]:
+        """Also the frames that were labelled, the part of a data set, and the frame rate."""
+        options, ranges = self.options, self.ranges_of(role)
+        out = super().label_parameters(role, labels) | ({"scene": options.scene} if options.scene else {})
+        out |= {"frames": str(ranges), "frames_by": "frames"} if ranges else {}
+        return out | ({} if options.fps is None else {"fps": str(options.fps)})
 
     def all_frames(self, role: Role) -> list[Frame]:
         """The boxes of a role as frames, at all times that the file describes."""
-        rows = self.boxes[role]
+        rows = self.labels[role]
         ends = np.searchsorted(rows.frame, rows.labelled, "right")
         return split_rows(rows.labelled, range(len(ends)), label_rows_3d(rows, role), ends)
 

@@ -14,6 +14,8 @@ from mcaptrack.sources.video.pixels import (
     Samples,
     Span,
     is_mosaic,
+    measured,
+    measured_span,
     pixel_format,
 )
 from mcaptrack.sources.video.reader import PictureMessage, Video, open_video
@@ -41,6 +43,8 @@ __all__ = [
     "find_seqinfo",
     "is_mosaic",
     "is_video_codec",
+    "measured",
+    "measured_span",
     "open_video",
     "pixel_format",
     "read_head",

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning, refuse_special
-from mcaptrack.geometry.arrays import Floats, Image
+from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import parse_fps
 from mcaptrack.notices import warn
 from mcaptrack.sources.video.limits import check_still, still_size
+from mcaptrack.sources.video.pixels import Span, measured, measured_span, scaled
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 #: Pictures of other kinds, which are not read; a folder that holds some is not all read.
@@ -37,10 +38,6 @@ _CAMERA_DIGITS, _ONE_RUN = 3, 3  # digits of such a number; parts of a name that
 #: Numbers in names count as frame numbers if at least this share of them exists.
 _DENSE: Final = 0.5
 _SHOWN: Final = 3
-#: Images in which the range of values is measured, values of each, and the share of the darkest and brightest cut off.
-_MEASURED, _SAMPLES, _CUT_OFF = 24, 100_000, 0.0002
-#: The values that become black and white.
-Span = tuple[float, float]
 
 
 class Images(NamedTuple):
@@ -155,32 +152,13 @@ def read_image(path: Path, span: Span | None = None) -> Image | None:
     Values of more than 8 bits are scaled by ``span``. Raises McaptrackError if it is too large, or not a file.
     """
     values = _read_values(path)
-    if values is None or values.dtype == np.uint8:
-        return values
-    low, high = span or (0.0, 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max))
-    shares = (np.nan_to_num(values.astype(np.float32), nan=low) - low) * (255 / max(high - low, 1e-30))
-    return np.asarray(np.rint(np.clip(shares, 0, 255)), np.uint8)
+    return values if values is None or values.dtype == np.uint8 else scaled(values, span)
 
 
 def measure_span(paths: Sequence[Path]) -> Span | None:
-    """The values that become black and white in images of more than 8 bits; None for others.
-
-    They are nearly the least and the greatest of images all over the folder. Values that stand for none don't count: 0,
-    the greatest whole number, and what is not finite.
-    """
-    pooled: list[Floats] = []
-    for at in np.unique(np.linspace(0, len(paths) - 1, min(_MEASURED, len(paths))).astype(int)).tolist():
-        values = _read_values(paths[at])
-        if values is None:
-            continue
-        if values.dtype == np.uint8:
-            return None
-        most = np.inf if values.dtype.kind == "f" else np.iinfo(values.dtype).max
-        some = values.reshape(-1)[:: max(1, values.size // _SAMPLES)].astype(np.float64)
-        pooled.append(some[np.isfinite(some) & (some != 0) & (some != most)])
-    known = np.concatenate([*pooled, np.empty(0)])
-    low, high = np.quantile(known, [_CUT_OFF, 1 - _CUT_OFF]).tolist() if len(known) else (0.0, 0.0)
-    return (low, high) if high > low else None
+    """The values that become black and white in images of more than 8 bits; None for others."""
+    images = (_read_values(paths[at]) for at in measured(len(paths)))
+    return measured_span(image for image in images if image is not None)
 
 
 def _read_values(path: Path) -> NDArray[Any] | None:

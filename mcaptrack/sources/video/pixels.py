@@ -9,7 +9,7 @@ Letters: H rows, W columns, N samples a pixel.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -25,6 +25,9 @@ Span = tuple[float, float]
 
 # Video stores luma in 16..235; detectors get 0..255 from every kind of picture.
 LIMITED_TO_FULL: Final = np.clip(np.rint((np.arange(256) - 16) * (255 / 219)), 0, 255).astype(np.uint8)
+#: Pictures in which the range of values is measured, samples of each, and the shares of the darkest and the brightest
+#: that are cut off.
+_MEASURED, _SAMPLES, _CUT_OFF = 24, 100_000, 0.0002
 #: BGR and 1 to Y, U and V of limited range (ITU-R BT.601), the inverse of what OpenCV reads.
 _TO_YUV: Final = np.array(
     [
@@ -282,6 +285,42 @@ def scaled(samples: Samples, span: Span | None) -> Bytes:
 
 def _default_span(kind: np.dtype[Any]) -> Span:
     return 0.0, float(np.iinfo(kind).max) if kind.kind in "iu" else 1.0
+
+
+# The range of values of pictures with more than 8 bits.
+
+
+def measured(count: int) -> list[int]:
+    """The numbers of the pictures, all over ``count`` of them, in which the range of values is measured."""
+    return [int(at) for at in np.unique(np.linspace(0, count - 1, min(_MEASURED, count)).astype(int))]
+
+
+def measured_span(parts: Iterable[Samples]) -> Span | None:
+    """The values that become black and white: nearly the least and the greatest; None if all are the same, or have
+    8 bits.
+
+    Single pixels that differ from all neighbours don't count, nor do values that stand for none: 0, the greatest whole
+    number, and what is not finite.
+    """
+    import cv2
+
+    pooled = [np.zeros(0, np.float32)]
+    for samples in parts:
+        kind = samples.dtype
+        if kind == np.uint8:
+            return None
+        for channel in np.moveaxis(samples, -1, 0) if samples.size else ():
+            values = cv2.medianBlur(np.ascontiguousarray(channel.astype(np.float32)), 3).ravel()
+            is_value = np.isfinite(values) & (values != 0)
+            if kind.kind in "iu":
+                is_value &= values != np.float32(np.iinfo(kind).max)
+            every = -(-len(values) // _SAMPLES)
+            pooled.append(values[::every][is_value[::every]])
+    values = np.concatenate(pooled)
+    if not len(values):
+        return None
+    low, high = np.quantile(values, [_CUT_OFF, 1 - _CUT_OFF]).tolist()
+    return (low, high) if high > low else None
 
 
 # Replace a part of a picture.

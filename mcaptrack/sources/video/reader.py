@@ -39,9 +39,10 @@ from mcaptrack.sources.video.container import (
 )
 from mcaptrack.sources.video.decode import EncodedPicture, decode_gray
 from mcaptrack.sources.video.encode import H264Encoder, StillFormat, VideoOptions, encode_image
-from mcaptrack.sources.video.image_folder import Images, Span, find_images, find_seqinfo, measure_span, read_image
+from mcaptrack.sources.video.image_folder import Images, find_images, find_seqinfo, measure_span, read_image
 from mcaptrack.sources.video.limits import check_h264, check_size
 from mcaptrack.sources.video.passthrough import check_stream, packets
+from mcaptrack.sources.video.pixels import Span
 
 #: A fixed number of threads, so that damaged streams decode to the same pictures on every machine.
 _THREADS: Final = 4

@@ -29,6 +29,7 @@ from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, Frame
 from mcaptrack.schema.classes import PERSON, class_name, class_names
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras
+from mcaptrack.sources.video import is_video_codec
 
 Progress = Callable[[str, int, int], None]
 _APPLICATION: Final = "mcaptrack"
@@ -36,7 +37,6 @@ _APPLICATION: Final = "mcaptrack"
 _DATES_NS: Final = 10**9 * NS_PER_S
 #: How long trails are.
 _TRAIL_NS: Final = 3 * NS_PER_S
-_CODECS: Final = {"h264": "H264", "h265": "H265", "av1": "AV1", "vp9": "VP9"}
 _IMAGES: Final = {"jpeg": "image/jpeg", "jpg": "image/jpeg", "png": "image/png", "webp": "image/webp"}
 #: The channels of forecasts below the name of a camera, the best first.
 _FORECASTS: Final = ("retracks/predictions", "predictions")
@@ -127,9 +127,9 @@ class _Job:
         has_codec = False
         for number, (message, picture) in enumerate(foreign.pictures(self._opened, topic)):
             self._at(message.t_ns, number)
-            if picture.format in _CODECS and picture.layout is None:
+            if is_video_codec(picture.format) and picture.layout is None:
                 if not has_codec:
-                    codec = getattr(rr.VideoCodec, _CODECS[picture.format])
+                    codec = getattr(rr.VideoCodec, picture.format.upper())
                     self._recording.log("camera", rr.VideoStream(codec=codec), static=True)
                     has_codec = True
                 self._recording.log("camera", rr.VideoStream.from_fields(sample=picture.data))

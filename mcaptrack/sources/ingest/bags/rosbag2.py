@@ -25,7 +25,7 @@ from mcaptrack.sources.ingest.bags import decompression
 from mcaptrack.sources.ingest.bags.metadata_yaml import Bag, holds_metadata, read_metadata
 from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
 from mcaptrack.sources.ingest.bags.rosbag1 import Bag1
-from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
+from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables, text_of
 from mcaptrack.sources.sidecar import METADATA, holds_packed
 from mcaptrack.sources.video import IMAGE_SUFFIXES
 
@@ -223,7 +223,7 @@ class Databases(_Files):
         for database in self._databases:
             if "metadata" in database.columns("metadata"):
                 for (text,) in database.rows("metadata", ["metadata"]):
-                    writer.add_metadata("rosbag2", {"serialized_metadata": _text(text)})
+                    writer.add_metadata("rosbag2", {"serialized_metadata": text_of(text)})
 
     def _open(self, number: int) -> None:
         if not number:  # definitions are tried on the messages of all files
@@ -239,7 +239,7 @@ class Databases(_Files):
         optional = [name for name in ("offered_qos_profiles", "type_description_hash") if name in has]
         described: dict[int, Connection] = {}
         for key, *values in database.rows("topics", ["id", "name", "type", "serialization_format", *optional]):
-            topic, kind, encoding, *more = map(_text, values)
+            topic, kind, encoding, *more = map(text_of, values)
             extra = dict(zip(optional, more, strict=True))
             digest = extra.get("type_description_hash", "")
             own, own_digest = definitions.get(kind, (("", "", b""), ""))
@@ -269,7 +269,7 @@ class Databases(_Files):
                 f"{database.path} does not add up: its index counts {total} messages, and {counted} are there"
             )
         self.findings.lost += [
-            f"{database.path}: {count} messages of topic {_text(key)[:80]}, which is not described"
+            f"{database.path}: {count} messages of topic {text_of(key)[:80]}, which is not described"
             for key, count in strange.items()
         ]
         return counts
@@ -277,13 +277,13 @@ class Databases(_Files):
     def _definitions(self, database: SqliteTables) -> dict[str, tuple[tuple[str, str, bytes], str]]:
         """Schema record and type hash of each message type that a database defines."""
         if not self._distro and "ros_distro" in database.columns("schema"):
-            self._distro = next((_text(row[0]) for row in database.rows("schema", ["ros_distro"])), "")
+            self._distro = next((text_of(row[0]) for row in database.rows("schema", ["ros_distro"])), "")
         has = database.columns("message_definitions")
         if not {"topic_type", "encoding", "encoded_message_definition"} <= set(has):
             return {}
         wanted = ["topic_type", "encoding", "encoded_message_definition"]
         wanted += ["type_description_hash"] * ("type_description_hash" in has)
-        rows = [[*map(_text, row), ""] for row in database.rows("message_definitions", wanted)]
+        rows = [[*map(text_of, row), ""] for row in database.rows("message_definitions", wanted)]
         return {
             kind: ((kind, encoding, text.encode()), type_hash)
             for kind, encoding, text, type_hash, *_ in rows
@@ -292,7 +292,7 @@ class Databases(_Files):
 
     def _payloads(self, kind: MessageType) -> Generator[bytes]:
         for database in self._databases:
-            keys = [key for key, name in database.rows("topics", ["id", "type"]) if _text(name) == kind.name]
+            keys = [key for key, name in database.rows("topics", ["id", "type"]) if text_of(name) == kind.name]
             for key in keys[:_TOPICS_TRIED]:
                 with closing(database.rows("messages", ["data"], where=("topic_id", key))) as those:
                     yield from (data for (data,) in those if isinstance(data, bytes))
@@ -353,11 +353,6 @@ class Logs(_Files):
 
     def _messages(self, number: int) -> Iterator[tuple[Connection, log.Message]]:
         return ((self._channels[number][channel], message) for channel, message in log.stream(self.logs[number]))
-
-
-def _text(value: Any) -> str:
-    """Text of a database, which may be bytes or another type."""
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else "" if value is None else str(value)
 
 
 def _in_order(key: Any) -> tuple[int, Any]:

@@ -137,11 +137,11 @@ class SqliteTables:
 
     def _find(self, table: str) -> Collection[str]:
         """The stored columns of a table. Raises McaptrackError for views, virtual tables and generated columns."""
-        columns = [(_text(row[1]), row[6]) for row in self._query(f'PRAGMA main.table_xinfo("{table}")')]
+        columns = [(text_of(row[1]), row[6]) for row in self._query(f'PRAGMA main.table_xinfo("{table}")')]
         if not columns:
             return ()
         query = f"SELECT sql FROM main.sqlite_master WHERE name = '{table}' COLLATE NOCASE"  # noqa: S608
-        made_by = [_text(row[0]) for row in self._query(query)]
+        made_by = [text_of(row[0]) for row in self._query(query)]
         # SQLite normalises the SQL text to this form, and decides by it.
         if not (made_by and all(text.startswith("CREATE TABLE ") for text in made_by)):
             raise McaptrackError(
@@ -180,5 +180,6 @@ class SqliteTables:
             raise McaptrackError(f"{self.path} is damaged: {why}{saved}") from None
 
 
-def _text(value: Any) -> str:
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+def text_of(value: Any) -> str:
+    """The text of a value, which may be bytes or of another type."""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else "" if value is None else str(value)

@@ -79,7 +79,7 @@ def _read(path: Path) -> BoxTable:
         path, "argoverse", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=frame_id
     )
     return BoxTable(
-        facts=facts, at=at, frame=t_ns, id=numbered([f"#{track}" for track in table["track_uuid"]])[0],
+        facts=facts, at=at, frame=t_ns, id=numbered([f"#{track}" for track in table["track_uuid"]]),
         boxes_m=np.column_stack([place, _floats(path, table, _SIZE), heading]), score=np.full(count, np.nan),
         class_id=kind, remarks=remarks,
     )  # fmt: skip

@@ -6,8 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
 from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import is_number, numbers_of_names
@@ -15,7 +15,6 @@ from mcaptrack.sources.ingest.labels.text import is_number, numbers_of_names
 _CORNERS: Final = ("x1", "y1", "x2", "y2")
 _INDEXES: Final = ("frameIndex", "frame_index", "index")
 _VIDEOS: Final = ("videoName", "video_name", "video")
-_SHOWN: Final = 5
 
 
 class Bdd(Format):
@@ -68,16 +67,10 @@ def _frames(file: LabelFile) -> list[Any]:
 
 def _of_video(file: LabelFile, wanted: str | None) -> list[dict[str, Any]]:
     """The frames of a video. Raises McaptrackError if there are several, and none is chosen."""
-    frames = [frame for frame in _frames(file) if isinstance(frame, dict)]
     videos: dict[str, list[dict[str, Any]]] = {}
-    for frame in frames:
+    for frame in (frame for frame in _frames(file) if isinstance(frame, dict)):
         videos.setdefault(str(next((frame[key] for key in _VIDEOS if frame.get(key)), "")), []).append(frame)
-    if wanted is None and len(videos) == 1:
-        return frames
-    if wanted is None or wanted not in videos:
-        what = f"no video {wanted!r:.60}" if wanted else f"{len(videos)} videos"
-        raise McaptrackError(f"{file.path} has {what}; choose one with `scene=`: {list_names(sorted(videos), _SHOWN)}")
-    return videos[wanted]
+    return chosen_part(file.path, videos, wanted, "video")
 
 
 def _numbers(frames: list[dict[str, Any]]) -> list[int]:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.angles import wrapped
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.boxes import outside
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.geometry.oriented_boxes import COLUMNS as COLUMNS_3D
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable
@@ -247,16 +248,6 @@ def check_size(table: BoxTable, _: Asked) -> None:
         find_outside(table, np.array(facts.size, float))
 
 
-def outside(boxes: Floats, size: Floats) -> tuple[Bools, Bools]:
-    """Mask boxes (N, 4) of left, top, width, height that lie outside of pictures of this size (2,) or these sizes
-    (N, 2) of width and height: as a whole, and by more than half of their area.
-    """
-    low, high = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]
-    beyond: Bools = np.asarray(((low >= size) | (high <= 0)).any(axis=1))
-    inner = np.maximum(np.minimum(high, size) - np.maximum(low, 0), 0).prod(axis=1)
-    return beyond, np.asarray(~beyond & (inner < boxes[:, 2:].prod(axis=1) / 2))
-
-
 def find_outside(table: BoxTable, size: Floats) -> None:
     """Warn of boxes that lie outside of pictures of this size (2,) or these sizes (N, 2)."""
     low, high = table.extent.low, table.extent.high
@@ -303,7 +294,6 @@ OF_SOURCE: Final[Mapping[str, Check]] = {
     "size": check_size,
 }
 OF_ROLE: Final[Mapping[str, Check]] = {"ids": check_ids}
-CHECKS: Final[Mapping[str, Check]] = {**OF_SOURCE, **OF_ROLE}
 
 
 def check(table: BoxTable, asked: Asked, checks: Mapping[str, Check] = OF_SOURCE) -> None:

@@ -6,31 +6,26 @@ Letters: N rows, F frames.
 from __future__ import annotations
 
 import math
-from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.masks import box_of_mask
-from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import FrameNames, TrackIds, as_float, is_count, is_number, numbers_of_names
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NOTHING, REGION, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, as_float, is_count, is_number, numbers_of_names
 
-_MAX_ROWS: Final = 10_000_000
 _MAX_CLASSES: Final = 65536
-_MAX_NAME: Final = 256
 #: Keys of the track id of an annotation, and of the frame of an image.
 _TRACK_IDS: Final = ("track_id", "instance_id", "tracker_id")
 _FRAMES: Final = ("frame_id", "frame_index", "mot_frame_id")
 _VIDEOS: Final = ("video_id", "vid_id")
 _BY_LIST: Final = "the list `images`"
-#: Numbers of a row: frame, left, top, width, height, score, category, id, whether it is a crowd, and was filled in.
-_COLUMNS: Final = 10
 
 
 class Coco(Format):
@@ -61,42 +56,37 @@ class Coco(Format):
         return table
 
 
-class _Rows:
-    """The numbers of boxes; ``kind`` names one of them in messages."""
+class _Rows(GatheredRows):
+    """Rows of entries; the ``noun`` names one of them in messages."""
 
-    def __init__(self, path: Path, kind: str) -> None:
-        self._path, self._kind, self._values = path, kind, array("d")
-        self._texts = TrackIds()
+    def __init__(self, path: Path, noun: str) -> None:
+        super().__init__(LabelFacts(path, "coco", region="iscrowd"), noun)
         self.outlined, self.masks = 0, 0
 
-    def add(self, number: int, entry: Any, frame_of: Callable[[Any], float]) -> None:
+    def add_entry(self, number: int, entry: Any, frame_of: Callable[[Any], float]) -> None:
         """Add an annotation or a result. Raises McaptrackError if something is missing or of the wrong type."""
         if not isinstance(entry, dict):
-            self.refuse(number, "is not an object")
+            raise self.refuse(number, "is not an object")
         box = entry.get("bbox")
         if box is None or box == []:
             box = self._around(number, entry.get("segmentation"))
         if not isinstance(box, list) or len(box) != 4 or not all(map(is_number, box)):
-            self.refuse(number, "has no bbox of 4 numbers: left, top, width, height")
+            raise self.refuse(number, "has no bbox of 4 numbers: left, top, width, height")
         inner = entry.get("attributes")
-        track_id = next((d[key] for d in (entry, inner) if isinstance(d, dict) for key in _TRACK_IDS if key in d), None)
-        category_id = _whole_of_text(entry.get("category_id"))
-        track_id = _whole_of_text(track_id)
-        if isinstance(track_id, str) and track_id:
-            track_id = self._texts.number(track_id[:_MAX_NAME])
-        values = [entry.get("score"), category_id, track_id, entry.get("iscrowd", 0)]
-        for value, key in zip(values, ("score", "category_id", "track_id", "iscrowd"), strict=True):
-            if value is not None and not isinstance(value, bool) and not is_number(value):
-                self.refuse(number, f"has a {key} that isn't a number, {value!r:.40}")
-        score, category, track_id, crowd = values
+        track = next((d[key] for d in (entry, inner) if isinstance(d, dict) for key in _TRACK_IDS if key in d), None)
+        category, crowd = _whole_of_text(entry.get("category_id")), entry.get("iscrowd", 0)
+        kind = self.number(number, category, "category_id", NO_CLASS)
+        is_crowd = crowd is True or self.number(number, None if crowd is False else crowd, "iscrowd", 0) != 0
         try:
             frame = frame_of(entry.get("image_id"))
         except (ValueError, KeyError, TypeError) as error:
             text = str(error).strip('"')
-            self.refuse(number, f"has a wrong image_id: {text}" if "column" in text else text)
-        unseen = isinstance(inner, dict) and inner.get("observed") is False
-        numbers = (_float(score, math.nan), _float(category, NO_CLASS), _float(track_id, NO_ID))
-        self._values.extend((frame, *map(_float, box), *numbers, bool(crowd), unseen))
+            raise self.refuse(number, f"has a wrong image_id: {text}" if "column" in text else text) from None
+        is_seen = not (isinstance(inner, dict) and inner.get("observed") is False)
+        self.add(
+            number, frame, [*map(as_float, box)], track, None, entry.get("score"), kind=kind, observed=is_seen,
+            aside=REGION if is_crowd else NOTHING,
+        )  # fmt: skip
 
     def _around(self, number: int, outline: Any) -> list[float] | None:
         """The box around polygons, [x, y, x, y, ...] each; None without any."""
@@ -105,36 +95,23 @@ class _Rows:
             try:
                 return box_of_mask(outline)
             except (KeyError, TypeError, ValueError) as error:
-                self.refuse(number, f"has no bbox, and a mask that can't be read: {error}")
+                raise self.refuse(number, f"has no bbox, and a mask that can't be read: {error}") from None
         flat = [part for part in outline if isinstance(part, list)] if isinstance(outline, list) else []
         points = [value for part in flat for value in part[: len(part) // 2 * 2]]
         if not points or not all(map(is_number, points)):
             return None
         self.outlined += 1
-        x, y = ([_float(value) for part in flat for value in part[axis : len(part) // 2 * 2 : 2]] for axis in (0, 1))
+        x, y = ([as_float(value) for part in flat for value in part[axis : len(part) // 2 * 2 : 2]] for axis in (0, 1))
         return [min(x), min(y), max(x) - min(x), max(y) - min(y)]
 
-    def refuse(self, number: int, problem: str) -> NoReturn:
-        raise McaptrackError(f"{self.at(number)} {problem}")
-
-    def at(self, number: int) -> str:
-        return f"{self._path}: {self._kind} {number}"
-
-    def done(self) -> BoxTable:
+    def table(self) -> BoxTable:
         """All rows."""
-        values: Floats = np.frombuffer(self._values, np.float64).reshape(-1, _COLUMNS)
-        frame, score, number, track_id, crowd, unseen = (values[:, at] for at in (0, 5, 6, 7, 8, 9))
-        track_id, said = self._texts.of(self._path, track_id)
-        rows = BoxTable(
-            facts=LabelFacts(self._path, "coco", region="iscrowd"), at=self.at, frame=frame, id=track_id,
-            boxes_px=values[:, 1:5], score=score, class_id=number, observed=unseen == 0, remarks=said,
-            aside=np.where(crowd != 0, REGION, NOTHING) if crowd.any() else None,
-        )  # fmt: skip
+        table = super().table()
         if self.outlined:
-            rows.remark(f": {self.outlined} boxes are those around polygons, which have no bbox")
+            table.remark(f": {self.outlined} boxes are those around polygons, which have no bbox")
         if self.masks:
-            rows.remark(f": {self.masks} boxes are those around masks, which have no bbox")
-        return rows
+            table.remark(f": {self.masks} boxes are those around masks, which have no bbox")
+        return table
 
 
 def _whole_of_text(value: Any) -> Any:
@@ -142,13 +119,8 @@ def _whole_of_text(value: Any) -> Any:
     return int(value) if isinstance(value, str) and is_count(value, 15) else value
 
 
-def _float(value: Any, missing: float = math.nan) -> float:
-    return missing if value is None else as_float(value)
-
-
 def _results(path: Path, content: list[Any]) -> BoxTable:
     """Results: a list of image_id, category_id, bbox, score. The number of an image is that of its frame."""
-    _check_count(path, content)
     rows, names = _Rows(path, "result"), FrameNames()
 
     def frame_of(image: Any) -> float:
@@ -156,11 +128,11 @@ def _results(path: Path, content: list[Any]) -> BoxTable:
             return names.number(image)
         if not is_number(image):
             raise ValueError("has no image_id")
-        return _float(image)
+        return as_float(image)
 
     for number, entry in enumerate(content):
-        rows.add(number, entry, frame_of)
-    out = rows.done()
+        rows.add_entry(number, entry, frame_of)
+    out = rows.table()
     out.remark(": the number in image_id is taken as the frame")
     return out
 
@@ -170,7 +142,6 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
     images, entries = content.get("images"), content["annotations"]
     if not isinstance(images, list) or not all(isinstance(image, dict) and "id" in image for image in images):
         raise McaptrackError(f"{path}: `images` is not a list of objects with an id each")
-    _check_count(path, entries)
     ids = [_key(image["id"]) for image in images]
     if len(set(ids)) < len(ids):
         twice = Counter(ids).most_common(1)[0][0]
@@ -188,8 +159,8 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
         return by_id[_key(image)]
 
     for number, entry in enumerate(entries):
-        rows.add(number, entry, frame_of)
-    out = rows.done()
+        rows.add_entry(number, entry, frame_of)
+    out = rows.table()
     facts = out.facts
     is_labelled = np.array([image.get("is_labeled") is not False for image in images], bool)  # PoseTrack
     numbers = np.array(frames, np.int64)
@@ -197,7 +168,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
     facts.first_frame = int(numbers.min()) if len(numbers) else 0
     facts.is_first_assumed = facts.first_frame > 0
     facts.sizes = {
-        frame: (_float(image["width"]), _float(image["height"]))
+        frame: (as_float(image["width"]), as_float(image["height"]))
         for frame, image in zip(frames, images, strict=True)
         if is_number(image.get("width")) and is_number(image.get("height"))
     }
@@ -216,12 +187,7 @@ def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
 
 def _key(value: Any) -> str:
     """The id of an image or a video as text; 1.0, as pandas writes it, is 1."""
-    return str(int(value) if isinstance(value, float) and value.is_integer() else value)[:_MAX_NAME]
-
-
-def _check_count(path: Path, entries: list[Any]) -> None:
-    if len(entries) > _MAX_ROWS:
-        raise McaptrackError(f"{path} has more than {_MAX_ROWS} boxes; give it in parts")
+    return str(int(value) if isinstance(value, float) and value.is_integer() else value)[:MAX_NAME]
 
 
 def _frames(images: list[dict[str, Any]]) -> tuple[list[int], str]:
@@ -250,6 +216,6 @@ def _categories(path: Path, categories: Any) -> dict[int, str] | None:
         if not isinstance(key, int) or not 0 <= key < 2**31 or not isinstance(name, str) or isinstance(key, bool):
             raise McaptrackError(f"{path}: category {number} has no whole number as its id, or no name")
         if key in out:
-            raise McaptrackError(f"{path}: {key} is the id of several categories, {out[key]} and {name[:_MAX_NAME]}")
-        out[key] = " ".join(name.split())[:_MAX_NAME]
+            raise McaptrackError(f"{path}: {key} is the id of several categories, {out[key]} and {name[:MAX_NAME]}")
+        out[key] = " ".join(name.split())[:MAX_NAME]
     return out

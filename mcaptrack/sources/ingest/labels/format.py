@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, TypeVar
 
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import read_json
@@ -27,7 +27,7 @@ _BEGIN_BYTES: Final = 4096
 MAX_LINE: Final = 65536
 _MAX_BYTES: Final = 512 * 2**20
 _SHOWN: Final = 60
-_LISTED: Final = 6
+_LISTED: Final = 10
 #: The first element of XML, after what may stand before it.
 _ROOT: Final = re.compile(rb"\s*(?:<[?!][^>]*>\s*)*<([\w.-]+)")
 #: Where labels lie in the folders that data sets and tools have, the most particular first.
@@ -45,6 +45,8 @@ _OTHERS: Final = {
     b"\x80": "a pickle of Python, which could run anything; save it as CSV, Parquet or JSON",
     b"FEA1": "a table of Feather V1; save it as Parquet, or as Feather V2",
 }
+
+Part = TypeVar("Part")
 
 
 class LabelFile:
@@ -190,6 +192,20 @@ class LabelFile:
             text += "; a table with names of classes needs a first line that names its columns, separated by commas, "
             text += "semicolons or tabs: frame,id,class,left,top,width,height,score"
         return McaptrackError(f"{self.path}:{number}: {text}")
+
+
+def chosen_part(path: Path, parts: Mapping[str, Part], wanted: str | None, noun: str, where: str = "") -> Part:
+    """The part of a file, a ``noun``, with this name, or the only one.
+
+    Raises McaptrackError if there is none, or if there are several and none is named.
+    """
+    if wanted is None and len(parts) == 1:
+        return next(iter(parts.values()))
+    if wanted is None or wanted not in parts:
+        what = f"no {noun} {wanted!r:.60}" if wanted else f"{len(parts)} {noun}s"
+        listed = list_names(sorted(parts), _LISTED)
+        raise McaptrackError(f"{path} has {what}{where}; choose one with `scene=`: {listed}")
+    return parts[wanted]
 
 
 class Format:

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.table import NO_ID, NOTHING, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, ClassNames, TrackIds, as_float, is_count, is_number
-
-_MAX_NAME: Final = 256
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_ROWS, ClassNames, TrackIds, as_float, is_count, is_number
 
 
 class GatheredRows:
@@ -27,12 +25,18 @@ class GatheredRows:
 
     def __init__(self, facts: LabelFacts, noun: str) -> None:
         self.facts, self._noun = facts, noun
-        self._values, self._boxes, self._places = array("d"), array("d"), list[str]()
+        self._values, self._boxes, self._places = array("d"), array("d"), list[int | str]()
         self._ids, self._names = TrackIds(), ClassNames()
 
-    def refuse(self, place: str, problem: str) -> McaptrackError:
+    def refuse(self, place: int | str, problem: str) -> McaptrackError:
         """The error for a row at this place in the file."""
         return McaptrackError(f"{self.facts.path}: {self._noun} {place} {problem}")
+
+    def number(self, place: int | str, value: Any, key: str, missing: float = np.nan) -> float:
+        """The number with this key. Raises McaptrackError if it is there, and none."""
+        if value is not None and not is_number(value):
+            raise self.refuse(place, f"has a {key} that isn't a number, {value!r:.40}")
+        return missing if value is None else as_float(value)
 
     def numbers(self, place: str, content: Any, keys: Sequence[Any]) -> list[float]:
         """The numbers with these keys, or at these places. Raises McaptrackError if there aren't all."""
@@ -47,27 +51,25 @@ class GatheredRows:
 
     def add(
         self,
-        place: str,
+        place: int | str,
         frame: float,
         box: Sequence[float],
         track: Any = None,
         name: Any = None,
         score: Any = None,
         *,
+        kind: float | None = None,
         observed: bool = True,
         counts: bool = True,
         aside: int = NOTHING,
     ) -> None:
         """Add a row. ``track`` is a number or a text, ``name`` that of its class. Raises McaptrackError if not."""
         if isinstance(track, str):
-            track = (int(track) if is_count(track, 15) else self._ids.number(track[:_MAX_NAME])) if track else None
-        for value, key in ((track, "id"), (score, "score")):
-            if value is not None and not is_number(value):
-                raise self.refuse(place, f"has a {key} that is no number: {str(value)[:40]!r}")
+            track = (int(track) if is_count(track, 15) else self._ids.number(track[:MAX_NAME])) if track else None
+        own, stated = self.number(place, track, "track_id", NO_ID), self.number(place, score, "score")
         if name is not None and not isinstance(name, str):
             raise self.refuse(place, f"has a class that is no text: {str(name)[:40]!r}")
-        kind = self._names.number(name or "")
-        own, stated = NO_ID if track is None else as_float(track), np.nan if score is None else as_float(score)
+        kind = self._names.number(name or "") if kind is None else kind
         self._values.extend((frame, own, kind, stated, observed, counts, aside))
         self._boxes.extend(box)
         self._places.append(place)
@@ -90,7 +92,7 @@ class GatheredRows:
             facts=facts, at=lambda row: f"{facts.path}: {self._noun} {places[row]}", frame=frame, id=track_id,
             boxes_px=boxes if boxes.shape[1] == 4 else None, boxes_m=boxes if boxes.shape[1] == 7 else None,
             xy_m=boxes if boxes.shape[1] == 2 else None, score=score, class_id=kind,
-            observed=None if observed.all() else observed == 1, counts=None if counts.all() else counts == 1,
+            observed=observed == 1, counts=None if counts.all() else counts == 1,
             aside=aside.astype(int) if aside.any() or not counts.all() else None,
             remarks=said,
         )  # fmt: skip

@@ -12,15 +12,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
 from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_ROWS, is_number
 
 _TYPE: Final = "videorectangle"
 _BOX: Final = ("frame", "x", "y", "width", "height")
-_SHOWN: Final = 5
 
 
 class LabelStudio(Format):
@@ -37,14 +35,7 @@ class LabelStudio(Format):
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a task."""
         tasks = {str(task.get("id", number)): task for number, task in enumerate(_tasks(file)) if [*_regions(task)]}
-        if asked.scene is None and len(tasks) == 1:
-            (task,) = tasks.values()
-        elif asked.scene is None or asked.scene not in tasks:
-            what = f"no task {asked.scene!r:.40} with boxes" if asked.scene else f"{len(tasks)} tasks with boxes"
-            listed = list_names([*tasks], _SHOWN) if tasks else "none"
-            raise McaptrackError(f"{file.path} has {what} in a video; choose one with `scene=`: {listed}")
-        else:
-            task = tasks[asked.scene]
+        task = chosen_part(file.path, tasks, asked.scene, "task", " with boxes in a video")
         facts = LabelFacts(file.path, "label-studio", first_frame=1, is_normalised=True)
         rows, count, duration, filled = GatheredRows(facts, "result"), 0, 0.0, 0
         for order, region in enumerate(_regions(task)):

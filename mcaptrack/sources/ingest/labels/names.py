@@ -9,12 +9,11 @@ from typing import Any, Final
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.labels.table import BoxTable
-from mcaptrack.sources.ingest.labels.text import is_count, lines_of
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, is_count, lines_of
 
 LISTS: Final = ("labels.txt", "classes.txt", "obj.names", "_classes.txt")
 _YAML: Final = ("data.yaml", "data.yml", "dataset.yaml")
 _MAX_CLASSES: Final = 65536
-_MAX_NAME: Final = 256
 
 
 def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
@@ -39,7 +38,7 @@ def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
 
 
 def _of_list(path: Path, first: int) -> dict[int, str]:
-    lines = [" ".join(line.split())[:_MAX_NAME] for _, line in lines_of(path)]
+    lines = [" ".join(line.split())[:MAX_NAME] for _, line in lines_of(path)]
     return dict(enumerate(lines[:_MAX_CLASSES], start=first))
 
 
@@ -58,4 +57,4 @@ def _of_yaml(path: Path) -> dict[int, str]:
         return {}
     if not all(isinstance(name, str) and is_count(key, 9) for key, name in names.items()):
         raise McaptrackError(f"{path}: `names` is neither a list of names nor a map from numbers to names")
-    return {int(key): " ".join(str(name).split())[:_MAX_NAME] for key, name in names.items()}
+    return {int(key): " ".join(str(name).split())[:MAX_NAME] for key, name in names.items()}

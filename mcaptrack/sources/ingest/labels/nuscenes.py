@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.errors import McaptrackError
+from mcaptrack.files import read_json
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_WHOLE, ClassNames, as_float, headings, numbered
 
@@ -32,7 +32,7 @@ _CLASSES: Final = {
 }
 _CLASS_OF: Final = {category: name for name, categories in _CLASSES.items() for category in categories}
 _NS_PER_US: Final = 1000
-_SHOWN: Final = 10
+_MAX_BYTES: Final = 4 * 2**30
 #: The frame of reference, by the name that converters to MCAP give it.
 FRAME: Final = "map"
 
@@ -127,32 +127,22 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     facts.usual, facts.states_labelled = frozenset(_CLASSES), True
     facts.labelled = np.unique(np.array(list(samples.values()), np.int64))
     return BoxTable(
-        facts=facts, at=at, frame=np.array(times, np.int64), id=numbered([f"#{track}" for track in ids])[0],
+        facts=facts, at=at, frame=np.array(times, np.int64), id=numbered([f"#{track}" for track in ids]),
         boxes_m=values, score=np.full(len(boxes), np.nan), class_id=np.array(kinds, np.int64), remarks=remarks,
     )  # fmt: skip
 
 
 def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> str:
     tokens = {_text(folder, "scene", row, "name"): _text(folder, "scene", row, "token") for row in scenes}
-    if wanted is None and len(tokens) == 1:
-        return next(iter(tokens.values()))
-    if wanted is None or wanted not in tokens:
-        what = f"no scene {wanted!r:.60}" if wanted else f"{len(tokens)} scenes"
-        raise McaptrackError(f"{folder} has {what}; choose one with `scene=`: {list_names(sorted(tokens), _SHOWN)}")
-    return tokens[wanted]
+    return chosen_part(folder, tokens, wanted, "scene")
 
 
 def _table(folder: Path, name: str) -> Iterator[dict[str, Any]]:
     path = folder / f"{name}.json"
-    try:
-        content = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    if not path.is_file():
         why = ": it is a set without labels" if path.stem == TABLES[2] else ""
-        raise McaptrackError(f"{folder} has no {path.name}{why}; nuScenes boxes need {', '.join(TABLES)}") from None
-    except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-    except (ValueError, RecursionError):
-        raise McaptrackError(f"{path} is not JSON") from None
+        raise McaptrackError(f"{folder} has no {path.name}{why}; nuScenes boxes need {', '.join(TABLES)}")
+    content = read_json(path, "nuScenes", _MAX_BYTES)
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise McaptrackError(f"{path} is not a table of nuScenes, a list of objects")
     yield from content

@@ -147,7 +147,7 @@ def _ids(given: LabelBoxes, count: int) -> Ints:
         raise ValueError(f"track_id of type {ids.dtype}; ids are whole numbers or texts")
     has_id = ids.astype(str) != ""
     out = np.full(count, NO_ID)
-    out[has_id] = numbered(ids[has_id].tolist())[0]
+    out[has_id] = numbered(ids[has_id].tolist())
     return out
 
 

@@ -34,7 +34,7 @@ MAX_WHOLE: Final = 2**53
 _LINE_SHOWN: Final = 60
 #: The number of class names of a file, at most: there are data sets with 21,841 classes.
 _MAX_NAMES: Final = 65_536
-_MAX_NAME: Final = 256
+MAX_NAME: Final = 256
 
 
 def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lines:
@@ -160,7 +160,7 @@ class ClassNames:
 
     def number(self, name: str) -> int:
         """The number of a name; ``NO_CLASS`` for a blank. Raises ValueError if there are too many names."""
-        name = " ".join(name.split())[:_MAX_NAME]
+        name = " ".join(name.split())[:MAX_NAME]
         if not name:
             return NO_CLASS
         if name not in self._numbers and len(self._numbers) == _MAX_NAMES:
@@ -208,13 +208,13 @@ class TrackIds:
         return ids, [f"{path}: {said}{', ...' if len(self._texts) > len(shown) else ''}"]
 
 
-def numbered(texts: list[str]) -> tuple[Ints, bool]:
-    """Track ids (N,): the texts as numbers if all are, otherwise numbered from 1 on as they come; and which it is."""
+def numbered(texts: list[str]) -> Ints:
+    """Track ids (N,): the texts as numbers if all are, otherwise numbered from 1 on as they come."""
     whole = [text.removesuffix(".0") for text in texts]
     if all(is_count(text, 16) for text in whole):
-        return np.array([int(text) for text in whole], np.int64), True
+        return np.array([int(text) for text in whole], np.int64)
     numbers: dict[str, int] = {}
-    return np.array([numbers.setdefault(text, len(numbers) + 1) for text in texts], np.int64), False
+    return np.array([numbers.setdefault(text, len(numbers) + 1) for text in texts], np.int64)
 
 
 class FrameNames:
