@@ -500,3 +500,16 @@ def test_damaged_files_are_read_or_refused_in_a_line(name, tmp_path):
             except McaptrackError as error:
                 assert "\n" not in str(error), error
         file.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_hidden_files_beside_labels_change_nothing(name, tmp_path):
+    path = WRITERS[name].write(tmp_path, WALK)
+    before = read_labels(path, name)
+    for file in [*tmp_path.rglob("*")]:
+        (file.parent / f"._{file.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X        \xff")
+    (tmp_path / "._a.names").write_bytes(b"\0\5\26\7")
+    after = read_labels(path, name)
+    assert (after.facts.found_by, after.remarks, after.doubts) == (before.facts.found_by, before.remarks, before.doubts)
+    for column, values in before.columns().items():
+        np.testing.assert_array_equal(after.columns()[column], values)
