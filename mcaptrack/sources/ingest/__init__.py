@@ -41,7 +41,7 @@ from mcaptrack.sources.ingest.job import (
     Progress,
 )
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
-from mcaptrack.sources.ingest.labels.format import LabelFile
+from mcaptrack.sources.ingest.labels.format import WAY, LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package
 from mcaptrack.sources.ingest.labels.reading import known_format
 from mcaptrack.sources.ingest.labels.timeline import (
@@ -65,6 +65,11 @@ VIDEO_SUFFIXES: Final = (
     ".ivf", ".obu", ".y4m", ".mjpeg", ".mjpg",
 )  # fmt: skip
 #: Files with these endings hold text, whatever their first bytes are.
+#: Files that people give as labels, by how they begin.
+_NO_TEXT: Final = {
+    b"PAR1": "a Parquet file", b"ARROW1": "an Arrow file", b"\x1f\x8b": "compressed with gzip",
+    b"MATLAB": "a MATLAB file",
+}  # fmt: skip
 _TEXT_SUFFIXES: Final = (".csv", ".tsv", ".txt", ".json", ".xml")
 
 
@@ -597,10 +602,16 @@ def _is_video(source: Path) -> bool:
 
 
 def _is_binary(source: Path) -> bool:
-    if source.suffix.lower() in IMAGE_SUFFIXES:
-        raise McaptrackError(f"{source} is a single image; give the folder that the images lie in")
     with source.open("rb") as stream:
         head = stream.read(4096)
+    if head[8:12] == b"WEBP" and b"ANIM" in head[:64]:
+        raise McaptrackError(f"{source} is an animated WebP, which is not read; convert it to a video")
+    if source.suffix.lower() in IMAGE_SUFFIXES:
+        raise McaptrackError(f"{source} is a single image; give the folder that the images lie in")
+    if head.startswith(b"#EXTM3U"):
+        raise McaptrackError(f"{source} is a playlist; give the video whose parts it lists, in one file")
+    if kind := next((kind for begin, kind in _NO_TEXT.items() if head.startswith(begin)), ""):
+        raise McaptrackError(f"{source} is {kind}, and neither a video nor of a label format; {WAY}")
     if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         raise McaptrackError(f"{source} is text in UTF-16; save it as UTF-8, in which labels are read")
     return b"\0" in head and source.suffix.lower() not in _TEXT_SUFFIXES

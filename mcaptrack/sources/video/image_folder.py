@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import mmap
 import re
+from collections import Counter
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import combinations
@@ -26,7 +27,12 @@ from mcaptrack.sources.video.limits import check_still, still_size
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 #: Pictures of other kinds, which are not read; a folder that holds some is not all read.
-_OTHERS: Final = (".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm", ".pnm", ".jp2", ".exr", ".dng")
+_OTHERS: Final = (
+    ".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm", ".pnm", ".jp2", ".j2k", ".jxl", ".exr", ".hdr", ".dng",
+    ".dpx", ".tga",
+)  # fmt: skip
+#: Files that are labels, in folders of which each is of a picture.
+_LABELS: Final = (".xml", ".json", ".csv")
 _RUNS: Final = re.compile(r"([0-9]+)")
 #: What stands before the number of a camera, or of a video, in the name of a picture.
 _CAMERA: Final = re.compile(
@@ -102,6 +108,12 @@ def _instead(files: Sequence[Path]) -> str:
         return f"; its folders do: give one, such as {folders[0]}"
     if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:
         return f"; convert those it holds, such as {others[0]}, to JPEG or PNG"
+    if kinds := Counter(path.suffix.lower() for path in files if path.suffix and path.is_file()):
+        ((kind, count),) = kinds.most_common(1)
+        labels = ": a folder of labels has .txt files, as those of YOLO; others are one file, as of COCO, CVAT or CSV"
+        return f"; it holds {count} {kind} files{labels if kind in _LABELS else ''}"
+    if folders := [path.name for path in files if path.is_dir()]:
+        return f"; it holds the folders {_some(folders)}: give one with images, or a file of labels"
     return ""
 
 

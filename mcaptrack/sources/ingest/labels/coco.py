@@ -49,7 +49,7 @@ class Coco(Format):
         """Whether JSON has the keys of annotations or of results."""
         keys = file.keys
         if isinstance(file.json if keys else [], dict):
-            return isinstance(file.json.get("annotations"), list)
+            return isinstance(file.json.get("annotations"), list) and "images" in keys
         return "bbox" in keys and "image_id" in keys
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:

@@ -6,8 +6,10 @@ tests/test_border.py. Nothing else names a format.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -21,6 +23,8 @@ _BEGIN_BYTES: Final = 4096
 MAX_LINE: Final = 65536
 _MAX_BYTES: Final = 512 * 2**20
 _SHOWN: Final = 60
+#: The way that is open for all labels, for messages.
+WAY: Final = "labels can be written as CSV with a header, such as frame,id,x,y,w,h,score,class"
 
 
 class LabelFile:
@@ -81,18 +85,32 @@ class LabelFile:
         return lines_of(self.path, most) if self._lines is None else self._lines
 
     def unknown(self, formats: str) -> McaptrackError:
-        """The error for a file of none of these formats, with what it is instead."""
+        """The error for a file of none of these formats, with what it is instead, and what to do."""
+        of_none = f"of no label format ({formats}); {WAY}"
         if self.is_folder:
-            return McaptrackError(f"{self.path} is a folder of no label format ({formats})")
+            return McaptrackError(f"{self.path} is a folder {of_none}")
+        if self.is_json and (rows := self._json_lines):
+            keys = f" with {', '.join(rows)}"[:300]
+            return McaptrackError(f"{self.path} is JSON in lines (objects{keys}) {of_none}")
         if self.is_json and self.json != []:
             kind = "an object" if isinstance(self.json, dict) else "a list"
             keys = f" with {', '.join(self.keys)}"[:300] if self.keys else ""
-            return McaptrackError(f"{self.path} is JSON ({kind}{keys}) of no label format ({formats})")
+            return McaptrackError(f"{self.path} is JSON ({kind}{keys}) {of_none}")
         number, line = next(lines_of(self.path, MAX_LINE), (0, ""))
         if not number or self.is_json:
             return McaptrackError(f"{self.path} holds no boxes")
         text = f"a row of {len(split(line))} columns fits no label format ({formats}): {line.strip()[:_SHOWN]}"
-        return McaptrackError(f"{self.path}:{number}: {text}")
+        return McaptrackError(f"{self.path}:{number}: {text}; {WAY}")
+
+    @property
+    def _json_lines(self) -> list[str]:
+        """The keys of the first object of a file with an object in each line; none if it is no such file."""
+        try:
+            objects = [json.loads(line) for _, line in islice(lines_of(self.path, MAX_LINE), 2)]
+        except (McaptrackError, ValueError, RecursionError):
+            return []
+        is_each = len(objects) > 1 and all(isinstance(entry, dict) for entry in objects)
+        return list(objects[0]) if is_each else []
 
 
 class Format:

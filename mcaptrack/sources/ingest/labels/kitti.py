@@ -59,7 +59,10 @@ class Kitti(Format):
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 17 or 18 columns, and a word in the third."""
         cells = file.cells
-        return len(cells) in (17, 18) and cells[2][:1].isalpha() and cells[2].replace("_", "").isalnum()
+        is_header = cells[0][:1].isalpha() if cells else False
+        return (
+            len(cells) in (17, 18) and not is_header and cells[2][:1].isalpha() and cells[2].replace("_", "").isalnum()
+        )
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""

@@ -96,7 +96,12 @@ class Yolo(Format):
 
 def _parse(parts: list[str]) -> list[float]:
     if not 5 <= len(parts) <= 7:
-        raise ValueError(f"{len(parts)} columns{', as outlines have, which are not read' if len(parts) > 7 else ''}")
+        is_named = parts[0][:1].isalpha()
+        kitti = (
+            ", as a file of KITTI for each picture has; those of a sequence are read, with frame and id before the type"
+        )
+        more = (kitti if is_named else ", as outlines have, which are not read") if len(parts) > 7 else ""
+        raise ValueError(f"{len(parts)} columns{more}")
     return [*map(float, parts), *[np.nan] * (7 - len(parts))]
 
 
