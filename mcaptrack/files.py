@@ -8,7 +8,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from shutil import rmtree
@@ -242,8 +242,8 @@ def visible(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if not path.name.startswith(".")]
 
 
-def read_json(path: Path, what: str, most_bytes: int) -> Any:
-    """Return the content of a JSON file, of the form ``what``.
+def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], IO[bytes]] | None = None) -> Any:
+    """Return the content of a JSON file, of the form ``what``; ``opened`` opens it, if it may be packed.
 
     Raises McaptrackError if it can't be read, has more than ``most_bytes``, is nested too deep or is invalid.
     """
@@ -252,7 +252,8 @@ def read_json(path: Path, what: str, most_bytes: int) -> Any:
         size = path.stat().st_size
         if size > most_bytes:
             raise McaptrackError(f"{path} has {size} bytes; at most {most_bytes} of {what} are read: give it in parts")
-        return json.loads(path.read_bytes().decode("utf-8-sig"))
+        with opened(path) if opened else path.open("rb") as stream:
+            return json.loads(stream.read().decode("utf-8-sig"))
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:

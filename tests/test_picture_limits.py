@@ -290,9 +290,6 @@ def test_what_is_no_picture_in_a_folder_is_passed_over_and_said(tmp_path):
         ("cam0/1.png", "; its folders do: give one, such as cam0"),
         ("1.heic", "; convert those it holds, such as 1.heic"),
         ("1.tga", "; convert those it holds, such as 1.tga"),
-        ("1.xml", "; it holds 1 .xml files: a folder of labels has .txt files"),
-        ("a.bin", "; it holds 1 .bin files$"),
-        ("annotations/1.json", "; it holds the folders annotations: give one with images, or a file of labels"),
     ],
 )
 def test_a_folder_without_images_says_what_it_has(tmp_path, name, hint):

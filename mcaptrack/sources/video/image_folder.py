@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import mmap
 import re
-from collections import Counter
 from collections.abc import Sequence
 from fractions import Fraction
 from itertools import combinations
@@ -31,8 +30,6 @@ _OTHERS: Final = (
     ".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm", ".pnm", ".jp2", ".j2k", ".jxl", ".exr", ".hdr", ".dng",
     ".dpx", ".tga",
 )  # fmt: skip
-#: Files that are labels, in folders of which each is of a picture.
-_LABELS: Final = (".xml", ".json", ".csv")
 _RUNS: Final = re.compile(r"([0-9]+)")
 #: What stands before the number of a camera, or of a video, in the name of a picture.
 _CAMERA: Final = re.compile(
@@ -76,7 +73,7 @@ def find_images(folder: Path) -> Images:
     named = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     paths = [path for path in named if not path.name.startswith(".")]
     if not paths:
-        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}){_instead(files)}")
+        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}){instead_of_images(files)}")
     notes = []
     if hidden := [path.name for path in named if path.name.startswith(".")]:
         notes.append(f"{folder}: {len(hidden)} hidden files are passed over ({_some(hidden)})")
@@ -102,18 +99,12 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
 
 
-def _instead(files: Sequence[Path]) -> str:
+def instead_of_images(files: Sequence[Path]) -> str:
     """A hint for a folder without images: what to give instead."""
     if folders := [path.name for path in files if path.is_dir() and _has_images(path)]:
         return f"; its folders do: give one, such as {folders[0]}"
     if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:
         return f"; convert those it holds, such as {others[0]}, to JPEG or PNG"
-    if kinds := Counter(path.suffix.lower() for path in files if path.suffix and path.is_file()):
-        ((kind, count),) = kinds.most_common(1)
-        labels = ": a folder of labels has .txt files, as those of YOLO; others are one file, as of COCO, CVAT or CSV"
-        return f"; it holds {count} {kind} files{labels if kind in _LABELS else ''}"
-    if folders := [path.name for path in files if path.is_dir()]:
-        return f"; it holds the folders {_some(folders)}: give one with images, or a file of labels"
     return ""
 
 
