@@ -235,7 +235,7 @@ def read_beginning(path: Path, count: int) -> bytes:
 
 
 def visible(folder: Path) -> list[Path]:
-    """The entries of a folder without those whose names begin with ".", as macOS leaves them beside copied files.
+    """The entries of a folder but hidden ones: "._x.txt", as macOS leaves beside copied files, is none of the labels.
 
     Raises OSError if it can't be listed.
     """

@@ -133,7 +133,7 @@ class TestIngest:
 
 
 NO_VIDEOS = {
-    "is a playlist; give the video": b"#EXTM3U\n#EXT-X-VERSION:3\n0.ts\n",
+    "is a playlist; give a video file": b"#EXTM3U\n#EXT-X-VERSION:3\n0.ts\n",
     "is an animated WebP": b"RIFF\x80\0\0\0WEBPVP8X\n\0\0\0\2\0\0\0\0\0\0\0\0\0ANIM",
 }
 

@@ -159,7 +159,7 @@ def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
                     f"positions that may be of people are in {listed}: `topic=` takes them; or add pictures with {add}"
                 )
             else:
-                has = f"it has {list_names([f'{topic} ({_type_of(opened, topic)})' for topic in topics])}"
+                has = f"it has {list_names([_with_type(opened, topic) for topic in topics])}"
                 hint += f"; {_FIELDS}"
             for topic in topics:
                 if kind := foreign.PICTURES_NOT_READ.get(plain_name(opened.channels[topic].schema_name)):
@@ -250,5 +250,6 @@ def _described(type_name: str) -> str:
     return f"{type_name or 'no schema'}{drawn if foreign.is_drawing(type_name) else ''}"
 
 
-def _type_of(opened: log.Log, topic: str) -> str:
-    return opened.channels[topic].schema_name or "no schema"
+def _with_type(opened: log.Log, topic: str) -> str:
+    type_name = opened.channels[topic].schema_name
+    return f"{topic} ({type_name})" if type_name else topic

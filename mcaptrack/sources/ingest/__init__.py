@@ -609,7 +609,7 @@ def _is_binary(source: Path) -> bool:
     if source.suffix.lower() in IMAGE_SUFFIXES:
         raise McaptrackError(f"{source} is a single image; give the folder that the images lie in")
     if head.startswith(b"#EXTM3U"):
-        raise McaptrackError(f"{source} is a playlist; give the video whose parts it lists, in one file")
+        raise McaptrackError(f"{source} is a playlist; give a video file of all its parts")
     if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         return False
     return b"\0" in head and source.suffix.lower() not in _TEXT_SUFFIXES
