@@ -234,6 +234,14 @@ def read_beginning(path: Path, count: int) -> bytes:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
 
+def visible(folder: Path) -> list[Path]:
+    """The entries of a folder but hidden ones: "._x.txt", as macOS leaves beside copied files, is none of the labels.
+
+    Raises OSError if it can't be listed.
+    """
+    return [path for path in folder.iterdir() if not path.name.startswith(".")]
+
+
 def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], IO[bytes]] | None = None) -> Any:
     """Return the content of a JSON file, of the form ``what``; ``opened`` opens it, if it may be packed.
 

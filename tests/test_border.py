@@ -429,6 +429,7 @@ def all_with(**changes: Any) -> list[Row]:
 
 SPREAD = [replace(row, xy=(300.0 * row.frame, row.xy[1])) for row in WALK]
 SHARES = [replace(row, box=(0.1 * row.frame, 0.2 * row.id, 0.1, 0.2)) for row in WALK]
+METRES = [Row(frame, who, (3.25 * frame, 2.5 * who, 4.5, 1.75)) for frame in range(1, 11) for who in (1, 2, 3)]
 LATE = [replace(row, frame=row.frame + 6) for row in WALK]
 #: By check: rows that break it, the column that they need, what they are read as, and what is said: a code in <>, or
 #: words of an error.
@@ -450,7 +451,7 @@ BROKEN: dict[str, list[tuple[list[Row], str, str, str]]] = {
         (all_with(size=(900, 900, 900)), "space", "truth", "sizes have to be in metres"),
         (changed(xy=(2e8, 0)), "space", "truth", "a coordinate can't be 2e\\+08"),
     ],
-    "shares": [(SHARES, "pixels", "truth", "<units>"), (changed(box=(1200, 20, 1700, 60)), "share", "truth", "is no share")],
+    "shares": [(SHARES, "pixels", "truth", "<units>"), (METRES, "pixels", "truth", "<units>"), (changed(box=(1200, 20, 1700, 60)), "share", "truth", "is no share")],
     "scores": [(changed(score=5), "score", "detections", "<scores>")],
     "repeated": [([*WALK, WALK[2]], "", "detections", "<repeated>")],
     "first frame": [(LATE, "frames", "truth", "<clock>")],
@@ -657,3 +658,16 @@ def test_a_video_of_several_is_chosen_while_a_log_is_made(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(frames))
     out = mcaptrack.ingest(tmp_path / "a.json", tmp_path / "a.mcap", role="truth", fps=10, scene="b")
     assert out.messages == {"/camera/truth": 5}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_hidden_files_beside_labels_change_nothing(name, tmp_path):
+    path = WRITERS[name].write(tmp_path, WALK)
+    before = read_labels(path, name, "detections")
+    for file in [*tmp_path.rglob("*")]:
+        (file.parent / f"._{file.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X        \xff")
+    (tmp_path / "._a.names").write_bytes(b"\0\5\26\7")
+    after = read_labels(path, name, "detections")
+    assert (after.facts.found_by, after.remarks, after.doubts) == (before.facts.found_by, before.remarks, before.doubts)
+    for column, values in before.columns().items():
+        np.testing.assert_array_equal(after.columns()[column], values)

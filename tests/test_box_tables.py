@@ -139,6 +139,41 @@ def test_results_need_an_image(tmp_path):
     assert labels.remarks[0].partition(": ")[2] == "the number in image_id is taken as the frame"
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_results_have_the_frames_sizes_and_names_of_the_annotations_beside_them(seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 9))
+    ids = rng.choice(600_000, count, replace=False)  # as those of COCO, in no order
+    images = [
+        {"id": int(key), "file_name": f"cam_{frame + seed:06}.jpg", "width": 640, "height": 480}
+        for frame, key in enumerate(ids)
+    ]
+    places = rng.uniform(0, 400, (count, 4)).round(2).tolist()
+    truth = coco(images, [box(image["id"], place) for image, place in zip(images, places, strict=True)])
+    some = rng.permutation(count)[: int(rng.integers(1, count + 1))]
+    results = [box(int(ids[at]), places[at], score=0.5) for at in some]
+    (tmp_path / "other.json").write_text(json.dumps(coco([1, 2], [])))
+    before = read(tmp_path, results)
+    assert sorted(before.frame.tolist()) == sorted(ids[some].tolist())
+    expected = read(tmp_path, truth, name="truth.json")
+    labels = read(tmp_path, results)
+    assert labels.frame.tolist() == [at + seed for at in sorted(some.tolist())]
+    assert labels.boxes_px.tolist() == [places[at] for at in sorted(some.tolist())]
+    assert (labels.facts.names, labels.facts.size) == ({5: "person"}, (640, 480))
+    assert (labels.facts.sizes, labels.first_frame) == (expected.facts.sizes, expected.first_frame)
+    assert labels.facts.named_by == str(tmp_path / "truth.json")
+    assert [
+        words for words in labels.remarks if words.endswith(f"are those of the images in {tmp_path / 'truth.json'}")
+    ]
+    changed = [{**image, "file_name": f"cam_{frame + 99:06}.jpg"} for frame, image in enumerate(images)]
+    (tmp_path / "two.json").write_text(json.dumps({"images": changed}))
+    labels = read(tmp_path, results)
+    assert sorted(labels.frame.tolist()) == sorted(ids[some].tolist())
+    assert any(
+        "truth.json and two.json beside it name its images differently" in words for words in said(tmp_path, labels)
+    )
+
+
 def test_files_have_no_more_boxes_and_classes_than_the_limits(tmp_path, monkeypatch):
     monkeypatch.setattr(gathered, "MAX_ROWS", 2)
     monkeypatch.setattr(coco_format, "_MAX_CLASSES", 2)

@@ -84,9 +84,10 @@ def test_pictures_that_cant_be_read_cost_no_boxes(tmp_path):
     }
 
 
+@pytest.mark.parametrize("pictures", [range(COUNT), ()])
 @pytest.mark.parametrize(("stamps", "words"), [(lambda n: None, ""), (lambda n: taken_s(n) + 0.01, "0.27 s after")])
-def test_other_boxes_are_at_their_log_times_and_that_is_said(tmp_path, stamps, words):
-    times, said = read(written(tmp_path / "a.mcap", stamps))
+def test_other_boxes_are_at_their_log_times_and_that_is_said(tmp_path, stamps, words, pictures):
+    times, said = read(written(tmp_path / "a.mcap", stamps, pictures=pictures))
     assert times == {number: ns(taken_s(number) + LATE_S + FOUND_S) for number in range(COUNT)}
     assert [(notice.code, words in notice.message) for notice in said] == ([("clock", True)] if words else [])
 

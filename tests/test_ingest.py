@@ -130,3 +130,19 @@ class TestIngest:
         with pytest.raises(McaptrackError, match=words):
             ingest(clip, tmp_path / "a.mcap", options(**named))
         assert sorted(tmp_path.iterdir()) == before
+
+
+NO_VIDEOS = {
+    "is a playlist; give a video file": b"#EXTM3U\n#EXT-X-VERSION:3\n0.ts\n",
+    "is an animated WebP": b"RIFF\x80\0\0\0WEBPVP8X\n\0\0\0\2\0\0\0\0\0\0\0\0\0ANIM",
+}
+
+
+@pytest.mark.parametrize(("words", "head"), NO_VIDEOS.items(), ids=NO_VIDEOS)
+@pytest.mark.parametrize("suffix", [".dat", ".csv"])
+def test_files_that_are_neither_videos_nor_labels_are_named_by_their_bytes(tmp_path, words, head, suffix):
+    path = write(tmp_path / f"a{suffix}", "")
+    path.write_bytes(head + b"\0" * 200)
+    with pytest.raises(McaptrackError, match=words):
+        ingest(path, tmp_path / "a.mcap", IngestOptions(fps=Fraction(10)))
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]

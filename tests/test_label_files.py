@@ -205,6 +205,12 @@ def test_what_is_no_file_of_labels_is_refused_in_these_words(name, role, text, w
     assert words is None or str(error.value) == f"{path}{words}"
 
 
+def test_a_header_of_many_columns_is_no_row_of_kitti(tmp_path):
+    header = "recordingId,trackId,frame,xCenter,yCenter," + ",".join(f"a{n}" for n in range(12))
+    with pytest.raises(McaptrackError, match="its columns are recordingId, trackId, frame, xCenter"):
+        read_labels(written(tmp_path / "a.csv", header + "\n" + ",".join("1" * 17)))
+
+
 def test_a_line_of_4096_characters_is_read_and_ids_may_repeat_in_detections(tmp_path):
     long = "1,1,1,1,1,1".ljust(4095) + "\n"
     assert len(read_labels(written(tmp_path / "a.txt", long), "mot").frame) == 1

@@ -143,7 +143,7 @@ def test_a_missing_input_error_lists_channels_and_a_remedy(fresh, tmp_path):
     with log.create(tmp_path / "empty.mcap") as writer:
         writer.add_channel("/imu", ("x", "jsonschema", b"{}"), "json", {})
     with pytest.raises(
-        McaptrackError, match=r"has no channel /camera/video for detect; it has /imu\. add pictures with"
+        McaptrackError, match=r"has no channel /camera/video for detect; it has /imu \(x\)\. add pictures with"
     ):
         run_stage(tmp_path / "empty.mcap", "retrack", Retrack())
     with pytest.raises(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import is_dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call, list_names
@@ -22,6 +22,8 @@ from mcaptrack.sources.cameras import USUAL, Camera, chain_of, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import FULL, STAGES, Transform
 from mcaptrack.transforms.protocol import check_options
+
+_FIELDS: Final = "`map=` names the fields of positions or boxes in other messages, as `map='x=people[].x,y=people[].y'`"
 
 
 class Job(NamedTuple):
@@ -102,8 +104,9 @@ def check_inputs(opened: log.Log, prefix: str, jobs: Sequence[Job]) -> None:
             reads = job.transform.reads
             theirs_too = foreign.BOXES_READ if reads is DETECTIONS else ()
             wanted = " or ".join(foreign.PICTURES_READ if reads is VIDEO else (reads.name, *theirs_too))
-            wanted += "; `map=` names the fields of others" if theirs_too else ""
-            raise McaptrackError(f"{opened.path}: {job.source} holds {name or 'no schema'}; {job.stage} reads {wanted}")
+            wanted += f"; {_FIELDS}" if theirs_too else ""
+            holds = f"{job.source} holds {_described(name)}"
+            raise McaptrackError(f"{opened.path}: {holds}; {job.stage} reads {wanted}")
         _check_outputs(opened, prefix, job)
         coming |= job.outputs()
 
@@ -156,7 +159,8 @@ def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
                     f"positions that may be of people are in {listed}: `topic=` takes them; or add pictures with {add}"
                 )
             else:
-                hint += "; `map=` names the fields of positions or boxes in other messages"
+                has = f"it has {list_names([_with_type(opened, topic) for topic in topics])}"
+                hint += f"; {_FIELDS}"
             for topic in topics:
                 if kind := foreign.PICTURES_NOT_READ.get(plain_name(opened.channels[topic].schema_name)):
                     hint = f"{topic} is {kind}, which is not read; {hint}"
@@ -236,6 +240,16 @@ def first_stage(opened: log.Log, source: str) -> str:
             return stage.name
     wanted = ", ".join((*foreign.PICTURES_READ, DETECTIONS.name, *foreign.BOXES_READ))
     raise McaptrackError(
-        f"{opened.path}: {source} holds {channel.schema_name or 'no schema'}; run begins with one of {wanted}, and "
-        "`map=` names the fields of others, as `map='x=people[].pose.x,y=people[].pose.y'`"
+        f"{opened.path}: {source} holds {_described(channel.schema_name)}; run begins with one of {wanted}; {_FIELDS}"
     )
+
+
+def _described(type_name: str) -> str:
+    """The type of a channel that isn't read, for messages."""
+    drawn = " without boxes, cylinders, spheres or frames of lines in its first messages"
+    return f"{type_name or 'no schema'}{drawn if foreign.is_drawing(type_name) else ''}"
+
+
+def _with_type(opened: log.Log, topic: str) -> str:
+    type_name = opened.channels[topic].schema_name
+    return f"{topic} ({type_name})" if type_name else topic

@@ -71,7 +71,7 @@ def _files(path: Path) -> list[Path]:
         log.refuse_non_mcap(path)
         return [path]
     kinds = (".txt", ".parquet", ".mcap")
-    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in kinds and file.is_file())
+    files = sorted(file for file in path.rglob("[!.]*") if file.suffix.lower() in kinds and file.is_file())
     # Only tables of tracks, and none that repeat the log beside them.
     logs = {sibling(file, ".tables") for file in files if file.suffix.lower() == ".mcap"}
     files = [file for file in files if not logs & set(file.parents)]

@@ -273,6 +273,11 @@ def fields_reader(name: str, shape: FieldShape, chosen: str = "") -> FieldReader
     return None if fields is None else FieldReader(fields, fields.in_space, None if chosen else known.adjust)
 
 
+def is_drawing(type_name: str) -> bool:
+    """Whether messages of a type draw things, of which some are boxes."""
+    return plain_name(type_name) in BUILT_IN[_KIND]
+
+
 def _special(name: str) -> Reading | None:
     """The way messages of a type are read if not by their fields: drawings, and types that a package reads.
 
@@ -604,8 +609,7 @@ def _times_of_pictures(
 
     if all(stamp in (None, at_ns) for stamp, at_ns in zip(stamps_ns, log_ns, strict=True)):
         return log_ns, "", "log times"
-    near = _pictures_near(opened, topic)
-    for pictures in near:
+    for pictures in _pictures_near(opened, topic):
         try:
             shown_ns = opened.times(pictures)
             is_made = Provenance.from_metadata(opened.channel(pictures).metadata)
@@ -618,10 +622,9 @@ def _times_of_pictures(
             pairs = zip(stamps_ns, log_ns, strict=True)
             t_ns = [own if stamp is None else at.get(stamp, max(stamp + late_ns, 0)) for stamp, own in pairs]
             return t_ns, pictures, f"stamps of the pictures of {pictures}"
-    if near:
-        late_s = np.median([(own - stamp) / NS_PER_S for stamp, own in zip(stamps_ns, log_ns, strict=True) if stamp])
-        said = f"boxes are taken at their log times, {late_s:.3g} s after their stamps, which no picture has"
-        warn(f"{opened.path}: {topic}: {said}", "clock")
+    late_s = np.median([(own - stamp) / NS_PER_S for stamp, own in zip(stamps_ns, log_ns, strict=True) if stamp])
+    said = f"boxes are taken at their log times, {late_s:.3g} s after their stamps, which no picture has"
+    warn(f"{opened.path}: {topic}: {said}", "clock")
     return log_ns, "", "log times"
 
 

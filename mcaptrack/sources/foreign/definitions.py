@@ -145,7 +145,7 @@ def _files_in(folder: Path) -> dict[str, Path]:
 
     Packages have their files in PKG/msg/, as in a workspace or in what ROS installs.
     """
-    of_kind = (path for path in folder.rglob("*") if path.suffix in (".msg", ".idl") and path.is_file())
+    of_kind = (path for path in folder.rglob("[!.]*") if path.suffix in (".msg", ".idl") and path.is_file())
     found = islice(of_kind, _MAX_FILES)
     files: dict[str, Path] = {}
     for path in sorted(found, key=lambda path: (path.suffix == ".idl", path)):  # rosidl makes each .idl of a .msg

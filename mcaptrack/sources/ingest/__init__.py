@@ -601,10 +601,14 @@ def _is_video(source: Path) -> bool:
 
 
 def _is_binary(source: Path) -> bool:
-    if source.suffix.lower() in IMAGE_SUFFIXES:
-        raise McaptrackError(f"{source} is a single image; give the folder that the images lie in")
     with source.open("rb") as stream:
         head = stream.read(4096)
+    if head[8:12] == b"WEBP" and b"ANIM" in head[:64]:
+        raise McaptrackError(f"{source} is an animated WebP, which is not read; convert it to a video")
+    if source.suffix.lower() in IMAGE_SUFFIXES:
+        raise McaptrackError(f"{source} is a single image; give the folder that the images lie in")
+    if head.startswith(b"#EXTM3U"):
+        raise McaptrackError(f"{source} is a playlist; give a video file of all its parts")
     if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
         return False
     return b"\0" in head and source.suffix.lower() not in _TEXT_SUFFIXES

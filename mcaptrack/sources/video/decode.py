@@ -28,6 +28,8 @@ from mcaptrack.sources.video.pixels import (
 )
 from mcaptrack.sources.video.recognise import UNREAD
 
+#: Still pictures that are read.
+_STILLS: Final = ("jpeg", "png", "bmp", "tiff", "webp", "avif")
 _FULL_RANGE: Final = 2  # AVCOL_RANGE_JPEG
 
 
@@ -173,7 +175,8 @@ def _decoded_still(picture: EncodedPicture, how: int) -> Samples:
         except cv2.error:  # the header contradicts the data
             image = None
     if image is None:
-        raise McaptrackError(f"{picture.name} can't be decoded as {picture.format or 'an image'}")
+        read = "" if picture.format in (*_STILLS, "") else f"; {', '.join(_STILLS)} are read"
+        raise McaptrackError(f"{picture.name} can't be decoded as {picture.format or 'an image'}{read}")
     return np.asarray(image)
 
 

@@ -27,7 +27,10 @@ from mcaptrack.sources.video.pixels import Span, measured, measured_span, scaled
 
 IMAGE_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 #: Pictures of other kinds, which are not read; a folder that holds some is not all read.
-_OTHERS: Final = (".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm", ".pnm", ".jp2", ".exr", ".dng")
+_OTHERS: Final = (
+    ".heic", ".heif", ".avif", ".gif", ".ppm", ".pgm", ".pnm", ".jp2", ".j2k", ".jxl", ".exr", ".hdr", ".dng",
+    ".dpx", ".tga",
+)  # fmt: skip
 _RUNS: Final = re.compile(r"([0-9]+)")
 #: What stands before the number of a camera, or of a video, in the name of a picture.
 _CAMERA: Final = re.compile(
@@ -67,7 +70,7 @@ def find_images(folder: Path) -> Images:
     named = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     paths = [path for path in named if not path.name.startswith(".")]
     if not paths:
-        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}){_instead(files)}")
+        raise McaptrackError(f"{folder} holds no images ({', '.join(IMAGE_SUFFIXES)}){instead_of_images(files)}")
     notes = []
     if hidden := [path.name for path in named if path.name.startswith(".")]:
         notes.append(f"{folder}: {len(hidden)} hidden files are passed over ({_some(hidden)})")
@@ -93,7 +96,7 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
 
 
-def _instead(files: Sequence[Path]) -> str:
+def instead_of_images(files: Sequence[Path]) -> str:
     """A hint for a folder without images: what to give instead."""
     if folders := [path.name for path in files if path.is_dir() and _has_images(path)]:
         return f"; its folders do: give one, such as {folders[0]}"

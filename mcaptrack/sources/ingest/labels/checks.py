@@ -34,6 +34,9 @@ _MAX_PLACE: Final = 1e8
 _MAX_SCORE: Final = 1e9
 _MAX_CLASS: Final = 2**31 - 1
 #: Boxes that are cut off at the edge of the picture reach a little beyond its whole size.
+#: So many boxes are seldom shorter than this in pictures.
+_LEAST_PX: Final = 6.0
+_MANY_BOXES: Final = 20
 _MOST_SHARE: Final = 2.0
 #: Lengths are metres if the median lies between these.
 _LEAST_LENGTH_M, _MOST_LENGTH_M = 0.05, 60.0
@@ -160,7 +163,7 @@ def _moving_across(table: BoxTable, boxes: Floats) -> tuple[int, int]:
 
 
 def check_shares(table: BoxTable, _: Asked) -> None:
-    """Boxes of fractions up to the whole size of a picture are shares of it, and no pixels."""
+    """Boxes of fractions up to the whole size of a picture are shares of it, no pixels; small ones may be metres."""
     facts, boxes = table.facts, table.boxes_px
     if boxes is None:
         return
@@ -178,6 +181,13 @@ def check_shares(table: BoxTable, _: Asked) -> None:
         facts.is_normalised = True
         text = f": no number of a box is above {_MOST_SHARE:g}, so they are taken as shares of the picture's size"
         table.find(text, "units")
+    elif facts.is_normalised is None and (boxes != np.rint(boxes)).any():
+        usual_px = float(np.median(boxes[:, 2:].max(axis=1)))
+        if usual_px < _LEAST_PX and len(boxes) >= _MANY_BOXES:
+            text = (
+                ": boxes are taken as pixels, and their usual length is {most:.2g}, as of metres; if they are, name the"
+            )
+            table.find(f"{text} columns with `columns='x_m=NAME,y_m=NAME'`", "units", most=usual_px)
 
 
 def check_scores(table: BoxTable, _: Asked) -> None:

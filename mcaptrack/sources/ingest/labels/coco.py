@@ -9,11 +9,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import visible
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.masks import box_of_mask
@@ -21,11 +22,17 @@ from mcaptrack.sources.ingest.labels.table import NO_CLASS, NOTHING, REGION, Ask
 from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, as_float, is_count, is_number, numbers_of_names
 
 _MAX_CLASSES: Final = 65536
+#: The largest number of other files beside results in which their images are looked up.
+_MAX_BESIDE: Final = 16
 #: Keys of the track id of an annotation, and of the frame of an image.
 _TRACK_IDS: Final = ("track_id", "instance_id", "tracker_id")
 _FRAMES: Final = ("frame_id", "frame_index", "mot_frame_id")
 _VIDEOS: Final = ("video_id", "vid_id")
 _BY_LIST: Final = "the list `images`"
+#: Keys with which annotations begin.
+_BEGIN: Final = tuple(
+    f'"{key}"'.encode() for key in ("images", "annotations", "categories", "info", "licenses", "videos")
+)
 
 
 class Coco(Format):
@@ -50,10 +57,7 @@ class Coco(Format):
             raise McaptrackError(f"{path} is neither annotations (images, annotations, categories) nor results of COCO")
         if isinstance(content, list):
             return _results(path, content)
-        table = _annotations(path, content)
-        table.facts.names = _categories(path, content.get("categories"))
-        table.facts.named_by = "file" if table.facts.names else ""
-        return table
+        return _annotations(path, content)
 
 
 class _Rows(GatheredRows):
@@ -120,10 +124,17 @@ def _whole_of_text(value: Any) -> Any:
 
 
 def _results(path: Path, content: list[Any]) -> BoxTable:
-    """Results: a list of image_id, category_id, bbox, score. The number of an image is that of its frame."""
+    """Results: a list of image_id, category_id, bbox, score.
+
+    Annotations beside them tell the frames of images; without these the number of an image is that of its frame.
+    """
     rows, names = _Rows(path, "result"), FrameNames()
+    ids = {_key(entry.get("image_id")) for entry in content if isinstance(entry, dict)}
+    beside, doubt = _images_beside(path, ids)
 
     def frame_of(image: Any) -> float:
+        if beside is not None:
+            return beside.by_id[_key(image)]
         if isinstance(image, str):
             return names.number(image)
         if not is_number(image):
@@ -133,56 +144,101 @@ def _results(path: Path, content: list[Any]) -> BoxTable:
     for number, entry in enumerate(content):
         rows.add_entry(number, entry, frame_of)
     out = rows.table()
+    if beside is not None:
+        beside.describe(out, str(beside.path))
+        out.remark(f": the frames of image_id are those of the images in {beside.path}")
+        return out
+    if doubt:
+        out.find(doubt, "clock")
     out.remark(": the number in image_id is taken as the frame")
     return out
 
 
+def _images_beside(path: Path, ids: set[str]) -> tuple[_Images | None, str]:
+    """The images in annotations of the same folder, if these name all of ``ids``; and what is doubtful about that."""
+    files = [LabelFile(other) for other in sorted(visible(path.parent)) if other.suffix == ".json" and other != path]
+    files = [file for file in files if file.head[:1] == b"{" and any(key in file.head for key in _BEGIN)][:_MAX_BESIDE]
+    every = list[_Images]()
+    for file in files:
+        try:
+            images = _Images.of(file.path, file.json)
+        except McaptrackError:
+            continue  # a file of something else
+        if ids <= images.by_id.keys():
+            every.append(images)
+    if any(images.by_id[image] != every[0].by_id[image] for images in every for image in ids):
+        names = " and ".join(images.path.name for images in every[:2])
+        return None, f": {names} beside it name its images differently, and neither is used"
+    return (every[0], "") if every else (None, "")
+
+
 def _annotations(path: Path, content: Mapping[str, Any]) -> BoxTable:
     """Annotations: images, annotations and categories."""
-    images, entries = content.get("images"), content["annotations"]
-    if not isinstance(images, list) or not all(isinstance(image, dict) and "id" in image for image in images):
-        raise McaptrackError(f"{path}: `images` is not a list of objects with an id each")
-    ids = [_key(image["id"]) for image in images]
-    if len(set(ids)) < len(ids):
-        twice = Counter(ids).most_common(1)[0][0]
-        raise McaptrackError(f"{path}: {twice} is the id of several images")
-    videos = {_key(image[key]) for image in images for key in _VIDEOS if key in image}
-    if len(videos) > 1:
-        raise McaptrackError(f"{path} holds {len(videos)} videos (video_id); give one file for each of them")
-    frames, order = _frames(images)
-    by_id = dict(zip(ids, frames, strict=True))
+    images, entries = _Images.of(path, content), content["annotations"]
     rows = _Rows(path, "annotation")
 
     def frame_of(image: Any) -> float:
-        if _key(image) not in by_id:
+        if _key(image) not in images.by_id:
             raise ValueError(f"is of image {image!r:.40}, which isn't among the images")
-        return by_id[_key(image)]
+        return images.by_id[_key(image)]
 
     for number, entry in enumerate(entries):
         rows.add_entry(number, entry, frame_of)
     out = rows.table()
-    facts = out.facts
-    is_labelled = np.array([image.get("is_labeled") is not False for image in images], bool)  # PoseTrack
-    numbers = np.array(frames, np.int64)
-    facts.labelled, facts.states_labelled = np.unique(numbers[is_labelled]), True
-    facts.first_frame = int(numbers.min()) if len(numbers) else 0
-    facts.is_first_assumed = facts.first_frame > 0
-    facts.sizes = {
-        frame: (as_float(image["width"]), as_float(image["height"]))
-        for frame, image in zip(frames, images, strict=True)
-        if is_number(image.get("width")) and is_number(image.get("height"))
-    }
-    sizes = {size for size in facts.sizes.values() if all(map(math.isfinite, size))}
-    if len(sizes) == 1 and len(facts.sizes) == len(images):
-        ((width, height),) = sizes
-        facts.size = (int(width), int(height))
-    out.remark(f": {len(images)} images, in order of {order}")
+    images.describe(out, "file")
+    is_labelled = np.array([image.get("is_labeled") is not False for image in images.entries], bool)  # PoseTrack
+    numbers = np.array([*images.by_id.values()], np.int64)
+    out.facts.labelled, out.facts.states_labelled = np.unique(numbers[is_labelled]), True
+    out.remark(f": {len(numbers)} images, in order of {images.order}")
     if not is_labelled.all():
         out.remark(f": {int((~is_labelled).sum())} images are not labelled (is_labeled)")
-    if order == _BY_LIST and len(images) > 1:
-        text = ": its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
-        out.find(f"{text} is taken as that of the pictures", "clock")
     return out
+
+
+class _Images(NamedTuple):
+    """The images of annotations: their entries, the frame of each id, what the frames are from, and class names."""
+
+    path: Path
+    entries: list[dict[str, Any]]
+    by_id: dict[str, int]
+    order: str
+    names: dict[int, str] | None
+
+    @classmethod
+    def of(cls, path: Path, content: Mapping[str, Any]) -> _Images:
+        """Read them. Raises McaptrackError if they are no images of one video."""
+        images = content.get("images")
+        if not isinstance(images, list) or not all(isinstance(image, dict) and "id" in image for image in images):
+            raise McaptrackError(f"{path}: `images` is not a list of objects with an id each")
+        ids = [_key(image["id"]) for image in images]
+        if len(set(ids)) < len(ids):
+            twice = Counter(ids).most_common(1)[0][0]
+            raise McaptrackError(f"{path}: {twice} is the id of several images")
+        videos = {_key(image[key]) for image in images for key in _VIDEOS if key in image}
+        if len(videos) > 1:
+            raise McaptrackError(f"{path} holds {len(videos)} videos (video_id); give one file for each of them")
+        frames, order = _frames(images)
+        by_id = dict(zip(ids, frames, strict=True))
+        return cls(path, images, by_id, order, _categories(path, content.get("categories")))
+
+    def describe(self, table: BoxTable, named_by: str) -> None:
+        """Set the facts that a table has from them: its first frame, sizes of pictures and names of classes."""
+        facts, frames = table.facts, self.by_id.values()
+        facts.first_frame = min(frames, default=0)
+        facts.is_first_assumed = facts.first_frame > 0
+        facts.sizes = {
+            frame: (as_float(image["width"]), as_float(image["height"]))
+            for frame, image in zip(frames, self.entries, strict=True)
+            if is_number(image.get("width")) and is_number(image.get("height"))
+        }
+        sizes = {size for size in facts.sizes.values() if all(map(math.isfinite, size))}
+        if len(sizes) == 1 and len(facts.sizes) == len(self.entries):
+            ((width, height),) = sizes
+            facts.size = (int(width), int(height))
+        facts.names, facts.named_by = self.names, named_by if self.names else ""
+        if self.order == _BY_LIST and len(self.entries) > 1:
+            text = ": its images have neither frame_id nor names with numbers of one sequence; the order in `images`"
+            table.find(f"{text} is taken as that of the pictures", "clock")
 
 
 def _key(value: Any) -> str:

@@ -211,6 +211,7 @@ class _Cells:
                 if "column" in str(error):
                     raise
                 problem = f"the column {header[places[key]]} holds {text.strip()[:40]!r}, which is no number"
+                problem += "; times are in seconds" if key == "t" else ""
                 if table.delimiter == "," in text:
                     problem += "; decimal commas are read where semicolons or tabs separate the columns"
                 raise ValueError(problem) from None

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.files import read_json
+from mcaptrack.files import read_json, visible
 from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
 from mcaptrack.sources.ingest.labels.text import MAX_ROW, Lines, lines_of, split
-from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
+from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, instead_of_images, natural_order
 
 _BEGIN_BYTES: Final = 4096
 #: The largest number of characters of a row.
@@ -91,7 +91,7 @@ class LabelFile:
     @cached_property
     def entries(self) -> list[Path]:
         """The content of a folder, in natural order."""
-        return sorted(self.path.iterdir(), key=natural_order) if self.is_folder else []
+        return sorted(visible(self.path), key=natural_order) if self.is_folder else []
 
     @cached_property
     def root(self) -> str:
@@ -173,10 +173,12 @@ class LabelFile:
         """The error for a file of none of these formats, with what it is instead."""
         if self.is_folder:
             held = list_names([path.name for path in self.entries], _LISTED) or "nothing"
+            hint = instead_of_images(self.entries)
+            hint = hint or "; give the label file, or the folder that label files lie in, with `label_format=`"
             looked = f"looked in {', '.join(PLACES)}, and in itself for files of {formats}"
             return McaptrackError(
                 f"{self.path} holds no images ({', '.join(IMAGE_SUFFIXES)}) and no labels that are known; {looked}; "
-                f"it holds {held}; give the label file, or the folder that label files lie in, with `label_format=`"
+                f"it holds {held}{hint}"
             )
         if self.is_json and self.json != []:
             kind = "an object" if isinstance(self.json, dict) else "a list"

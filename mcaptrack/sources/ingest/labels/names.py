@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import visible
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.text import MAX_NAME, is_count, lines_of
@@ -22,7 +23,7 @@ def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
     Names in a list count from ``first``, where it states no numbers. What can't be read is said.
     """
     for folder in dict.fromkeys(folders):
-        others = sorted(folder.glob("*.names")) if folder.is_dir() else []
+        others = sorted(path for path in visible(folder) if path.suffix == ".names") if folder.is_dir() else []
         for path in (*(folder / name for name in (*LISTS, *_YAML)), *others[:1]):
             if not path.is_file() or path == table.path:
                 continue

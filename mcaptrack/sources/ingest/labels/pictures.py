@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import visible
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
@@ -60,7 +61,7 @@ def around(points: Sequence[Any]) -> list[float]:
 
 def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files of a folder with this ending, in natural order. Raises McaptrackError if there are too many."""
-    files = sorted((path for path in folder.iterdir() if path.suffix.lower() == suffix), key=natural_order)
+    files = sorted((path for path in visible(folder) if path.suffix.lower() == suffix), key=natural_order)
     if len(files) > _MAX_PICTURES:
         raise McaptrackError(f"{folder} holds {len(files)} label files; at most {_MAX_PICTURES} are read")
     return files

@@ -14,6 +14,7 @@ import numpy as np
 
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import visible
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
@@ -33,7 +34,7 @@ def _label_files(folder: Path) -> list[Path]:
     """The label files of a folder, or of its subfolder "labels", in natural order; none if there are none."""
     for place in (folder, folder / "labels"):
         try:
-            files = [path for path in place.iterdir() if path.suffix.lower() == ".txt"]
+            files = [path for path in visible(place) if path.suffix.lower() == ".txt"]
         except OSError:
             continue
         files = [path for path in files if path.name.lower() not in _NOT_LABELS]
@@ -97,7 +98,12 @@ class Yolo(Format):
 
 def _parse(parts: list[str]) -> list[float]:
     if not 5 <= len(parts) <= 7:
-        raise ValueError(f"{len(parts)} columns{', as outlines have, which are not read' if len(parts) > 7 else ''}")
+        is_named = parts[0][:1].isalpha()
+        kitti = (
+            ", as a file of KITTI for each picture has; those of a sequence are read, with frame and id before the type"
+        )
+        more = (kitti if is_named else ", as outlines have, which are not read") if len(parts) > 7 else ""
+        raise ValueError(f"{len(parts)} columns{more}")
     return [*map(float, parts), *[np.nan] * (7 - len(parts))]
 
 
