@@ -8,7 +8,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from shutil import rmtree
@@ -194,6 +194,11 @@ def _remove_left(folder: Path, pattern: re.Pattern[str], name: str = "") -> None
                         rmtree(entry.path, ignore_errors=True)
                     else:
                         os.unlink(entry.path)
+
+
+def visible(paths: Iterable[Path]) -> list[Path]:
+    """Those of paths that are no hidden files, as those are that macOS lays beside each file (._NAME), by name."""
+    return sorted(path for path in paths if not path.name.startswith("."))
 
 
 def sync_folder(folder: Path) -> None:

@@ -341,6 +341,16 @@ class TestRosbag2:
             make(tmp_path / "g", tmp_path / "out.mcap")
         assert not (tmp_path / "out.mcap").exists()
 
+    @pytest.mark.parametrize("has_metadata", [False, True])
+    def test_hidden_files_are_no_parts(self, tmp_path, has_metadata):
+        said = bag2(tmp_path / "bag")
+        [part] = (tmp_path / "bag").glob("*.db3")
+        part.with_name(f"._{part.name}").write_bytes(b"\0\5\x16\7")
+        if not has_metadata:
+            (tmp_path / "bag" / "metadata.yaml").unlink()
+        make(tmp_path / "bag", tmp_path / "out.mcap")
+        assert recorded(tmp_path / "out.mcap") == sorted(said)
+
 
 PLANE = "0.1 0 0\n0 0.1 0\n0 0 1\n"
 
@@ -365,8 +375,8 @@ class TestBesideLabels:
         for name in ("a.mcap", "b.mcap", "c.mcap"):
             with log.read(tmp_path / name) as opened:
                 frames = opened.frames("/robot/front/image/truth", TRACKS)
-                assert [frame.t_ns for frame in frames] == times
-                assert [frame.rows["x_px"].tolist() for frame in frames] == [[2 + n] for n in range(20)] + [[]] * 10
+                assert [frame.t_ns for frame in frames] == times[:20]  # those after the last label are not labelled
+                assert [frame.rows["x_px"].tolist() for frame in frames] == [[2 + n] for n in range(20)]
                 assert frames[0].rows["x_m"].tolist() == pytest.approx([0.7])
                 (plane,) = opened.frames("/robot/front/image/ground_plane", GROUND_PLANE)
                 plane = rows_to_plane(plane.rows)
@@ -378,7 +388,7 @@ class TestBesideLabels:
         with pytest.raises(McaptrackError, match=r"/left/image, /right/image; .* choose with `camera='left'`"):
             make(tmp_path / "a.bag", tmp_path / "a.mcap", **files)
         assert not (tmp_path / "a.mcap").exists()
-        assert make(tmp_path / "a.bag", tmp_path / "a.mcap", camera="right", **files).messages["/right/truth"] == 30
+        assert make(tmp_path / "a.bag", tmp_path / "a.mcap", camera="right", **files).messages["/right/truth"] == 20
 
     def test_without_pictures_there_is_nothing_to_label(self, tmp_path, files):
         bag1(tmp_path / "a.bag", 5, 100)

@@ -17,7 +17,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder
+from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder, visible
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.foreign.definitions import Defined, MessageType, defined, is_defined, is_packed
@@ -63,10 +63,10 @@ def open_bag(folder: Path) -> RecordingReader:
     ours, results = {path.name for path in paths}, {log.results_path(path).name for path in paths}
     unnamed = [
         entry.name
-        for entry in folder.iterdir()
+        for entry in visible(folder.iterdir())
         if entry.suffix in (".db3", ".mcap") and entry.name not in ours | results
     ]
-    for name in sorted(unnamed):
+    for name in unnamed:
         warn(f"{folder / name} is not named in {METADATA}; it is left out", "left-out")
     for path in paths:
         if not follow_links(path).is_relative_to(follow_links(folder)):
@@ -410,7 +410,7 @@ def is_mcap(path: Path) -> bool:
 def _open_folder(path: Path) -> RecordingReader | None:
     if holds_metadata(path / METADATA):
         return open_bag(path)
-    names = sorted(entry.name for entry in path.iterdir())
+    names = [entry.name for entry in visible(path.iterdir())]
     if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
         return None
     if parts := log.split_files_in(path):

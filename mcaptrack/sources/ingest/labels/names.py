@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import visible
 from mcaptrack.sources.ingest.bags import plain_yaml
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.text import is_count, lines_of
@@ -15,6 +17,8 @@ LISTS: Final = ("labels.txt", "classes.txt", "obj.names", "_classes.txt")
 _YAML: Final = ("data.yaml", "data.yml", "dataset.yaml")
 _MAX_CLASSES: Final = 65536
 _MAX_NAME: Final = 256
+#: A line of a list that states its number: `2: person`, `2 person`, `2,person`.
+_NUMBERED: Final = re.compile(r"([0-9]{1,9})(?: ?[:=,] ?| )(\D.*)")
 
 
 def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
@@ -23,7 +27,7 @@ def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
     Names in a list count from ``first``, where it states no numbers. What can't be read is said.
     """
     for folder in dict.fromkeys(folders):
-        others = sorted(folder.glob("*.names")) if folder.is_dir() else []
+        others = visible(folder.glob("*.names")) if folder.is_dir() else []
         for path in (*(folder / name for name in (*LISTS, *_YAML)), *others[:1]):
             if not path.is_file() or path == table.path:
                 continue
@@ -40,6 +44,9 @@ def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
 
 def _of_list(path: Path, first: int) -> dict[int, str]:
     lines = [" ".join(line.split())[:_MAX_NAME] for _, line in lines_of(path)]
+    numbered = [match for match in map(_NUMBERED.fullmatch, lines) if match]
+    if len(numbered) == len(lines) == len({int(match[1]) for match in numbered}):
+        return {int(match[1]): match[2] for match in numbered}
     return dict(enumerate(lines[:_MAX_CLASSES], start=first))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import visible
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
@@ -31,7 +32,7 @@ def _label_files(folder: Path) -> list[Path]:
     """The label files of a folder, or of its subfolder "labels", in natural order; none if there are none."""
     for place in (folder, folder / "labels"):
         try:
-            files = [path for path in place.iterdir() if path.suffix.lower() == ".txt"]
+            files = [path for path in visible(place.iterdir()) if path.suffix.lower() == ".txt"]
         except OSError:
             continue
         files = [path for path in files if path.name.lower() not in _NOT_LABELS]
@@ -49,7 +50,7 @@ class Yolo(Format):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a folder holds label files and no pictures."""
-        if not file.is_folder or any(path.suffix.lower() in IMAGE_SUFFIXES for path in file.path.iterdir()):
+        if not file.is_folder or any(path.suffix.lower() in IMAGE_SUFFIXES for path in visible(file.path.iterdir())):
             return False
         return bool(_label_files(file.path))
 
