@@ -8,7 +8,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from shutil import rmtree
@@ -239,8 +239,8 @@ def read_beginning(path: Path, count: int) -> bytes:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
 
-def read_json(path: Path, what: str, most_bytes: int) -> Any:
-    """Return the content of a JSON file, of the form ``what``.
+def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], IO[bytes]] | None = None) -> Any:
+    """Return the content of a JSON file, of the form ``what``; ``opened`` opens it, if it may be packed.
 
     Raises McaptrackError if it can't be read, has more than ``most_bytes``, is nested too deep or is invalid.
     """
@@ -249,7 +249,8 @@ def read_json(path: Path, what: str, most_bytes: int) -> Any:
         size = path.stat().st_size
         if size > most_bytes:
             raise McaptrackError(f"{path} has {size} bytes; at most {most_bytes} of {what} are read: give it in parts")
-        return json.loads(path.read_bytes().decode("utf-8-sig"))
+        with opened(path) if opened else path.open("rb") as stream:
+            return json.loads(stream.read().decode("utf-8-sig"))
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:

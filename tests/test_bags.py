@@ -375,7 +375,7 @@ class TestBesideLabels:
         for name in ("a.mcap", "b.mcap", "c.mcap"):
             with log.read(tmp_path / name) as opened:
                 frames = opened.frames("/robot/front/image/truth", TRACKS)
-                assert [frame.t_ns for frame in frames] == times[:20]  # those after the last label are not labelled
+                assert [frame.t_ns for frame in frames] == times[:20]  # the file labels no others
                 assert [frame.rows["x_px"].tolist() for frame in frames] == [[2 + n] for n in range(20)]
                 assert frames[0].rows["x_m"].tolist() == pytest.approx([0.7])
                 (plane,) = opened.frames("/robot/front/image/ground_plane", GROUND_PLANE)

@@ -23,8 +23,9 @@ from mcaptrack.notices import collected
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, read_calibrations
-from mcaptrack.sources.fixed_frame import holds_transforms, read_frames
+from mcaptrack.sources.fixed_frame import holds_transforms, named_detections, read_frames
 from mcaptrack.sources.foreign import definitions
+from mcaptrack.sources.foreign.boxes import boxes_decoder, decoded_messages
 from mcaptrack.sources.foreign.definitions import MessageType, defined, definitions_of
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from tests.bags import database
@@ -41,7 +42,15 @@ SPELLINGS = {
     "Python": "{}.msg.{}",
     "slash": "/{}/msg/{}",
 }
+
+
 #: What asks for a type, with a type that it reads, and what it gives for a channel of it.
+def in_space(opened: log.Log) -> list:
+    """The boxes in space of the messages of /t."""
+    read = decoded_messages(opened, "/t", lambda kind: boxes_decoder(kind, in_space=True))
+    return [message.boxes for _, message in read]
+
+
 ASKS = {
     "raw pictures": ("sensor_msgs/Image", lambda opened: [p.data for _, p in foreign.pictures(opened, "/t")]),
     "compressed pictures": (
@@ -54,13 +63,13 @@ ASKS = {
     ),
     "boxes": (
         "vision_msgs/Detection2DArray",
-        lambda opened: [f.rows["w_px"].tolist() for f in foreign.named_detections(opened, "/t").frames],
+        lambda opened: [f.rows["w_px"].tolist() for f in named_detections(opened, "/t").frames],
     ),
     "boxes in space": (
         "vision_msgs/Detection3DArray",
-        lambda opened: [m.boxes for _, m in foreign.boxes_3d(opened, "/t")],
+        in_space,
     ),
-    "drawings": ("visualization_msgs/MarkerArray", lambda opened: [m.boxes for _, m in foreign.boxes_3d(opened, "/t")]),
+    "drawings": ("visualization_msgs/MarkerArray", in_space),
     "transforms": ("tf2_msgs/TFMessage", lambda opened: read_frames(opened).topics),
     "transforms of ROS 1": ("tf/tfMessage", lambda opened: read_frames(opened).topics),
     "calibrations": (
@@ -69,9 +78,12 @@ ASKS = {
     ),
 }
 HOLDS = (
-    foreign.holds_pictures, foreign.holds_detections, foreign.may_hold_boxes_3d, foreign.is_drawing, holds_transforms,
-    holds_calibrations,
-)  # fmt: skip
+    lambda opened, channel: foreign.holds_pictures(channel),
+    lambda opened, channel: foreign.holds_boxes(opened, channel.topic, in_space=False),
+    lambda opened, channel: foreign.holds_boxes(opened, channel.topic, in_space=True),
+    lambda opened, channel: holds_transforms(channel),
+    lambda opened, channel: holds_calibrations(channel),
+)
 _IDL = {"bool": "boolean", "byte": "octet", "float32": "float", "float64": "double"}
 
 
@@ -131,7 +143,7 @@ def write(path: Path, name: str, encoding: str, definition: str, payloads: list[
 def answers(path: Path, asked) -> tuple:
     with log.read(path) as opened:
         channel = opened.channel("/t")
-        kinds = [holds(channel) for holds in HOLDS]
+        kinds = [holds(opened, channel) for holds in HOLDS]
         return kinds, asked(opened)
 
 
@@ -139,7 +151,7 @@ def rows(path: Path) -> list:
     """The values of all fields of all messages, in order, whatever the fields are called."""
     with log.read(path) as opened:
         read = flattener(message_type_of(opened, "/t"))
-        return [re.sub(r'"\w+":|[{}]', "", repr([*read(found.payload).values()])) for found in opened.messages("/t")]
+        return [re.sub(r"'\w+': |[{}]", "", repr([*read(found.payload).values()])) for found in opened.messages("/t")]
 
 
 @pytest.mark.parametrize("kind", ASKS)
@@ -275,7 +287,7 @@ def test_a_folder_of_definitions_comes_before_those_of_ros(tmp_path):
     folder, name, payloads = package(tmp_path)
     bare = write(tmp_path / "a.mcap", name, "ros2msg", "", payloads)
     with collected() as warnings, log.read(bare) as opened, pytest.raises(McaptrackError, match="can't be read"):
-        foreign.named_detections(opened, "/t")
+        named_detections(opened, "/t")
     assert "its definition is not known, and that of ROS 2" in warnings[0].message
     assert "`definitions=`" in warnings[0].message
     flat = tmp_path / "flat"
@@ -290,9 +302,9 @@ def test_a_folder_of_definitions_comes_before_those_of_ros(tmp_path):
     (as_files / "Detection2DArray.idl").write_text(as_idl(types | store.fielddefs | known | types, False))
     for place in (folder, folder / "vision_msgs", flat, as_files):
         with collected() as warnings, definitions_of(place), log.read(bare) as opened:
-            frames = foreign.named_detections(opened, "/t").frames
+            frames = named_detections(opened, "/t").frames
         assert [frame.rows["w_px"].tolist() for frame in frames] == [[20.0]] * len(payloads)
-        (warning,) = warnings
+        (warning,) = [warning for warning in warnings if warning.code == "definitions"]
         assert warning.message.endswith(f"its definition is that in {place}, which fits its messages")
 
 
@@ -304,7 +316,7 @@ def test_the_option_is_one_of_every_command_that_reads_messages(tmp_path):
     outcome = call("ingest", tmp_path / "a.db3", "-o", tmp_path / "a.mcap", "--definitions", folder)
     assert outcome.code == 0, outcome
     with log.read(tmp_path / "a.mcap") as opened:
-        assert len(foreign.named_detections(opened, "/t").frames) == len(payloads)
+        assert len(named_detections(opened, "/t").frames) == len(payloads)
     for line in (["track"], ["run"], ["export"]):
         outcome = call(*line, bare, "--topic", "/t", "--definitions", folder, "-o", tmp_path / f"{line[0]}.mcap")
         assert outcome.code == 0, outcome
@@ -366,7 +378,7 @@ def test_a_log_without_definitions_has_them_after_it_is_ingested(tmp_path):
         mcaptrack.ingest(bare, tmp_path / "a.mcap")
     with collected() as later, log.read(tmp_path / "a.mcap") as opened:
         assert [found.payload for found in opened.messages("/t")] == payloads
-        assert len(foreign.named_detections(opened, "/t").frames) == len(payloads)
+        assert len(named_detections(opened, "/t").frames) == len(payloads)
         (schema,), (channel,) = opened.index.schemas.values(), opened.channels.values()
     assert warnings + [each for each in later if each.code == "definitions"] == []
     assert b"is_tracking" in schema.data
@@ -401,7 +413,7 @@ def test_a_type_with_a_name_in_a_database_in_other_letters_is_the_same(tmp_path)
     database(tmp_path / "a.db3", 2, [(1, n, payload) for n, payload in enumerate(payloads)], topics)
     mcaptrack.ingest(tmp_path / "a.db3", tmp_path / "a.mcap")
     with log.read(tmp_path / "a.mcap") as opened:
-        assert len(foreign.named_detections(opened, "/t").frames) == len(payloads)
+        assert len(named_detections(opened, "/t").frames) == len(payloads)
     assert sqlite3.connect(tmp_path / "a.db3").execute("SELECT count(*) FROM messages").fetchone() == (len(payloads),)
     assert types
 
@@ -419,7 +431,7 @@ def test_other_encodings_of_dds_are_named(tmp_path, number, name):
         log.read(path) as opened,
         pytest.raises(McaptrackError, match=f"its bytes are {name}; CDR of version 1 is read"),
     ):
-        foreign.named_detections(opened, "/t")
+        named_detections(opened, "/t")
 
 
 def test_messages_of_either_byte_order_are_read(tmp_path):

@@ -82,6 +82,13 @@ def template(template, tmp_path_factory) -> Path:
         words = ("--as", "detections", "--fps", 10, "--camera", camera, "--ground-plane", folder / "plane.txt")
         done("ingest", folder / "truth.txt", *words, where, folder / "two.mcap")
     (folder / "walk.txt").write_text("\n".join(walk) + "\n")
+    (folder / "old.html").write_text("")
+    with log.create(folder / "things.mcap") as writer:
+        channel = writer.add_channel("/things", ("my_msgs/Things", "jsonschema", b"{}"), "json", {})
+        for number in range(40):
+            box = {"left": 10 + number, "top": 20, "right": 22 + number, "bottom": 50, "label": "7", "conf": 0.9}
+            payload = json.dumps({"stamp": {"sec": 1, "nanosec": number}, "things": [box]}).encode()
+            writer.add_message(channel, number * 10**8, number, payload)
     (folder / "known.onnx").write_bytes(DATA)
     kinds = "".join(
         f"{n},{who},{9 * n},24,8,16,{kind}\n" for n in range(30) for who, kind in ((1, "person"), (2, "cart"))

@@ -48,9 +48,6 @@ class TestLabels:
             read_labels(tmp_path / "a.txt")
         with pytest.raises(McaptrackError, match="can't be read"):
             read_labels(tmp_path / "none.txt")
-        (tmp_path / "a.csv").write_text("frame,x,y,w,h\n1,1,2,3,4\n", encoding="utf-16")
-        with pytest.raises(McaptrackError, match="UTF-16; save it as UTF-8"):
-            ingest(tmp_path / "a.csv", tmp_path / "a.mcap", options(fps=Fraction(1)))
 
     @pytest.mark.parametrize("text", ["1,0,0\n0,1,0\n0,0,1\n", "1 0 0\n0 1 0\n0 0 1", "1.0e0\t0\t0\n0,1,0\n0 0 1\n"])
     def test_homographies_by_comma_or_blank(self, tmp_path, text):

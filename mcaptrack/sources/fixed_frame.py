@@ -50,7 +50,7 @@ from mcaptrack.sources.foreign.boxes import (
     named_boxes,
     read_classes,
 )
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, stamp_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, stamp_of, unpacker
 from mcaptrack.sources.foreign.fields import Message3d
 from mcaptrack.sources.foreign.flatten import message_type_of
 
@@ -632,6 +632,7 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     """
     reading = foreign.reading_of(opened, topic)
     if reading is None:
+        decoded_messages(opened, topic, unpacker)  # says why, if its messages can't be decoded
         name = opened.channel(topic).schema_name or "no schema"
         raise McaptrackError(f"{opened.path}: {topic} holds {name}, not detections; {', '.join(BOXES_READ)} are read")
     if reading.known is None and reading.fields is not None and not choice_for(opened, topic).fields:

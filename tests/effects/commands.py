@@ -28,6 +28,13 @@ def common(base: str, **others: str | tuple[str, str]) -> dict[str, Case]:
     )
 
 
+def of_boxes(command: str) -> dict[str, Case]:
+    """The options of commands that read boxes of other software."""
+    base = f"{command} things.mcap --topic /things"
+    other = "left=things[].top,top=things[].left,w=things[].right,h=things[].bottom"
+    return {"map": (base, f"--map {other}"), "class_map": (base, "--class-map 7=person")}
+
+
 def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
     """The options of a stage that its transform doesn't declare."""
     base = f"{command} a.mcap"
@@ -36,6 +43,7 @@ def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
         camera="--camera other", output="-o b.mcap", sidecar="--sidecar", force=(f"{base} -o fresh.mcap", "--force"),
         **({"frame": "--frame map"} if command == "track" else {}),
         **({"definitions": (f"{command} bare.mcap --topic /t", "--definitions src")} if command in ("detect", "track") else {}),
+        **(of_boxes("track") if command == "track" else {}),
         **({} if command == "motion" else {"views": "--views"}), **others,
     )  # fmt: skip
 
@@ -101,6 +109,7 @@ CASES: dict[str, dict[str, Case]] = {
         camera="--camera other",
         output="-o b.mcap",
         definitions=("run bare.mcap --no-tables --topic /t", "--definitions src"),
+        **of_boxes("run --no-tables"),
         sidecar="--sidecar",
         events="--no-events",
         tables=("run a.mcap", "--no-tables"),
@@ -273,7 +282,7 @@ CASES: dict[str, dict[str, Case]] = {
         force=("render a.mcap -o clip.mp4", "--force"),
     ),
     "report": common(
-        "report a.mcap", camera="--camera other", output="-o b.html", force=("report a.mcap -o clip.mp4", "--force")
+        "report a.mcap", camera="--camera other", output="-o b.html", force=("report a.mcap -o old.html", "--force")
     ),
     "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
     "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o fresh.mcap", "--force")),

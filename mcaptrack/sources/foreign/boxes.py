@@ -191,7 +191,8 @@ def reading_of(opened: log.Log, topic: str) -> Reading | None:
 
 
 def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Reading | None:
-    if not channel.schema_name or Provenance.from_metadata(channel.metadata):  # views of mcaptrack are drawings, too
+    is_ours = channel.schema is not None or Provenance.from_metadata(channel.metadata)  # views are drawings, too
+    if not channel.schema_name or is_ours:
         return None
     kind, words = message_type_of(opened, channel.topic), re.findall("[a-z]+", channel.topic.lower())
     person = _PERSON if any(PEOPLE.fullmatch(word) for word in words) else ""

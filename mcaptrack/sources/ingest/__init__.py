@@ -21,6 +21,7 @@ from mcaptrack.files import is_same_file, refuse_special
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
+from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import CLOCK, Provenance
@@ -41,9 +42,8 @@ from mcaptrack.sources.ingest.job import (
     Progress,
 )
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
-from mcaptrack.sources.ingest.labels.format import LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package
-from mcaptrack.sources.ingest.labels.reading import known_format
+from mcaptrack.sources.ingest.labels.reading import known_format, label_file
 from mcaptrack.sources.ingest.labels.timeline import (
     Timeline,
     boxes_extent,
@@ -65,7 +65,7 @@ VIDEO_SUFFIXES: Final = (
     ".ivf", ".obu", ".y4m", ".mjpeg", ".mjpg",
 )  # fmt: skip
 #: Files with these endings hold text, whatever their first bytes are.
-_TEXT_SUFFIXES: Final = (".csv", ".tsv", ".txt", ".json", ".xml")
+_TEXT_SUFFIXES: Final = (".csv", ".tsv", ".txt", ".json", ".jsonl", ".ndjson", ".xml")
 
 
 # Ingest a video or a folder of images as a camera, with labels for its pictures.
@@ -570,13 +570,14 @@ class RecordingJob(IngestJob):
 
 
 def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log | None) -> IngestJob:
-    recorded = open_recording(source)
+    is_packed_text = Path(source.stem).suffix.lower() in _TEXT_SUFFIXES  # labels.csv.zst begins as logs may
+    recorded = None if is_packed_text and source.is_file() else open_recording(source)
     if recorded is not None:
         return RecordingJob(source, options, recorded, progress, into)
     role = options.role
     if role == "calibration" or (role is None and is_calibration(source)):
         return CalibrationJob(source, options, into)
-    file, columns = LabelFile(source), options.columns or {}
+    file, columns = label_file(source, options.label_format), options.columns or {}
     if role == MOTION:
         is_text = not (file.is_folder or _is_video(source) or _is_binary(source))
         return MotionJob(source, options, into) if is_text else VideoJob(source, options, progress, into)
@@ -585,8 +586,12 @@ def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log
         return Boxes3DJob([(role, source)], options, into)
     is_foreign = isinstance(form, FormatOfPackage) and not file.is_folder  # bytes may be labels, as its format has it
     is_labels = form is not None and (is_foreign or form.recognises(file))
-    if (is_labels and not _is_video(source)) or (file.is_folder and role):
+    is_of_pictures = file.holds_pictures and not role and options.label_format == "auto"
+    if (is_labels and not is_of_pictures and not _is_video(source)) or (file.is_folder and role):
         return LabelJob([(role, source)], options, into)
+    file.refuse_binary()
+    if file.is_folder and not file.holds_pictures:
+        raise file.unknown(", ".join(BUILT_IN["label_format"]))
     if file.is_folder or _is_video(source) or _is_binary(source):
         return VideoJob(source, options, progress, into)
     return LabelJob([(role, source)], options, into)
@@ -602,5 +607,5 @@ def _is_binary(source: Path) -> bool:
     with source.open("rb") as stream:
         head = stream.read(4096)
     if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
-        raise McaptrackError(f"{source} is text in UTF-16; save it as UTF-8, in which labels are read")
+        return False
     return b"\0" in head and source.suffix.lower() not in _TEXT_SUFFIXES

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import shutil
+import zlib
 from collections.abc import Callable
+from functools import partial
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import refuse_special
 
 ENVIRONMENT: Final = "MCAPTRACK_MAX_UNPACKED_MIB"
 #: The limit is this ratio, but at least this many MiB, unless the environment variable sets another one.
 _RATIO, _MIN_MIB = 64, 64
+#: The first bytes of packed files.
+_GZIP, _ZSTD = b"\x1f\x8b", b"\x28\xb5\x2f\xfd"
 #: Small enough that Python handles signals between two pieces.
 _PIECE_BYTES: Final = 2**20
 #: One byte of zstd can expand to 32 KiB: without a declared size the input is fed in small pieces.
@@ -53,6 +59,49 @@ def unzstd(data: bytes, most: int) -> bytes:
         return decompress_pieces(lambda piece, _: unpacker.decompress(piece), lambda: unpacker.eof, data, most)
     except zstandard.ZstdError as error:
         raise NotUnpackedError(str(error)) from None
+
+
+def opened(path: Path) -> IO[bytes]:
+    """The bytes of a file, decompressed if they are those of gzip or zstd. Raises McaptrackError."""
+    refuse_special(path)
+    try:
+        stream = path.open("rb")
+        magic = stream.read(4)
+        stream.seek(0)
+        if not magic.startswith(_GZIP) and magic != _ZSTD:
+            return stream
+        with stream:
+            return BytesIO(_unpacked(stream.read(), magic == _ZSTD))
+    except OSError as error:
+        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+    except NotUnpackedError as error:
+        raise McaptrackError(f"{path} can't be decompressed: {error}") from None
+
+
+def _unpacked(data: bytes, is_zstd: bool) -> bytes:
+    """Decompress all parts of gzip or zstd that follow each other. Raises NotUnpackedError."""
+    import zstandard
+
+    def unpackers() -> Any:
+        return zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompressobj()
+
+    new = unpackers if is_zstd else partial(zlib.decompressobj, zlib.MAX_WBITS + 16)
+    parts, size, most, unpacker = list[bytes](), 0, limit_of(len(data)), new()
+    try:
+        for at in range(0, len(data), _FED_BYTES):
+            piece = data[at : at + _FED_BYTES]
+            while piece:
+                unpacker = new() if unpacker.eof else unpacker
+                parts.append(unpacker.decompress(piece))
+                piece = unpacker.unused_data if unpacker.eof else b""
+                size += len(parts[-1])
+            if size > most:
+                raise too_large(None, most)
+    except (zlib.error, zstandard.ZstdError) as error:
+        raise NotUnpackedError(str(error)) from None
+    if not unpacker.eof:
+        raise NotUnpackedError("it is cut off")
+    return b"".join(parts)
 
 
 def decompress_steps(unpacker: Any, data: bytes, most: int) -> bytes:

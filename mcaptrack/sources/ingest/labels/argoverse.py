@@ -15,6 +15,8 @@ from mcaptrack.sources.ingest.labels.text import ClassNames, headings, numbered
 
 BOXES: Final = "annotations.feather"
 POSES: Final = "city_SE3_egovehicle.feather"
+#: The column of ids, which the beginning of a table names.
+_TRACKS: Final = b"track_uuid"
 _QUATERNION: Final = ("qw", "qx", "qy", "qz")
 _PLACE: Final = ("tx_m", "ty_m", "tz_m")
 _SIZE: Final = ("length_m", "width_m", "height_m")
@@ -33,7 +35,8 @@ class Argoverse(Format):
     def recognises(self, file: LabelFile) -> bool:
         """Whether it is a table of boxes, or the folder of a log, with or without one."""
         path = file.path
-        return path.suffix == ".feather" or (file.is_folder and any((path / name).is_file() for name in (BOXES, POSES)))
+        is_table = path.suffix == ".feather" and (path.name == BOXES or _TRACKS in file.head)
+        return is_table or (file.is_folder and any((path / name).is_file() for name in (BOXES, POSES)))
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The boxes of a log, in the city's frame if the poses are there."""

@@ -120,7 +120,8 @@ def check_boxes_3d(table: BoxTable, _: Asked) -> None:
     table.refuse(is_odd.any(axis=1), odd)
     _check_places(table, np.nan_to_num(boxes[:, :3]), unit=" m")
     table.refuse((boxes[:, _SIZE] < 0).any(axis=1), lambda row: f"a size can't be {np.nanmin(boxes[row, _SIZE]):g}")
-    length = boxes[:, _SIZE].max(axis=1)
+    sizes = boxes[:, _SIZE]  # of some formats without heights
+    length = sizes[:, np.isfinite(sizes).all(axis=0)].max(axis=1, initial=-np.inf)
     usual = float(np.median(length)) if np.isfinite(length).all() else 1.0
     if not _LEAST_LENGTH_M <= usual <= _MOST_LENGTH_M:
         raise McaptrackError(f"{table.path}: the median length of its boxes is {usual:g}; sizes have to be in metres")
@@ -166,7 +167,11 @@ def check_shares(table: BoxTable, _: Asked) -> None:
     largest = parts.max(axis=1, initial=0)
     if facts.is_normalised:
         table.refuse(
-            largest > _MOST_SHARE, lambda row: f"{largest[row]:g} is no share of the picture's size, as its boxes are"
+            largest > _MOST_SHARE,
+            lambda row: (
+                f"{largest[row]:g} is no share of the picture's size, as its boxes are; "
+                "boxes in pixels are read as a table (`label_format='csv'`)"
+            ),
         )
     elif facts.is_normalised is None and (np.abs(boxes) <= _MOST_SHARE).all() and (boxes != np.rint(boxes)).any():
         facts.is_normalised = True
@@ -199,7 +204,7 @@ def check_repeated(table: BoxTable, _: Asked) -> None:
     if not same.any():
         return
     alike = np.union1d(order[1:][same], order[:-1][same])
-    rows = np.column_stack([np.asarray(column)[alike] for column in columns])
+    rows = np.nan_to_num(np.column_stack([np.asarray(column)[alike] for column in columns]), nan=np.inf)
     if repeated := len(rows) - len(np.unique(rows, axis=0)):
         text = ": {0} of {rows} boxes are there before, with the same frame and class; they stay as they are"
         table.find(text, "repeated", repeated)

@@ -17,6 +17,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.masks import box_of_mask
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import FrameNames, TrackIds, as_float, is_count, is_number, numbers_of_names
 
@@ -43,7 +44,7 @@ class Coco(Format):
         keys = file.keys
         if isinstance(file.json if keys else [], dict):
             return isinstance(file.json.get("annotations"), list)
-        return "bbox" in keys and "image_id" in keys
+        return "image_id" in keys and bool({"bbox", "segmentation"} & set(keys))
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""
@@ -66,7 +67,7 @@ class _Rows:
     def __init__(self, path: Path, kind: str) -> None:
         self._path, self._kind, self._values = path, kind, array("d")
         self._texts = TrackIds()
-        self.outlined = 0
+        self.outlined, self.masks = 0, 0
 
     def add(self, number: int, entry: Any, frame_of: Callable[[Any], float]) -> None:
         """Add an annotation or a result. Raises McaptrackError if something is missing or of the wrong type."""
@@ -100,7 +101,11 @@ class _Rows:
     def _around(self, number: int, outline: Any) -> list[float] | None:
         """The box around polygons, [x, y, x, y, ...] each; None without any."""
         if isinstance(outline, dict):
-            self.refuse(number, "has a mask (RLE) and no bbox; boxes are read")
+            self.masks += 1
+            try:
+                return box_of_mask(outline)
+            except (KeyError, TypeError, ValueError) as error:
+                self.refuse(number, f"has no bbox, and a mask that can't be read: {error}")
         flat = [part for part in outline if isinstance(part, list)] if isinstance(outline, list) else []
         points = [value for part in flat for value in part[: len(part) // 2 * 2]]
         if not points or not all(map(is_number, points)):
@@ -127,6 +132,8 @@ class _Rows:
         )  # fmt: skip
         if self.outlined:
             rows.remark(f": {self.outlined} boxes are those around polygons, which have no bbox")
+        if self.masks:
+            rows.remark(f": {self.masks} boxes are those around masks, which have no bbox")
         return rows
 
 

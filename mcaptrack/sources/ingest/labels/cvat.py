@@ -69,6 +69,7 @@ _ZIP: Final = b"PK\x03\x04"
 #: A zip file without members.
 _EMPTY_ZIP: Final = b"PK\x05\x06"
 _MEMBER: Final = "annotations.xml"
+_WORKBOOK: Final = "xl/workbook.xml"
 _SHOWN: Final = 5
 
 
@@ -96,8 +97,19 @@ def _member(path: Path, names: list[str]) -> str:
         return members[0]
     if members:
         raise McaptrackError(f"{path} holds {len(members)} of {_MEMBER}; give each as a file ({_listed(members)})")
+    if _WORKBOOK in names:
+        raise McaptrackError(
+            f"{path} is a workbook of Excel; save its sheet as CSV or Parquet, which are read as labels"
+        )
     content = f"it holds {_listed(names)}" if names else "it is empty"
     raise McaptrackError(f"{path} is a zip file without the {_MEMBER} of CVAT: {content}; unpack other formats")
+
+
+#: What else XML begins with: what it is, and how it becomes something that is read.
+_OTHER_XML: Final = {
+    "fcd-export": ", of SUMO: its tool xml2csv.py makes CSV of it, which is read",
+    "sequence": ", of UA-DETRAC: write its boxes as MOTChallenge or CSV (frame,id,left,top,width,height)",
+}
 
 
 def _listed(names: list[str]) -> str:
@@ -146,7 +158,8 @@ class _Parser(XmlReader):
         if len(self.names) > _MAX_DEPTH:
             self.fail("nested deeper than annotations of CVAT are")
         if len(self.names) == 1 and name != "annotations":
-            self.fail(f"XML that begins with <{name[:40]}>; of XML, <annotations> of CVAT are read")
+            read = "of XML, <annotations> of CVAT and <annotation> of Pascal VOC or LabelMe are read"
+            self.fail(f"XML that begins with <{name[:40]}>{_OTHER_XML.get(name, '')}; {read}")
         if "meta" in self.names[:2]:
             self._text = []
         elif name == _TRACK and len(self.names) == 2:
@@ -156,7 +169,8 @@ class _Parser(XmlReader):
             self._track = _Track(number, self._label(attributes), line)
         elif name == "image" and len(self.names) == 2:
             self._check_task(attributes)
-            self._image = self._whole(attributes.get("id", ""), "the id of an image")
+            id_text = attributes.get("id", str(len(self.images)))  # those of other writers lack it: they are in order
+            self._image = self._whole(id_text, "the id of an image")
             if self._image in self.images:
                 self.fail(f"image {self._image} is there before; give one file for each task")
             self.images[self._image] = (attributes.get("width", ""), attributes.get("height", ""))

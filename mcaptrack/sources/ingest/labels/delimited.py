@@ -12,11 +12,12 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from functools import partial
-from itertools import chain
+from itertools import chain, islice, takewhile
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -34,17 +35,23 @@ from mcaptrack.sources.ingest.labels.text import (
     lines_of,
     numbered,
     read_numbers,
+    states_number,
 )
 
 #: Columns that supervision writes before those of the user.
 SUPERVISION: Final = ("x_min", "y_min", "x_max", "y_max", "class_id", "confidence", "tracker_id")
-_DELIMITERS: Final = ",;\t"
+_DELIMITERS: Final = ",;\t|"
 #: Where one of these separates cells, a comma in a number is a decimal comma.
-_NOT_COMMAS: Final = (";", "\t")
+_NOT_COMMAS: Final = (";", "\t", "|", " ")
 _MAX_COLUMNS: Final = 1024
 _LEAST_COLUMNS: Final = 4
+_MAX_COMMENTS: Final = 1000
+#: A name of a column where blanks separate these.
+_NAME: Final = re.compile(r"[A-Za-z][\w.%-]*")
+#: Objects in objects are read so deep.
+_DEEPEST: Final = 2
 #: Between cells of rows that come from JSON.
-_SEPARATOR: Final = "\x1f"
+SEPARATOR: Final = "\x1f"
 #: The column that counts frames from 0, as examples of supervision add it.
 _FRAME_INDEX: Final = "frame_index"
 #: The columns of MOTChallenge, in which a comment may name them.
@@ -62,17 +69,25 @@ _MAX_SECONDS: Final = 2**63 / 1e9
 def header_of(path: Path, line: str) -> list[str]:
     """The names of columns if a line is a header, otherwise an empty list: none of its cells is a number."""
     cells = [cell.strip() for cell in split_row(path, delimiter_of(line), line)]
-    is_header = len(cells) >= _LEAST_COLUMNS and not any(_is_number(cell) for cell in cells)
-    return cells if is_header and any(line.count(delimiter) for delimiter in _DELIMITERS) else []
+    is_header = len(cells) >= _LEAST_COLUMNS and not any(states_number(cell) for cell in cells)
+    return cells if is_header and (delimiter_of(line) != " " or all(map(_NAME.fullmatch, cells))) else []
 
 
 def comment_header(path: Path, row: str) -> list[str]:
-    """The names of columns by a first line that begins with "#", if it fits the first row; otherwise an empty list."""
-    _, first = next(lines_of(path, MAX_LINE, has_comments=True), (0, ""))
-    names = header_of(path, first.strip().lstrip("#")) if first.lstrip().startswith("#") else []
+    """The names of columns by the last line before the first row, if it begins with "#" and fits; otherwise an empty
+    list.
+    """
+    last = (comments_of(path) or [""])[-1]
+    names = header_of(path, last) if last else []
     delimiter = delimiter_of(row)
     cells = split_row(path, delimiter, row)
-    return names if len(names) == len(cells) and delimiter == delimiter_of(first) else []
+    return names if len(names) == len(cells) and delimiter == delimiter_of(last) else []
+
+
+def comments_of(path: Path) -> list[str]:
+    """The lines before the first row, which begin with "#", without it."""
+    lines = takewhile(lambda line: line.startswith("#"), (line.lstrip() for _, line in lines_of(path, MAX_LINE, True)))
+    return [line.strip().lstrip("#").strip() for line in islice(lines, _MAX_COMMENTS)]
 
 
 def is_empty(cell: str) -> bool:
@@ -80,28 +95,23 @@ def is_empty(cell: str) -> bool:
     return cell.strip().lower() in _EMPTY
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def delimiter_of(header: str) -> str:
-    """The character that separates the cells of a line."""
-    return max(_DELIMITERS, key=header.count)
+    """The character that separates the cells of a line; a blank if there is none of the others."""
+    most = max(_DELIMITERS, key=header.count)
+    return most if most in header else " "
 
 
 def split_row(path: Path, delimiter: str, line: str) -> list[str]:
     """The cells of a line. Raises McaptrackError if they can't be told apart."""
+    if delimiter == " ":
+        return line.split()
     try:
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     except csv.Error as error:
         raise McaptrackError(f"{path}: {error}: {line[:60]!r}") from None
 
 
-class _Opened(NamedTuple):
+class Opened(NamedTuple):
     """A table after its header was read: its place, the names of columns, the rows, and what separates their cells."""
 
     path: Path
@@ -110,6 +120,7 @@ class _Opened(NamedTuple):
     lines: Lines
     split: Callable[[str], list[str]]
     delimiter: str = ""
+    note: str = ""
 
     @property
     def where(self) -> str:
@@ -125,7 +136,7 @@ class _Opened(NamedTuple):
         return math.nan if is_empty(text) else float(self.decimal(text))
 
 
-def _opened(file: LabelFile) -> _Opened:
+def opened(file: LabelFile) -> Opened:
     """Read the header of a table. Raises McaptrackError if it has none."""
     path, lines = file.path, file.lines(MAX_LINE)
     number, first = next(lines, (0, ""))
@@ -140,7 +151,43 @@ def _opened(file: LabelFile) -> _Opened:
             f"{first.strip()[:60]}"
         )
     delimiter = delimiter_of(first)
-    return _Opened(path, number, header, lines, partial(split_row, path, delimiter), delimiter)
+    return with_lists(Opened(path, number, header, lines, partial(split_row, path, delimiter), delimiter))
+
+
+#: Names of columns that hold a box as a list of four numbers, without blanks, "_" and the like; and what these are.
+_LISTS: Final = {
+    **dict.fromkeys(("", "xywh", "tlwh", "ltwh"), "xywh"),
+    **dict.fromkeys(("xyxy", "ltrb", "tlbr"), ("x", "y", "x2", "y2")),
+    **dict.fromkeys(("cxcywh", "cxywh"), ("cx", "cy", "w", "h")),
+}
+_LIST: Final = re.compile(r"(bbox|box|boundingbox|rect)?(" + "|".join(_LISTS) + ")")
+_NUMBER: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+def with_lists(table: Opened) -> Opened:
+    """A table in which four columns, bbox.x and so on, replace one that holds boxes as lists of four numbers, if there
+    are no others of boxes.
+    """
+    plain, header = _plain(table.header), table.header
+    lists = [(at, match[2]) for at, name in enumerate(plain) if name and (match := _LIST.fullmatch(name))]
+    if not lists or any(name in HEADERS[key] for key in ("x", "cx") for name in plain):
+        return table
+    at, order = lists[0]
+    name, keys = header[at], _LISTS[order]
+    note = f"{name} holds {'left, top, width, height' if keys == 'xywh' else ', '.join(keys)}"
+    note += f"; a column with the name {name}_xyxy holds corners" if not order else ""
+
+    def split_list(line: str) -> list[str]:
+        parts = table.split(line)
+        if len(parts) != len(header):
+            raise ValueError(f"{len(parts)} columns, and the header has {len(header)}")
+        numbers = ["", "", "", ""] if is_empty(parts[at]) else _NUMBER.findall(parts[at])
+        if len(numbers) != 4:
+            raise ValueError(f"the column {name} holds {parts[at][:40]!r}, which are no four numbers")
+        return [*parts[:at], *numbers, *parts[at + 1 :]]
+
+    names = [*header[:at], *(f"bbox.{key}" for key in keys), *header[at + 1 :]]
+    return table._replace(header=names, split=split_list, note=note)
 
 
 class _Cells:
@@ -149,9 +196,7 @@ class _Cells:
     ``places`` are the columns that are read; ``readers`` make numbers of those that hold something else.
     """
 
-    def __init__(
-        self, table: _Opened, places: Mapping[str, int], readers: Mapping[str, Callable[[str], float]]
-    ) -> None:
+    def __init__(self, table: Opened, places: Mapping[str, int], readers: Mapping[str, Callable[[str], float]]) -> None:
         header, keys = table.header, sorted(places, key=places.__getitem__)
         if len(header) > _MAX_COLUMNS:
             raise McaptrackError(f"{table.where}: more than {_MAX_COLUMNS} columns")
@@ -184,7 +229,7 @@ class _Cells:
         unused = [name for place, name in enumerate(header) if name and place not in places.values()]
         more = f"; not read: {', '.join(unused)}"[:300] if unused else ""
         #: Which columns were read, as text.
-        self.remark = f"{table.path}: columns {used}{more}"
+        self.remark = f"{table.path}: columns {used}{more}{f'; {table.note}' if table.note else ''}"
 
     def column(self, key: str) -> Floats:
         """A column (N,); NaN if the table has none."""
@@ -199,7 +244,7 @@ class _Cells:
         columns, texts = self.columns, self.classes.names
         kind, name = columns.get("class"), columns.get("name")
         facts.named_by = "file"
-        if kind is not None and texts and all(_is_number(text) for text in texts.values()):
+        if kind is not None and texts and all(states_number(text) for text in texts.values()):
             stated = np.isfinite(kind)
             number = np.full(len(kind), float(NO_CLASS))
             number[stated] = np.array([float(text) for text in texts.values()])[kind[stated].astype(int)]
@@ -231,6 +276,8 @@ def is_table(file: LabelFile) -> bool:
         if header_of(file.path, file.row):
             return True
         names = comment_header(file.path, file.row)
+        if are_metres(names, {}):
+            return True
         columns = choose_columns(str(file.path), names, {}) if names else _MOT_COLUMNS
     except McaptrackError:
         return False
@@ -255,8 +302,8 @@ class Csv(Format):
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a table."""
         if self.holds_3d(file, asked.columns):
-            return _read_table_3d(_opened(file), asked.columns)
-        return _read_table(_opened(file), "csv", asked.columns)
+            return read_table_3d(opened(file), asked.columns)
+        return read_table(opened(file), "csv", asked.columns)
 
 
 class Supervision(Format):
@@ -274,24 +321,39 @@ class Supervision(Format):
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a table, or of JSON: objects with the same keys."""
-        if not file.is_json:
-            return _read_table(_opened(file), "supervision", asked.columns)
-        path, content = file.path, file.json
-        if not isinstance(content, list) or not content or not isinstance(content[0], dict):
-            raise McaptrackError(f"{path} holds no rows of supervision: a list of objects with x_min, y_min, ...")
-        header = [str(key) for key in content[0]][: _MAX_COLUMNS + 1]
-
-        def lines() -> Iterator[tuple[int, str]]:
-            for number, row in enumerate(content, start=1):
-                if not isinstance(row, dict) or list(row)[: len(header)] != header:
-                    raise McaptrackError(f"{path}: row {number} has other keys than the first one: {str(row)[:60]}")
-                yield number, _SEPARATOR.join(str(value).replace(_SEPARATOR, " ")[:MAX_LINE] for value in row.values())
-
-        table = _Opened(path, 1, header, lines(), lambda line: line.split(_SEPARATOR))
-        return _read_table(table, "supervision", asked.columns)
+        return read_table(records(file) if file.is_json else opened(file), "supervision", asked.columns)
 
 
-def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
+def records(file: LabelFile) -> Opened:
+    """JSON as a table: a list of objects, or an object in each line, with the same keys; those of objects in it are
+    joined with dots. Raises McaptrackError if it is none.
+    """
+    path, content = file.path, file.records
+    if not content or not all(isinstance(row, dict) for row in content):
+        raise McaptrackError(f"{path} holds no rows: a list of objects with the same keys, x_min, y_min, ...")
+    header = [*_flat(content[0])][: _MAX_COLUMNS + 1]
+
+    def lines() -> Iterator[tuple[int, str]]:
+        for number, row in enumerate(map(_flat, content), start=1):
+            if row.keys() - header:
+                raise McaptrackError(f"{path}: row {number} has other keys than the first one: {str(row)[:60]}")
+            cells = ("" if row.get(name) is None else str(row[name]) for name in header)
+            yield number, SEPARATOR.join(cell.replace(SEPARATOR, " ")[:MAX_LINE] for cell in cells)
+
+    return with_lists(Opened(path, 1, header, lines(), lambda line: line.split(SEPARATOR)))
+
+
+def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """The values of an object by key, also those of objects in it, down to the third."""
+    out: dict[str, Any] = {}
+    for key, value in row.items():
+        is_deeper = isinstance(value, dict) and before.count(".") < _DEEPEST
+        out |= _flat(value, f"{before}{key}.") if is_deeper else {f"{before}{key}": value}
+    return out
+
+
+def read_table(table: Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
+    """The rows of a table of boxes in pictures, as those of the format ``name``. Raises McaptrackError."""
     path, header = table.path, table.header
     places = choose_columns(table.where, header, chosen)
     frames, ids = FrameNames(), TrackIds()
@@ -303,9 +365,15 @@ def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTabl
             return ids.number(text.strip())
 
     def frame_of(text: str) -> float:
-        return float(text) if _is_number(text) else frames.number(text.strip())
+        return float(text) if states_number(text) else frames.number(text.strip())
 
-    cells = _Cells(table, places, {"frame": frame_of, "id": id_of})
+    unit, without_zone = unit_of(header[places["t"]])[1] if "t" in places else 1.0, list[str]()
+
+    def time_of(text: str) -> float:
+        t_ns = iso_ns(text, without_zone)
+        return table.number_in(text) * unit if t_ns is None else t_ns / NS_PER_S
+
+    cells = _Cells(table, places, {"frame": frame_of, "id": id_of, "t": time_of})
     track_id, said = ids.of(path, cells.column("id"))
     remarks, facts = [cells.remark, *said], LabelFacts(path, name)
     are_rows = "id" in places and header[places["id"]].lower() == "id" and "id" not in chosen
@@ -317,7 +385,7 @@ def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTabl
         score=cells.column("score"), class_id=cells.name_classes(facts), remarks=remarks,
     )  # fmt: skip
     if "t" in places:
-        seconds = cells.columns["t"] * unit_of(header[places["t"]])[1]
+        seconds = cells.columns["t"]
         rows.refuse(
             ~(np.isfinite(seconds) & (seconds >= 0) & (seconds < _MAX_SECONDS)),
             lambda row: (
@@ -327,6 +395,7 @@ def _read_table(table: _Opened, name: str, chosen: Mapping[str, str]) -> BoxTabl
         )
         facts.times_s, rows.frame = np.unique(seconds, return_inverse=True)
         facts.first_frame = 0
+        _warn_of_zone(rows, without_zone)
     if name == "supervision" and header[places.get("frame", 0)].lower() == _FRAME_INDEX:
         facts.first_frame = 0
     return rows.with_boxes(cells.stacked(key for key in _OF_BOXES if key in places))
@@ -342,9 +411,32 @@ def _boxes(columns: Mapping[str, Floats]) -> Floats:
     return np.stack([left, top, width, height], axis=-1)
 
 
+_ISO: Final = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)?")
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def iso_ns(text: str, without_zone: list[str]) -> int | None:
+    """A date and time of ISO 8601 in nanoseconds from 1970 on, in UTC unless it names a zone; None if it is none.
+
+    The first one that names none is added to ``without_zone``.
+    """
+    match = _ISO.fullmatch(text.strip())
+    if match is None:
+        return None
+    if match[3] is None and not without_zone:
+        without_zone.append(text.strip())
+    zone = match[3] if match[3] not in (None, "Z", "UTC") else "+00:00"
+    since = datetime.fromisoformat(match[1] + zone) - _EPOCH
+    return (since.days * 86_400 + since.seconds) * NS_PER_S + int((match[2] or "").ljust(9, "0"))
+
+
 def unit_of(header: str) -> tuple[str, float]:
-    """The unit of a column of times, by its name, and its seconds: s, unless it ends with _ms, _us or _ns."""
+    """The unit of a column of times, by its name, and its seconds: s, unless it ends with _ms, _us or _ns, or is that
+    of ``rostopic echo -p``.
+    """
     text = header.strip().lower()
+    if text == _ROSTOPIC:
+        return "ns", _UNITS["ns"]
     units = (unit for unit in _UNITS.items() if text.endswith((f"_{unit[0]}", f" {unit[0]}", f"({unit[0]})")))
     return next(units, ("s", 1.0))
 
@@ -373,18 +465,22 @@ HEADERS: Final[Mapping[str, tuple[str, ...]]] = {
     "y2": ("y2", "ymax", "maxy", "bottom", "bbbottom", "bboxbottom", "bboxy2", "bboxymax", "ybr", "ybottom"),
     "cx": ("cx", "xc", "xcenter", "xcentre", "centerx", "centrex"),
     "cy": ("cy", "yc", "ycenter", "ycentre", "centery", "centrey"),
-    "frame": ("frame", "frameindex", "frameidx", "framenumber", "frameno", "framenum", "frameid", "image", "imageid",
-              "imagename", "filename", "file"),
-    "t": ("t", "time", "timestamp", "seconds", "stamp", *_WITH_UNITS),
+    "frame": ("frame", "frameindex", "frameidx", "framenumber", "frameno", "framenum", "frameid", "fr", "image",
+              "imageid", "imagename", "filename", "file"),
+    "t": ("t", "time", "timestamp", "seconds", "stamp", "%time", "simtime", *_WITH_UNITS),
     "score": ("score", "confidence", "conf", "probability", "prob"),
     "class": ("class", "classid", "cls", "label", "category", "categoryid", "labelid", "objectclass"),
     "name": ("classname", "categoryname", "labelname", "name"),
-    "id": ("trackid", "trackerid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid", "pedid",
-           "pedestrianid", "personid", "agentid"),
+    "id": ("trackid", "trackerid", "pedestrianid", "id", "track", "objectid", "targetid", "tid", "trackuuid", "uuid",
+           "pedid", "personid", "agentid"),
 }  # fmt: skip
 #: Keys of which several columns may fit; the first header of the list above is read.
 _RANKED: Final = ("frame", "t", "class", "id")
-IGNORED: Final = re.compile(r"[\s_\-.()\[\]/:]+|px$|pixels$")
+IGNORED: Final = re.compile(r"-pid\d+$|[\s_\-.()\[\]/:]+|px$|pixels$")
+
+
+#: How names of columns that hold a number of a box may begin.
+_BOX: Final = re.compile(r"^(?:boundingbox|box2d|box|rect)(?=(?:x|y|w|h|left|top|right|bottom|width|height)[a-z12]*$)")
 
 
 def parse_columns(columns: str | Mapping[str, str]) -> dict[str, str]:
@@ -425,7 +521,7 @@ def _named(where: str, header: Sequence[str], chosen: Mapping[str, str]) -> dict
 
 
 def _plain(header: Sequence[str]) -> list[str]:
-    return [IGNORED.sub("", name.strip().lower()) for name in header]
+    return [_BOX.sub("bbox", IGNORED.sub("", name.strip().lower())) for name in header]
 
 
 def _fitting(names: Sequence[str], plain: Sequence[str], taken: Mapping[str, int]) -> list[int]:
@@ -459,9 +555,9 @@ def choose_columns(where: str, header: Sequence[str], chosen: Mapping[str, str])
         complete = [pair for pair in axis if all(key in out for key in pair)]
         complete.sort(key=lambda pair: -len(chosen.keys() & pair))
         if not complete:
-            places = {key: fits[0] for key in _PLACE[:2] if (fits := _fitting(_HEADERS_3D[key], plain, {}))}
-            hint = ",".join(f"{key}={header[place]}" for key, place in places.items())
-            positions = f"; positions in metres are read with `columns={hint!r}`" if len(places) == 2 else ""
+            x, y = (_fitting(_HEADERS_3D[key], plain, {}) or _by_end(key, header, {}) for key in _PLACE[:2])
+            hint = f"x_m={header[x[0]]},y_m={header[y[0]]}" if x and y else ""
+            positions = f"; positions in metres are read with `columns={hint!r}`" if hint else ""
             raise McaptrackError(
                 f"{where}: no columns for {' and '.join(axis[0])} (or {' and '.join(axis[1])}) of boxes; {shown}; name "
                 f"them with `columns='x=left,y=top,w=width,h=height,frame=frame'`{positions}"
@@ -533,26 +629,65 @@ _ONLY_3D: Final = frozenset(("xm", "ym", "zm", "tzm", "lengthm", "headingrad", "
 _OTHER_UNIT: Final = re.compile(r"(?:^|[_ \[(])(mm|cm|km|ft|feet|inch|inches|px)[\])]?$", re.IGNORECASE)
 
 
+#: Columns by which tables of positions in metres are known: of rostopic, SUMO, Vadere and JuPedSim.
+_ROSTOPIC: Final = "%time"
+_OF_PROGRAMS: Final = (
+    (_ROSTOPIC, "field.header.stamp"),
+    ("timestep_time",),
+    ("pedestrianid", "simtime"),
+    ("id", "fr", "x", "y"),
+)
+#: The frames per second, in a comment of JuPedSim.
+_RATE: Final = re.compile(r"framerate:\s*(\d+(?:\.\d+)?)$", re.IGNORECASE)
+_PARTS: Final = re.compile(r"[\s._/]+")
+
+
+def _by_end(key: str, header: Sequence[str], taken: Mapping[str, int]) -> list[int]:
+    """The columns with names that end with one of a key, after a dot or "_": the last two words, or the last one if no
+    other column has it.
+    """
+    words = [_PARTS.split(name.strip().lower()) for name in header]
+    names = _HEADERS_3D.get(key) or HEADERS[key]
+    fits = _fitting(names, ["".join(parts[-2:]) for parts in words], taken)
+    last = _fitting(names, [parts[-1] for parts in words], taken)
+    return fits or (last if len(last) == 1 else [])
+
+
+def _is_of_program(header: Sequence[str]) -> bool:
+    """Whether the columns are those of a program that writes metres."""
+    names = {name.strip().lower() for name in header}
+    return any(names >= set(required) for required in _OF_PROGRAMS)
+
+
 def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
     """Whether a table has 3D boxes, by its first line and the columns that are ``chosen`` by key."""
-    if set(chosen) & set(KEYS_3D):
-        return True
-    header = header_of(path, first)
-    if not header:
-        return False
+    header = header_of(path, first) or (comment_header(path, first) if first else [])
+    return are_metres(header, chosen)
+
+
+def hold_places(header: Sequence[str]) -> bool:
+    """Whether any of the columns holds a number of a place, by its name."""
+    plain = {*_plain(header)}
+    keys = (*((key, HEADERS[key]) for key in _OF_BOXES), *((key, _HEADERS_3D[key]) for key in _PLACE))
+    return any(plain & {*names} for _, names in keys)
+
+
+def are_metres(header: Sequence[str], chosen: Mapping[str, str]) -> bool:
+    """Whether columns with these names hold boxes or positions in metres, or are ``chosen`` as such by key."""
     plain = _plain(header)
-    if _ONLY_3D & set(plain):
+    if set(chosen) & set(KEYS_3D) or _ONLY_3D & set(plain) or _is_of_program(header):
         return True
     keys = {key for key, names in _HEADERS_3D.items() if set(names) & set(plain)}
     return set(_PLACE) <= keys and bool(keys & {*_HEADING, "qw"})
 
 
-def _read_table_3d(table: _Opened, chosen: Mapping[str, str]) -> BoxTable:
+def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
+    """The rows of a table of boxes or positions in metres. Raises McaptrackError."""
     path, places = table.path, _choose_columns_3d(table.where, table.header, chosen)
-    times, ids = list[int](), list[str]()
+    times, ids, without_zone = list[int](), list[str](), list[str]()
 
     def time_in(text: str) -> float:
-        times.append(_exact_ns(table.decimal(text), unit_of(table.header[places["t"]])[1]))
+        times.append(_exact_ns(table.decimal(text), unit_of(table.header[places["t"]])[1], without_zone))
         return 0.0
 
     def id_in(text: str) -> float:
@@ -580,6 +715,12 @@ def _read_table_3d(table: _Opened, chosen: Mapping[str, str]) -> BoxTable:
         id=track_id, boxes_m=boxes, score=cells.column("score"), class_id=np.nan_to_num(kind, nan=NO_CLASS),
         velocity=cells.stacked(_VELOCITY), remarks=remarks,
     )  # fmt: skip
+    _warn_of_zone(rows, without_zone)
+    comments = comments_of(path) if table.delimiter and "t" not in places else []
+    rate = next(filter(None, map(_RATE.match, comments)), None)
+    if rate is not None and float(rate[1]) > 0:
+        rows.frame, facts.is_timed = np.rint(rows.frame * NS_PER_S / float(rate[1])), True
+        rows.remark(f": times by its {rate[0]}")
     if not facts.names:
         facts.names, facts.numbering, facts.named_by = None, None, ""
     return rows.with_boxes(boxes[:, :6])
@@ -594,7 +735,7 @@ def _choose_columns_3d(where: str, header: Sequence[str], chosen: Mapping[str, s
     out, plain = _named(where, header, chosen), _plain(header)
     either = ({*_HEADING, *_QUATERNION}, {"t", "frame"})
     for key, names in (*_HEADERS_3D.items(), *((key, HEADERS[key]) for key in _SHARED)):
-        fits = _fitting(names, plain, out)
+        fits = _fitting(names, plain, out) or (_by_end(key, header, out) if _is_of_program(header) else [])
         if key in out or not fits or any(key in group and group & chosen.keys() for group in either):
             continue
         out[key] = fits[0]
@@ -624,10 +765,16 @@ def _choose_columns_3d(where: str, header: Sequence[str], chosen: Mapping[str, s
     return out
 
 
-def _exact_ns(text: str, unit: float) -> int:
+def _warn_of_zone(rows: BoxTable, without_zone: list[str]) -> None:
+    for text in without_zone:
+        rows.find(f": its times name no time zone ({text[:40]}); they are taken as UTC", "clock")
+
+
+def _exact_ns(text: str, unit: float, without_zone: list[str]) -> int:
     """A time in nanoseconds, exactly."""
     try:
-        t_ns = int((Decimal(text) * round(unit * NS_PER_S)).to_integral_value())
+        t_ns = iso_ns(text, without_zone)
+        t_ns = t_ns if t_ns is not None else int((Decimal(text) * round(unit * NS_PER_S)).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError):
         raise ValueError(f"{text[:30]!r} in the column of times is no number") from None
     if not 0 <= t_ns <= LAST_NS:

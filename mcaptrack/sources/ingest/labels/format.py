@@ -6,21 +6,45 @@ tests/test_border.py. Nothing else names a format.
 
 from __future__ import annotations
 
+import json
+import re
+from codecs import BOM_UTF8, BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Mapping
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
-from mcaptrack.errors import McaptrackError
-from mcaptrack.files import read_beginning, read_json
+from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.files import read_json
+from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
 from mcaptrack.sources.ingest.labels.text import MAX_ROW, Lines, lines_of, split
+from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
 
 _BEGIN_BYTES: Final = 4096
 #: The largest number of characters of a row.
 MAX_LINE: Final = 65536
 _MAX_BYTES: Final = 512 * 2**20
 _SHOWN: Final = 60
+_LISTED: Final = 6
+#: The first element of XML, after what may stand before it.
+_ROOT: Final = re.compile(rb"\s*(?:<[?!][^>]*>\s*)*<([\w.-]+)")
+#: Where labels lie in the folders that data sets and tools have, the most particular first.
+PLACES: Final = (
+    *("gt/gt.txt", "det/det.txt", "annotations/instances_*.json", "annotations/*.json", "annotations/*.csv"),
+    *("labels/*", "obj_*_data", "Annotations", "Annotations/*", "label_2", "*/label_2"),
+    *("annotations.xml", "default.xml", "result.json"),
+)
+#: What begins so is no text, and never labels: its kind, and what to do.
+_OTHERS: Final = {
+    b"PK\x03\x04": "an Excel workbook or another zip file; save the table as CSV or Parquet",
+    b"MATLAB": "a file of MATLAB; save its table as CSV (writetable)",
+    b"\x89HDF": "an HDF5 file; save its table as CSV or Parquet",
+    b"\x93NUMPY": "an array of NumPy; save it with numpy.savetxt and a header that names its columns, or as CSV",
+    b"\x80": "a pickle of Python, which could run anything; save it as CSV, Parquet or JSON",
+    b"FEA1": "a table of Feather V1; save it as Parquet, or as Feather V2",
+}
 
 
 class LabelFile:
@@ -38,7 +62,13 @@ class LabelFile:
     def head(self) -> bytes:
         """Its first bytes without blanks before them; of a folder, and of what can't be read, none."""
         try:
-            return read_beginning(self.path, _BEGIN_BYTES).removeprefix(b"\xef\xbb\xbf").lstrip()
+            if self.is_folder:
+                return b""
+            with opened(self.path) as stream:
+                data = stream.read(_BEGIN_BYTES)
+            is_wide = data.startswith((BOM_UTF16_LE, BOM_UTF16_BE))
+            data = data.decode("utf-16", "ignore").encode() if is_wide else data
+            return data.removeprefix(BOM_UTF8).lstrip()
         except McaptrackError:
             return b""
 
@@ -56,6 +86,31 @@ class LabelFile:
         """The parts of its first row."""
         return split(self.row)
 
+    @cached_property
+    def entries(self) -> list[Path]:
+        """The content of a folder, in natural order."""
+        return sorted(self.path.iterdir(), key=natural_order) if self.is_folder else []
+
+    @cached_property
+    def root(self) -> str:
+        """The name of the first element of XML; "" if it is none."""
+        match = _ROOT.match(self.head)
+        return match[1].decode("utf-8", "replace") if match else ""
+
+    @property
+    def holds_pictures(self) -> bool:
+        """Whether a folder holds pictures."""
+        return any(path.suffix.lower() in IMAGE_SUFFIXES for path in self.entries)
+
+    def refuse_binary(self) -> None:
+        """Raise McaptrackError for a kind of file that never holds labels, with what to do."""
+        if not self.is_folder and not self.head:
+            with opened(self.path):  # says so if it is packed and damaged
+                pass
+        for magic, kind in _OTHERS.items():
+            if self.head.startswith(magic):
+                raise McaptrackError(f"{self.path} is {kind}: that is read as labels")
+
     @property
     def is_json(self) -> bool:
         """Whether it begins as a JSON list or object does."""
@@ -64,7 +119,39 @@ class LabelFile:
     @cached_property
     def json(self) -> Any:
         """Its content as JSON. Raises McaptrackError if it is none."""
-        return read_json(self.path, "JSON", _MAX_BYTES)
+        return read_json(self.path, "JSON", _MAX_BYTES, opened)
+
+    @cached_property
+    def has_json_lines(self) -> bool:
+        """Whether each of its first two lines is a JSON object."""
+        lines = lines_of(self.path, MAX_LINE) if self.is_json else iter(())
+        try:
+            first = [line.strip() for _, line in islice(lines, 2)]
+        except McaptrackError:
+            return False
+        return len(first) == 2 and all(line[0] == "{" and line[-1] == "}" for line in first)
+
+    @cached_property
+    def records(self) -> list[Any]:
+        """Its content as a list: of JSON lines, of a JSON list, or of tables as pandas writes them; none of others.
+
+        Raises McaptrackError if a line is no JSON.
+        """
+        if self.has_json_lines:
+            return [self._of_line(number, line) for number, line in lines_of(self.path, MAX_LINE)]
+        content = self.json if self.is_json else None
+        if not isinstance(content, dict):
+            return content if isinstance(content, list) else []
+        columns = [*content.values()]
+        if columns and all(isinstance(column, dict) and column.keys() == columns[0].keys() for column in columns):
+            return [{name: content[name][row] for name in content} for row in columns[0]]
+        return []
+
+    def _of_line(self, number: int, line: str) -> Any:
+        try:
+            return json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise McaptrackError(f"{self.path}:{number}: not valid JSON: {str(error)[:200]}") from None
 
     @cached_property
     def keys(self) -> list[str]:
@@ -83,15 +170,25 @@ class LabelFile:
     def unknown(self, formats: str) -> McaptrackError:
         """The error for a file of none of these formats, with what it is instead."""
         if self.is_folder:
-            return McaptrackError(f"{self.path} is a folder of no label format ({formats})")
+            held = list_names([path.name for path in self.entries], _LISTED) or "nothing"
+            looked = f"looked in {', '.join(PLACES)}, and in itself for files of {formats}"
+            return McaptrackError(
+                f"{self.path} holds no images ({', '.join(IMAGE_SUFFIXES)}) and no labels that are known; {looked}; "
+                f"it holds {held}; give the label file, or the folder that label files lie in, with `label_format=`"
+            )
         if self.is_json and self.json != []:
             kind = "an object" if isinstance(self.json, dict) else "a list"
             keys = f" with {', '.join(self.keys)}"[:300] if self.keys else ""
-            return McaptrackError(f"{self.path} is JSON ({kind}{keys}) of no label format ({formats})")
+            is_of_pictures = {"data", "annotations"} <= set(self.keys) or "annotation_id" in self.keys
+            hint = "; export tasks of Label Studio with pictures as COCO or Pascal VOC" if is_of_pictures else ""
+            return McaptrackError(f"{self.path} is JSON ({kind}{keys}) of no label format ({formats}){hint}")
         number, line = next(lines_of(self.path, MAX_LINE), (0, ""))
         if not number or self.is_json:
             return McaptrackError(f"{self.path} holds no boxes")
         text = f"a row of {len(split(line))} columns fits no label format ({formats}): {line.strip()[:_SHOWN]}"
+        if "," in line and any(cell[:1].isalpha() for cell in split(line)):
+            text += "; a table with names of classes needs a first line that names its columns, separated by commas, "
+            text += "semicolons or tabs: frame,id,class,left,top,width,height,score"
         return McaptrackError(f"{self.path}:{number}: {text}")
 
 

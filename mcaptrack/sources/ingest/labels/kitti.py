@@ -6,6 +6,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -13,8 +14,17 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, files_in
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import ClassNames, Numbers, as_boxes, check_columns, read_numbers
+from mcaptrack.sources.ingest.labels.text import (
+    ClassNames,
+    Numbers,
+    as_boxes,
+    check_columns,
+    lines_of,
+    read_numbers,
+    states_number,
+)
 
 _COLUMNS: Final = (
     "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
@@ -30,6 +40,8 @@ _SITTING: Final = ("person_sitting", "person")
 _REGION: Final = "dontcare"
 #: The frame of reference of boxes in space: of the camera, with z up.
 _FRAME_ID: Final = "camera_link"
+#: So many files of a folder tell whether it is of this kind.
+_LOOKED_AT: Final = 100
 
 
 def _rows(file: LabelFile) -> tuple[Numbers, dict[int, str]]:
@@ -59,7 +71,12 @@ class Kitti(Format):
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 17 or 18 columns, and a word in the third."""
         cells = file.cells
-        return len(cells) in (17, 18) and cells[2][:1].isalpha() and cells[2].replace("_", "").isalnum()
+        return (
+            len(cells) in (17, 18)
+            and states_number(cells[0])
+            and cells[2][:1].isalpha()
+            and cells[2].replace("_", "").isalnum()
+        )
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""
@@ -111,3 +128,29 @@ class Kitti3d(Format):
         axes = "x is forward, y left, z up (in the file x is right, y down, z forward); positions are centres of boxes"
         table.remark(f": {axes}")
         return table.take(~(is_region | has_no_box))
+
+
+class KittiFrames(PictureFormat):
+    """Folders of KITTI's detection labels, a file for each picture, as DeepStream writes them, too."""
+
+    name, title = "kitti-frames", "KITTI detection"
+    row = "a folder of text files, one for each picture: `type [id] truncated occluded alpha left top right bottom ...`"
+    reads_folders = True
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether the first file of a folder that has rows begins so."""
+        texts = (LabelFile(path).row.split() for path in file.entries[:_LOOKED_AT] if path.suffix.lower() == ".txt")
+        cells = next(filter(None, texts), [])
+        return len(cells) in (15, 16, 17) and cells[0][:1].isalpha()
+
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
+        """The pictures of a folder."""
+        for path in files_in(file.path, ".txt"):
+            picture, self.where = LabelledPicture(path.name, []), path.name
+            for number, line in lines_of(path):
+                self.where, cells = f"{path.name}:{number}", line.split()
+                check_columns(cells, 15, 17)
+                track = cells.pop(1) if len(cells) == 17 else None
+                (box,) = as_boxes(np.array([cells[4:8]], float)).tolist()
+                picture.shapes.append(LabelledShape(box, cells[0], cells[15] if len(cells) == 16 else None, track))
+            yield picture

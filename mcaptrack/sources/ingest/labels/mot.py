@@ -18,7 +18,7 @@ from mcaptrack.sources.ingest.labels.delimited import is_table
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import name_classes
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NO_CLASS, OCCUPIED, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import check_columns, read_numbers
+from mcaptrack.sources.ingest.labels.text import check_columns, read_numbers, states_number
 
 #: The classes of MOT16, 17 and 20, and of VisDrone.
 _NAMES: Final = (
@@ -47,7 +47,7 @@ class Mot(Format):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has commas and 6 to 10 columns, and isn't that of a table."""
-        return "," in file.row and 6 <= len(file.cells) <= 10 and not is_table(file)
+        return "," in file.row and 6 <= len(file.cells) <= 10 and states_number(file.cells[2]) and not is_table(file)
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""

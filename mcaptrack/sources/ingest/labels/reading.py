@@ -14,13 +14,13 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.choices import Role
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import refuse_special
 from mcaptrack.registry import BUILT_IN, find
 from mcaptrack.schema.classes import ClassMap
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, check
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile
+from mcaptrack.sources.ingest.labels.format import PLACES, Format, LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package, recognised
 from mcaptrack.sources.ingest.labels.roles import WantedClasses, rename, settled
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Extent
@@ -28,6 +28,7 @@ from mcaptrack.sources.ingest.labels.text import lines_of, split
 
 _AUTO: Final = "auto"
 _TABLE: Final = "csv"
+_LISTED: Final = 6
 #: Files from this size on are read in parts, of about so many rows.
 _LONG_BYTES: Final = 20_000_000
 _PART_ROWS: Final = 200_000
@@ -53,14 +54,32 @@ def known_format(file: LabelFile, label_format: str = _AUTO, columns: Mapping[st
         made = _made(name)
         if (not columns or "columns" in made.takes) and made.recognises(file):
             return made
-    return _made(_TABLE) if columns else recognised(file)
+    return _made("records" if file.is_json else _TABLE) if columns else recognised(file)
+
+
+def label_file(path: Path, label_format: str = _AUTO) -> LabelFile:
+    """A file or folder with labels, or the one inside of a folder where data sets and tools have it (``PLACES``).
+
+    Raises McaptrackError if there are several.
+    """
+    file = LabelFile(path)
+    if label_format != _AUTO or not file.is_folder or file.holds_pictures or known_format(file):
+        return file
+    for pattern in PLACES:
+        inside = [entry for entry in sorted(path.glob(pattern)) if known_format(LabelFile(entry))]
+        if len(inside) > 1:
+            listed = list_names([str(entry.relative_to(path)) for entry in inside], _LISTED)
+            raise McaptrackError(f"{path} holds labels in {len(inside)} places, {listed}; give one of them")
+        if inside:
+            return LabelFile(inside[0])
+    return file
 
 
 def is_3d(path: Path, label_format: str = _AUTO, columns: Mapping[str, str] | None = None) -> bool:
     """Whether a label file holds boxes in metres, by the format that is given, or by its content."""
-    file = LabelFile(path)
     if label_format == _AUTO and not path.exists():
         return False
+    file = label_file(path, label_format)
     made = known_format(file, label_format, columns)
     return made is not None and made.holds_3d(file, columns or {})
 
@@ -111,10 +130,11 @@ def read_labels(
         With the line, if the file doesn't have this format, or none of the known ones, or if its rows can't be labels.
     """
     refuse_special(path)
-    file = LabelFile(path)
+    file = label_file(path, label_format)
     asked = Asked(label_format, role, columns or {}, scene, wanted, first_frame, class_map)
     made = known_format(file, label_format, columns)
     if made is None:
+        file.refuse_binary()
         raise file.unknown(", ".join(BUILT_IN["label_format"]))
     name = label_format if label_format != _AUTO else _name_of(made)
     for option in ("columns", "scene"):
@@ -128,7 +148,10 @@ def read_labels(
         table = _read_in_parts(file, made, replace(asked, role=role or "tracks"))
         if table is not None:
             return table
-    return read_by(made, file, asked)
+    table = read_by(made, file, asked)
+    if file.path != path:
+        table.remarks.insert(0, f"{path}: its labels are {file.path.relative_to(path)}")
+    return table
 
 
 def read_by(made: Format, file: LabelFile, asked: Asked) -> BoxTable:

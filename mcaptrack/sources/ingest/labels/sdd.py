@@ -36,7 +36,13 @@ class Sdd(Format):
             check_columns(parts, 10, 10)
             return [*map(float, parts[:9]), names.number(parts[9].strip('"'))]
 
-        values, at = read_numbers(file.path, file.lines(), f"Stanford Drone annotations ({_COLUMNS})", 10, parse)
+        values, at = read_numbers(
+            file.path,
+            file.lines(),
+            f"Stanford Drone annotations ({_COLUMNS}; VATIC writes attributes behind, which are not read)",
+            10,
+            parse,
+        )
         facts = LabelFacts(file.path, "sdd", first_frame=0, names=names.names, numbering=_CLASSES, named_by="file")
         facts.fps, facts.clock_of, facts.labelled = _FPS, self.title, np.unique(values[:, 5])
         table = BoxTable(

@@ -8,15 +8,17 @@ from __future__ import annotations
 import math
 import re
 from array import array
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterator, Sequence
+from io import TextIOWrapper
 from pathlib import Path, PurePath
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID
 
 #: Line numbers and lines, without empty lines and comments.
@@ -25,6 +27,7 @@ Lines = Iterator[tuple[int, str]]
 MAX_ROWS: Final = 10_000_000
 #: The largest number of characters of a row of numbers.
 MAX_ROW: Final = 4096
+_UTF16: Final = (BOM_UTF16_LE, BOM_UTF16_BE)
 #: Whole numbers of JSON can't be larger: as microseconds they are times.
 MAX_WHOLE: Final = 2**53
 #: The number of characters of a line that errors show.
@@ -35,23 +38,27 @@ _MAX_NAME: Final = 256
 
 
 def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lines:
-    """The lines of a text file, of at most ``most`` characters, without empty lines and, unless they are wanted,
-    comments.
+    """The lines of a text file, perhaps packed, of at most ``most`` characters, without empty lines and, unless they
+    are wanted, comments.
 
     Raises McaptrackError if it can't be read, isn't text, or has longer lines.
     """
-    refuse_special(path)
     try:
-        with path.open(encoding="utf-8-sig") as stream:
+        with opened(path) as data:
+            is_wide = data.read(2) in _UTF16
+            data.seek(0)
+            stream = TextIOWrapper(data, "utf-16" if is_wide else "utf-8-sig")
             number = 0
             while line := stream.readline(most + 1):
                 number += 1
                 if len(line) > most:
                     raise McaptrackError(f"{path}:{number}: a line of more than {most} characters is no row")
+                if is_wide and "\0" in line:
+                    raise UnicodeError
                 if line.strip() and (has_comments or not line.lstrip().startswith("#")):
                     yield number, line
-    except UnicodeDecodeError:
-        raise McaptrackError(f"{path} is not text in UTF-8, as labels and homographies are") from None
+    except UnicodeError:
+        raise McaptrackError(f"{path} is not text in UTF-8 or UTF-16, as labels and homographies are") from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
 
@@ -59,6 +66,15 @@ def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lin
 def is_count(text: str, digits: int) -> bool:
     """Whether a text is a whole number from 0 on, with at most so many digits."""
     return text.isascii() and text.isdecimal() and len(text) <= digits
+
+
+def states_number(text: str) -> bool:
+    """Whether a text is a number, as Python reads it."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def is_number(value: Any) -> bool:

@@ -19,11 +19,13 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, numbers_of_names, read_numbers
-from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, natural_order
+from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, numbers_of_names, read_numbers, states_number
+from mcaptrack.sources.video.image_folder import natural_order
 
 _READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
 _NOT_LABELS: Final = (*LISTS, *_READMES, "train.txt", "val.txt", "test.txt")
+#: So many files of a folder tell whether it is of this kind.
+_LOOKED_AT: Final = 100
 _MAX_FILES: Final = 1_000_000
 _ROW: Final = "YOLO (class x y width height [confidence] [id])"
 
@@ -49,10 +51,10 @@ class Yolo(Format):
     reads_folders = True
 
     def recognises(self, file: LabelFile) -> bool:
-        """Whether a folder holds label files and no pictures."""
-        if not file.is_folder or any(path.suffix.lower() in IMAGE_SUFFIXES for path in visible(file.path.iterdir())):
-            return False
-        return bool(_label_files(file.path))
+        """Whether a folder holds label files that begin with numbers, or are all empty."""
+        files = _label_files(file.path)[:_LOOKED_AT] if file.is_folder else []
+        rows = [LabelFile(path).cells for path in files]
+        return bool(rows) and all(map(states_number, next(filter(None, rows), [])))
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of all files. The numbers in the names of files are those of frames."""

@@ -1,0 +1,125 @@
+"""Tables without text of their own: Parquet, Arrow and Feather, JSON lines, and JSON of rows as pandas writes it.
+
+Columns are those of tables with a header (``delimited``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Final
+
+from mcaptrack.errors import McaptrackError
+from mcaptrack.sources.ingest.labels.delimited import (
+    SEPARATOR,
+    Opened,
+    are_metres,
+    hold_places,
+    read_table,
+    read_table_3d,
+    records,
+    with_lists,
+)
+from mcaptrack.sources.ingest.labels.format import MAX_LINE, Format, LabelFile
+from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_PARQUET: Final = b"PAR1"
+_ARROW: Final = b"ARROW1"
+#: The beginning of a stream of Arrow, which is like that of no text.
+_STREAM: Final = b"\xff\xff\xff\xff"
+
+
+class Records(Format):
+    """Tables that other programs write, of boxes in pictures and in metres."""
+
+    title = "tables in Parquet, Arrow, Feather or JSON"
+    row = "the same columns in Parquet, Arrow or Feather, in JSON lines, or in a JSON list of objects"
+    takes = ("columns",)
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether a file begins so, or is JSON of rows with a place in each."""
+        if file.head.startswith((_PARQUET, _ARROW, _STREAM)) or file.has_json_lines:
+            return True
+        try:
+            return file.is_json and hold_places(records(file).header)
+        except McaptrackError:
+            return False
+
+    def holds_3d(self, file: LabelFile, columns: Mapping[str, str]) -> bool:
+        """Whether the columns are those of boxes or positions in metres."""
+        return are_metres(_table(file).header, columns)
+
+    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
+        """The rows of a table."""
+        table = _table(file)
+        if are_metres(table.header, asked.columns):
+            rows = read_table_3d(table, asked.columns)
+            rows.facts.format = "records"
+            return rows
+        return read_table(table, "records", asked.columns)
+
+
+def _table(file: LabelFile) -> Opened:
+    """The columns of a file, and its rows as texts. Raises McaptrackError if it isn't a table."""
+    return records(file) if file.is_json else _of_arrow(file)
+
+
+def _of_arrow(file: LabelFile) -> Opened:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    path, schema = file.path, pa.schema([])
+    batches: Iterator[pa.RecordBatch]
+    try:
+        source = pa.OSFile(str(path))
+        if file.head.startswith(_PARQUET):
+            table = pq.ParquetFile(source)
+            schema, batches = table.schema_arrow, table.iter_batches()
+        elif file.head.startswith(_ARROW):
+            reader = pa.ipc.open_file(source)
+            schema, batches = reader.schema, map(reader.get_batch, range(reader.num_record_batches))
+        else:
+            stream = pa.ipc.open_stream(source)
+            schema, batches = stream.schema, iter(stream)
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise McaptrackError(f"{path} is no table that can be read: {str(error).splitlines()[0][:200]}") from None
+    names = [field.name for field in _flattened(pa.Table.from_batches([], schema)).schema if _is_text(field.type)]
+
+    def lines() -> Iterator[tuple[int, str]]:
+        number = 0
+        try:
+            for batch in batches:
+                part = _flattened(pa.Table.from_batches([batch])).select(names)
+                for row in zip(*map(_texts, part.columns), strict=True):
+                    number += 1
+                    yield number, SEPARATOR.join(row)
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise McaptrackError(f"{path}: after row {number}: {str(error).splitlines()[0][:200]}") from None
+
+    return with_lists(Opened(path, 1, names, lines(), lambda line: line.split(SEPARATOR)))
+
+
+def _flattened(table: pa.Table) -> pa.Table:
+    """A table with the fields of structures as columns of their own, named with a dot."""
+    import pyarrow as pa
+
+    return table.flatten() if any(map(pa.types.is_struct, table.schema.types)) else table
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    """Whether values of a type can be read as texts: neither bytes nor structures."""
+    import pyarrow as pa
+
+    return not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_struct(kind))
+
+
+def _texts(column: pa.ChunkedArray) -> Iterable[str]:
+    """The values of a column as texts; "" for none."""
+    import pyarrow as pa
+
+    kind = column.type
+    if not (pa.types.is_nested(kind) or pa.types.is_string(kind)):
+        column = column.cast(pa.string())
+    return ("" if value is None else str(value).replace(SEPARATOR, " ")[:MAX_LINE] for value in column.to_pylist())
