@@ -197,7 +197,7 @@ def _remove_left(folder: Path, pattern: re.Pattern[str], name: str = "") -> None
 
 
 def visible(paths: Iterable[Path]) -> list[Path]:
-    """Those of paths that are no hidden files, as those are that macOS lays beside each file (._NAME), by name."""
+    """Those of paths that are no hidden files, such as ._NAME, which macOS writes for each file, by name."""
     return sorted(path for path in paths if not path.name.startswith("."))
 
 

@@ -330,7 +330,7 @@ def _settled(kind: Any) -> Any:
 
 
 def _free_name(wanted: str, names: dict[str, Any]) -> str:
-    """The name, with a number if it is taken; case is ignored, as in SQL, whose tables have the recording beside."""
+    """The name, with a number if it is taken, by a column that SQL adds as well; case is ignored, as in SQL."""
     name, number = wanted, 1
     taken = {RECORDING.name, *(name_taken.lower() for name_taken in names)}
     while name.lower() in taken:
