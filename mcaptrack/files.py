@@ -8,7 +8,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from shutil import rmtree
@@ -196,6 +196,11 @@ def _remove_left(folder: Path, pattern: re.Pattern[str], name: str = "") -> None
                         os.unlink(entry.path)
 
 
+def visible(paths: Iterable[Path]) -> list[Path]:
+    """Those of paths that are no hidden files, such as ._NAME, which macOS writes for each file, by name."""
+    return sorted(path for path in paths if not path.name.startswith("."))
+
+
 def sync_folder(folder: Path) -> None:
     """Sync a folder to disk, with the files created, renamed and removed in it."""
     if not hasattr(os, "O_DIRECTORY"):
@@ -232,14 +237,6 @@ def read_beginning(path: Path, count: int) -> bytes:
             return stream.read(count)
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
-
-
-def visible(folder: Path) -> list[Path]:
-    """The entries of a folder but hidden ones: "._x.txt", as macOS leaves beside copied files, is none of the labels.
-
-    Raises OSError if it can't be listed.
-    """
-    return [path for path in folder.iterdir() if not path.name.startswith(".")]
 
 
 def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], IO[bytes]] | None = None) -> Any:

@@ -341,6 +341,16 @@ class TestRosbag2:
             make(tmp_path / "g", tmp_path / "out.mcap")
         assert not (tmp_path / "out.mcap").exists()
 
+    @pytest.mark.parametrize("has_metadata", [False, True])
+    def test_hidden_files_are_no_parts(self, tmp_path, has_metadata):
+        said = bag2(tmp_path / "bag")
+        [part] = (tmp_path / "bag").glob("*.db3")
+        part.with_name(f"._{part.name}").write_bytes(b"\0\5\x16\7")
+        if not has_metadata:
+            (tmp_path / "bag" / "metadata.yaml").unlink()
+        make(tmp_path / "bag", tmp_path / "out.mcap")
+        assert recorded(tmp_path / "out.mcap") == sorted(said)
+
 
 PLANE = "0.1 0 0\n0 0.1 0\n0 0 1\n"
 

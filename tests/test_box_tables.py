@@ -540,6 +540,9 @@ def test_a_sixth_column_is_a_score_or_an_id(rows, role, scores, ids, tmp_path):
         ({"obj.names": "person\ndog", "data.yaml": "names: [a, b]"}, "obj.names", {1: "person", 2: "dog"}),
         ({"data.yml": "names:\n  0: person\n  1: cat\n"}, "data.yml", {1: "person", 2: "cat"}),
         ({"data.yaml": "path: x"}, None, {}),
+        ({"classes.txt": "1: big  dog\n0: person"}, "classes.txt", {1: "person", 2: "big dog"}),
+        ({"classes.txt": "1,dog 9\n0,person"}, "classes.txt", {1: "person", 2: "dog 9"}),
+        ({"classes.txt": "person\n1 dog"}, "classes.txt", {1: "person", 2: "1 dog"}),
     ],
 )
 def test_names_of_classes_are_beside_the_labels_or_above(files, named_by, names, tmp_path):
@@ -551,6 +554,18 @@ def test_names_of_classes_are_beside_the_labels_or_above(files, named_by, names,
     wanted = [f"{place}: class names by {place / named_by}"] if named_by else []
     assert [words for words in labels.remarks if "class names by" in words] == wanted
     assert labels.remarks[0] == f"{place}: 1 files, frames are numbered by their names"
+
+
+def test_hidden_files_are_no_labels(tmp_path):
+    """macOS lays one beside each file of a disk of others, with the same suffix."""
+    folder_of(tmp_path, {"1.txt": ROW, "a.names": "person\n"})
+    wanted = read_labels(tmp_path, role="detections")
+    for name in ("._1.txt", "._2.txt", "._3.jpg", "._a.names"):
+        (tmp_path / name).write_bytes(b"\0\5\x16\7")
+    labels = read_labels(tmp_path, role="detections")
+    assert (labels.frame.tolist(), labels.classes, labels.remarks) == (
+        wanted.frame.tolist(), {1: "person"}, wanted.remarks
+    )  # fmt: skip
 
 
 def test_a_folder_of_labels_has_no_more_than_its_limits(tmp_path, monkeypatch):

@@ -204,13 +204,14 @@ def test_fields_of_json_become_columns_with_names_of_their_own(tmp_path):
     rows = [
         {"i": 1, "a.b": 1, "t": 5, "T_2": 6, "only": [], "half": "\ud800x"},
         {"i": -(2**63), "a": {"b": 2}, "deep": {"l": [1, 2.5]}},
-        {"mixed": [1, {"a": 1}]},
+        {"mixed": [1, {"a": 1}], "recording": 3},
     ]
     table = one_channel(tmp_path / "a.mcap", "", "", b"", "json", [json.dumps(row).encode() for row in rows])
     got = {name: table.column(name).to_pylist() for name in fields(table)}
     assert got["i"] == [1, -(2**63), None]
     assert (got["a.b"], got["a_b"]) == ([1, None, None], [None, 2, None])
     assert (got["t_2"], got["T_2_2"]) == ([5, None, None], [6, None, None])  # t is the log's time; capitals don't count
+    assert got["recording_2"] == [None, None, 3]  # recording is the log's name, in SQL and in folders of tables
     assert got["deep_l"] == [None, [1.0, 2.5], None]
     assert got["mixed"] == [None, None, '[1,{"a":1}]']
     assert got["half"] == ["?x", None, None]

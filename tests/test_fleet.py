@@ -19,6 +19,7 @@ from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import child, ledger
 from mcaptrack.fleet.child import Child, WorkerLimits
+from mcaptrack.fleet.expansion import NamedLog, outputs_in
 from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.fleet.worker import Reply, Request
 from tests import fleet_tasks
@@ -86,8 +87,10 @@ class TestWhichLogs:
         done = fleet.run(fleet_tasks.touch, folder, {"add": "+"}, output_dir=folder / "out", suffix=".done.mcap")
         assert len(done.results) == 5
         assert (folder / "out/x/same.done.mcap").read_text() == "x+"
-        with pytest.raises(McaptrackError, match="would both be"):
+        with pytest.raises(McaptrackError, match=r"would both be .*or give the folder that holds both"):
             fleet.run(fleet_tasks.touch, [folder / "x/same.mcap", folder / "y/same.mcap"], output_dir=folder / "o")
+        with pytest.raises(McaptrackError, match=r"would both be .* \(`output=`\)$"):  # no folder keeps these apart
+            outputs_in(folder, [NamedLog(Path(name), Path("a.mcap")) for name in ("a.mp4", "a.ts")], ".mcap")
 
     @pytest.mark.parametrize(
         ("options", "words"),

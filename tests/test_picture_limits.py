@@ -290,6 +290,7 @@ def test_what_is_no_picture_in_a_folder_is_passed_over_and_said(tmp_path):
         ("cam0/1.png", "; its folders do: give one, such as cam0"),
         ("1.heic", "; convert those it holds, such as 1.heic"),
         ("1.tga", "; convert those it holds, such as 1.tga"),
+        ("walk.mp4", "; give files it holds by name, such as walk.mp4"),
     ],
 )
 def test_a_folder_without_images_says_what_it_has(tmp_path, name, hint):

@@ -58,6 +58,8 @@ def test_warnings_give_share_times_and_restarts():
     assert "in 3% of the pictures, from 2.0 s to 2.2 s: " in words
     (words,) = said(20 * "s" + "lll" + 77 * "s", (0, 30, 60))
     assert "in 3% of the pictures, from 2.0 s to 2.2 s; the background model started again 2 times: " in words
+    (words,) = said(100 * "s", (0, 30, 60))  # as where the size of pictures changes
+    assert words.startswith("view-lost: the background model started again 2 times, from 3.0 s to 6.0 s: ")
 
 
 def textured(height: int = 160, width: int = 240, seed: int = 3) -> np.ndarray:

@@ -184,9 +184,11 @@ def outputs_in(folder: Path, logs: Sequence[NamedLog], suffix: str) -> list[Path
         name = folder / sibling(log.below, suffix, of=stem)
         other = names.setdefault(name, log.path)
         if other != log.path:
+            are_logs = log.path.suffix.lower() == other.suffix.lower() == _SUFFIX  # folders stand for logs only
+            apart = ", or give the folder that holds both, which keeps those below it apart" if are_logs else ""
             raise McaptrackError(
                 f"the results of {other} and {log.path} would both be {name}; process them one by one, each with "
-                "a name of its own (`output=`), or give the folder that holds both, which keeps those below it apart"
+                f"a name of its own (`output=`){apart}"
             )
     return list(names)
 

@@ -58,7 +58,7 @@ def split_files_in(folder: Path) -> list[Path]:
 
     That is one file, or a recording that rosbag2 has split: drive_0.mcap, drive_1.mcap.
     """
-    names = [entry.name for entry in visible(folder) if entry.name.endswith(_PARTS)]
+    names = [entry.name for entry in visible(folder.iterdir()) if entry.name.endswith(_PARTS)]
     names = [name for name in names if not name.endswith(RESULTS_SUFFIX)]
     matches = [match for match in map(_SPLIT.fullmatch, names) if match]
     if len(matches) == len(names) and len({(match[1], match[3]) for match in matches}) == 1:

@@ -22,6 +22,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.notices import warn
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.tables.build import Pointers, TablePieces, frames_table
+from mcaptrack.tables.fields import RECORDING
 
 if TYPE_CHECKING:
     from mcaptrack.columns import ProtobufColumns, RosColumns
@@ -329,9 +330,9 @@ def _settled(kind: Any) -> Any:
 
 
 def _free_name(wanted: str, names: dict[str, Any]) -> str:
-    """The name, with a number if it is taken; case is ignored, as in SQL."""
+    """The name, with a number if it is taken, by a column that SQL adds as well; case is ignored, as in SQL."""
     name, number = wanted, 1
-    taken = {name_taken.lower() for name_taken in names}
+    taken = {RECORDING.name, *(name_taken.lower() for name_taken in names)}
     while name.lower() in taken:
         number += 1
         name = f"{wanted}_{number}"

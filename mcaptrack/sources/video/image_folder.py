@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import read_beginning, refuse_special
+from mcaptrack.files import read_beginning, refuse_special, visible
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import parse_fps
 from mcaptrack.notices import warn
@@ -102,12 +102,14 @@ def instead_of_images(files: Sequence[Path]) -> str:
         return f"; its folders do: give one, such as {folders[0]}"
     if others := [path.name for path in files if path.suffix.lower() in _OTHERS]:
         return f"; convert those it holds, such as {others[0]}, to JPEG or PNG"
+    if others := [path.name for path in visible(files) if not path.is_dir()]:
+        return f"; give files it holds by name, such as {others[0]}"
     return ""
 
 
 def _has_images(folder: Path) -> bool:
     try:
-        return any(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.iterdir())
+        return any(path.suffix.lower() in IMAGE_SUFFIXES for path in visible(folder.iterdir()))
     except OSError:
         return False
 

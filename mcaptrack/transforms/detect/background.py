@@ -119,16 +119,16 @@ class Steadiness:
         self._views: Counter[View] = Counter()
         self._restarts = -1  # the first picture starts the model
         self._start_ns: int | None = None
-        self._span_ns: dict[bool, tuple[int, int]] = {}
+        self._span_ns: dict[str, tuple[int, int]] = {}
 
     def update(self, t_ns: int, view: View, is_new: bool) -> None:
         """Take the view at a picture, and whether the background model starts again with it."""
         self._start_ns = t_ns if self._start_ns is None else self._start_ns
         self._views[view] += 1
         self._restarts += is_new
-        if view != "steady":
-            is_lost = view == "lost"
-            self._span_ns[is_lost] = (self._span_ns.get(is_lost, (t_ns, t_ns))[0], t_ns)
+        seen = (view if view != "steady" else "", "restart" if is_new and self._restarts > 0 else "")
+        for key in filter(None, seen):
+            self._span_ns[key] = (self._span_ns.get(key, (t_ns, t_ns))[0], t_ns)
 
     def check(self) -> None:
         """Warn if the camera moved or its view was lost. Raises McaptrackError if it moved in most pictures."""
@@ -142,20 +142,24 @@ class Steadiness:
             )
         if moving >= _WARN_FROM:
             warn(
-                f"the camera moves in {moving:.0%} of the pictures, {self._when(False)}: detections there "
+                f"the camera moves in {moving:.0%} of the pictures, {self._when('moving')}: detections there "
                 "are incomplete and may be wrong",
                 "camera-moves",
             )
         if lost >= _WARN_FROM or (self._restarts > 0 and moving < _WARN_FROM):
-            restarts = f"; the background model started again {self._restarts} times" if self._restarts > 0 else ""
+            text = f"the background model started again {self._restarts} times" if self._restarts > 0 else ""
+            if lost:
+                share = f"the view of the camera was lost in {lost:.0%} of the pictures, {self._when('lost')}"
+                text = f"{share}; {text}" if text else share
+            else:
+                text = f"{text}, {self._when('restart')}"
             warn(
-                f"the view of the camera was lost in {lost:.0%} of the pictures, {self._when(True)}{restarts}: cuts, "
-                "changes of light, or a large object before the camera; detections there may be wrong",
+                f"{text}: cuts, changes of light, or a large object before the camera; detections there may be wrong",
                 "view-lost",
             )
 
-    def _when(self, is_lost: bool) -> str:
-        first, last = ((t_ns - (self._start_ns or 0)) / NS_PER_S for t_ns in self._span_ns.get(is_lost, (0, 0)))
+    def _when(self, what: str) -> str:
+        first, last = ((t_ns - (self._start_ns or 0)) / NS_PER_S for t_ns in self._span_ns[what])
         return f"from {first:.1f} s to {last:.1f} s"
 
 

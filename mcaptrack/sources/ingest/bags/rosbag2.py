@@ -63,10 +63,10 @@ def open_bag(folder: Path) -> RecordingReader:
     ours, results = {path.name for path in paths}, {log.results_path(path).name for path in paths}
     unnamed = [
         entry.name
-        for entry in visible(folder)
+        for entry in visible(folder.iterdir())
         if entry.suffix in (".db3", ".mcap") and entry.name not in ours | results
     ]
-    for name in sorted(unnamed):
+    for name in unnamed:
         warn(f"{folder / name} is not named in {METADATA}; it is left out", "left-out")
     for path in paths:
         if not follow_links(path).is_relative_to(follow_links(folder)):
@@ -405,7 +405,7 @@ def is_mcap(path: Path) -> bool:
 def _open_folder(path: Path) -> RecordingReader | None:
     if holds_metadata(path / METADATA):
         return open_bag(path)
-    names = sorted(entry.name for entry in visible(path))
+    names = [entry.name for entry in visible(path.iterdir())]
     if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in names):
         return None
     if parts := log.split_files_in(path):

@@ -156,7 +156,7 @@ def _results(path: Path, content: list[Any]) -> BoxTable:
 
 def _images_beside(path: Path, ids: set[str]) -> tuple[_Images | None, str]:
     """The images in annotations of the same folder, if these name all of ``ids``; and what is doubtful about that."""
-    files = [LabelFile(other) for other in sorted(visible(path.parent)) if other.suffix == ".json" and other != path]
+    files = [LabelFile(other) for other in visible(path.parent.iterdir()) if other.suffix == ".json" and other != path]
     files = [file for file in files if file.head[:1] == b"{" and any(key in file.head for key in _BEGIN)][:_MAX_BESIDE]
     every = list[_Images]()
     for file in files:

@@ -91,7 +91,7 @@ class LabelFile:
     @cached_property
     def entries(self) -> list[Path]:
         """The content of a folder, in natural order."""
-        return sorted(visible(self.path), key=natural_order) if self.is_folder else []
+        return sorted(visible(self.path.iterdir()), key=natural_order) if self.is_folder else []
 
     @cached_property
     def root(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +16,8 @@ from mcaptrack.sources.ingest.labels.text import MAX_NAME, is_count, lines_of
 LISTS: Final = ("labels.txt", "classes.txt", "obj.names", "_classes.txt")
 _YAML: Final = ("data.yaml", "data.yml", "dataset.yaml")
 _MAX_CLASSES: Final = 65536
+#: A line of a list that states its number: `2: person`, `2 person`, `2,person`.
+_NUMBERED: Final = re.compile(r"([0-9]{1,9})(?: ?[:=,] ?| )(\D.*)")
 
 
 def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
@@ -23,7 +26,7 @@ def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
     Names in a list count from ``first``, where it states no numbers. What can't be read is said.
     """
     for folder in dict.fromkeys(folders):
-        others = sorted(path for path in visible(folder) if path.suffix == ".names") if folder.is_dir() else []
+        others = visible(folder.glob("*.names")) if folder.is_dir() else []
         for path in (*(folder / name for name in (*LISTS, *_YAML)), *others[:1]):
             if not path.is_file() or path == table.path:
                 continue
@@ -40,6 +43,9 @@ def name_classes(table: BoxTable, folders: Iterable[Path], first: int) -> None:
 
 def _of_list(path: Path, first: int) -> dict[int, str]:
     lines = [" ".join(line.split())[:MAX_NAME] for _, line in lines_of(path)]
+    numbered = [match for match in map(_NUMBERED.fullmatch, lines) if match]
+    if len(numbered) == len(lines) == len({int(match[1]) for match in numbered}):
+        return {int(match[1]): match[2] for match in numbered}
     return dict(enumerate(lines[:_MAX_CLASSES], start=first))
 
 

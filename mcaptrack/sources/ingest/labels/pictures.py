@@ -61,7 +61,7 @@ def around(points: Sequence[Any]) -> list[float]:
 
 def files_in(folder: Path, suffix: str) -> list[Path]:
     """The files of a folder with this ending, in natural order. Raises McaptrackError if there are too many."""
-    files = sorted((path for path in visible(folder) if path.suffix.lower() == suffix), key=natural_order)
+    files = sorted((path for path in visible(folder.iterdir()) if path.suffix.lower() == suffix), key=natural_order)
     if len(files) > _MAX_PICTURES:
         raise McaptrackError(f"{folder} holds {len(files)} label files; at most {_MAX_PICTURES} are read")
     return files

@@ -34,7 +34,7 @@ def _label_files(folder: Path) -> list[Path]:
     """The label files of a folder, or of its subfolder "labels", in natural order; none if there are none."""
     for place in (folder, folder / "labels"):
         try:
-            files = [path for path in visible(place) if path.suffix.lower() == ".txt"]
+            files = [path for path in visible(place.iterdir()) if path.suffix.lower() == ".txt"]
         except OSError:
             continue
         files = [path for path in files if path.name.lower() not in _NOT_LABELS]
