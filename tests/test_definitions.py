@@ -47,7 +47,7 @@ SPELLINGS = {
 #: What asks for a type, with a type that it reads, and what it gives for a channel of it.
 def in_space(opened: log.Log) -> list:
     """The boxes in space of the messages of /t."""
-    read = decoded_messages(opened, "/t", lambda kind: boxes_decoder(kind, in_space=True))
+    read = decoded_messages(opened, "/t", lambda kind: boxes_decoder(kind, in_space=True), None)
     return [message.boxes for _, message in read]
 
 

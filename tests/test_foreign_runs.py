@@ -221,16 +221,16 @@ def test_recorded_detections_are_in_the_table_of_detections(tmp_path):
     )
 
 
-def test_unreadable_recorded_detections_leave_other_tables_complete(tmp_path):
+def test_an_unreadable_message_of_boxes_costs_itself(tmp_path):
     path = tmp_path / "a.mcap"
     boxes_log(path, "person", damaged=True)
     outcome = call("export", path, "-o", tmp_path / "t", "--json")
     data = json.loads(outcome.out)
     assert (outcome.code, data["results"][0]["rows"]["detections"], data["results"][0]["rows"]["frames"]) == (
         0,
-        0,
+        4,
         4,
     )
     (warning,) = data["warnings"]
-    assert (warning["code"], "not a vision_msgs" in warning["message"]) == ("left-out", True)
-    assert "no boxes of /lidar/boxes are in the table" in warning["message"]
+    assert (warning["code"], "not a vision_msgs" in warning["message"]) == ("lost", True)
+    assert "it counts as empty" in warning["message"]

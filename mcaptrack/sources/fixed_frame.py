@@ -632,7 +632,7 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     """
     reading = foreign.reading_of(opened, topic)
     if reading is None:
-        decoded_messages(opened, topic, unpacker)  # says why, if its messages can't be decoded
+        decoded_messages(opened, topic, unpacker, None)  # says why, if its messages can't be decoded
         name = opened.channel(topic).schema_name or "no schema"
         raise McaptrackError(f"{opened.path}: {topic} holds {name}, not detections; {', '.join(BOXES_READ)} are read")
     if reading.known is None and reading.fields is not None and not choice_for(opened, topic).fields:
@@ -643,7 +643,8 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
 
 def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> foreign.NamedFrames:
     """The boxes in space of a channel, as ``named_detections`` returns them."""
-    decoded = decoded_messages(opened, topic, lambda kind: decoder_with_errors(kind, reading.read))
+    nothing = Message3d(0, "", is_measured=False)
+    decoded = decoded_messages(opened, topic, lambda kind: decoder_with_errors(kind, reading.read), nothing)
     own = reading.class_name
 
     def classes(texts: Sequence[str]) -> ClassesRead:

@@ -19,8 +19,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.notices import warn
 from mcaptrack.schema.spill import SpillFile, Stored
+from mcaptrack.sources.foreign.flatten import UnreadMessages
 from mcaptrack.tables.build import Pointers, TablePieces, frames_table
 from mcaptrack.tables.fields import RECORDING
 
@@ -36,8 +36,6 @@ Flatten = Callable[[bytes], Mapping[Path, Any]]
 _PART_MESSAGES: Final = 4096
 #: Bytes of rows after which a piece of the table ends, so that a table of pictures is made in pieces, too.
 _PIECE_BYTES: Final = 32 * 2**20
-#: If more messages of a channel can't be read, and more than half, it is of another type.
-_MOST_UNREAD: Final = 100
 
 
 class MessageFields(NamedTuple):
@@ -46,34 +44,6 @@ class MessageFields(NamedTuple):
     types: Mapping[Path, Any]
     left_out: Sequence[Path]
     columns: Callable[[], Iterator[tuple[int, Columns]]]
-
-
-class _Unread:
-    """The messages of a channel that can't be read: their times, and why."""
-
-    def __init__(self, where: str) -> None:
-        self._where, self._total, self._why = where, 0, dict[int, str]()
-
-    def count(self, messages: int) -> None:
-        """Count messages that are read next."""
-        self._total += messages
-
-    def add(self, t_ns: int, why: str) -> None:
-        """Add a message. Raises McaptrackError if most are of another type."""
-        self._why[t_ns] = why
-        unread = len(self._why)
-        if unread == self._total or (unread > _MOST_UNREAD and 2 * unread > self._total):
-            raise McaptrackError(f"{self._where}{self}")
-
-    def warn(self) -> None:
-        """Warn of them, if there are any."""
-        if self._why:
-            warn(f"{self._where}{self}; they have no values", "lost")
-
-    def __str__(self) -> str:
-        first = min(self._why)
-        many = f"; {len(self._why)} of {self._total} messages are like this" if len(self._why) > 1 else ""
-        return f" at {first} ns: {self._why[first]}{many}"
 
 
 def messages_table(topic: str, schema_name: str, places: Pointers, fields: MessageFields) -> TablePieces:
@@ -116,11 +86,11 @@ def typed_fields(
         del types[path]  # its messages have no fields
 
     def columns() -> Iterator[tuple[int, Columns]]:
-        unread = _Unread(where)
+        unread = UnreadMessages(where)
         for batch in payloads():
             unread.count(len(batch.t_ns))
             yield len(batch.t_ns), _read(reader, batch, types, flatten, unread)
-        unread.warn()
+        unread.warn("they have no values")
 
     return MessageFields(types, list(reader.left_out), columns)
 
@@ -130,7 +100,7 @@ def _read(
     batch: Payloads,
     types: Mapping[Path, Any],
     flatten: Flatten,
-    unread: _Unread,
+    unread: UnreadMessages,
 ) -> Columns:
     """The columns of a batch, with nulls for messages that can't be read."""
     import pyarrow as pa
@@ -160,7 +130,7 @@ def _read(
     return {path: column.combine_chunks().take(take) for path, column in joined.items()}
 
 
-def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: _Unread) -> Iterator[Mapping[Path, Any]]:
+def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: UnreadMessages) -> Iterator[Mapping[Path, Any]]:
     """Some messages of a batch, decoded each for itself; nothing of those that can't be."""
     for t_ns, start, end in zip(
         *(values[rows].tolist() for values in (batch.t_ns, batch.start, batch.end)), strict=True
@@ -183,13 +153,13 @@ def inferred_fields(
     blobs: bool,
 ) -> MessageFields:
     """The fields of messages by their values."""
-    stored, unread = _Stored(wanted, blobs), _Unread(where)
+    stored, unread = _Stored(wanted, blobs), UnreadMessages(where)
     for batch in payloads():
         unread.count(len(batch.t_ns))
         for row in _flat(batch, np.arange(len(batch.t_ns)), flatten, unread):
             stored.add(row)
     stored.close()
-    unread.warn()
+    unread.warn("they have no values")
     types = stored.types()
     return MessageFields(types, list(stored.left_out), lambda: stored.columns(types))
 

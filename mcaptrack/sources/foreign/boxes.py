@@ -60,7 +60,7 @@ from mcaptrack.sources.foreign.fields import (
     shape_of_message,
     shape_of_type,
 )
-from mcaptrack.sources.foreign.flatten import message_reader, message_type_of
+from mcaptrack.sources.foreign.flatten import UnreadMessages, message_type_of
 from mcaptrack.sources.foreign.known_types import KNOWN, Known
 
 _KIND: Final = "message_reader"
@@ -486,7 +486,7 @@ def named_boxes(opened: log.Log, topic: str, reading: Reading) -> NamedFrames:
     convert = lambda message: (picture_stamp_of(message), reading.read(message))  # noqa: E731
     log_ns, stamps_ns, boxes, ends = list[int](), list[int | None](), list[Box](), [0]
     for message, (stamp_ns, of_message) in decoded_messages(
-        opened, topic, lambda kind: decoder_with_errors(kind, convert)
+        opened, topic, lambda kind: decoder_with_errors(kind, convert), (None, ())
     ):
         log_ns.append(message.t_ns)
         stamps_ns.append(stamp_ns)
@@ -632,11 +632,29 @@ def _times_of_pictures(
 
 
 def decoded_messages(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]], empty: Any
 ) -> Iterator[tuple[log.Message, Any]]:
     """The messages of a channel with what the function that ``make`` makes for their type gives.
 
-    Raises McaptrackError, with topic and time.
+    Messages that can't be read count as ``empty``, with a warning. Raises McaptrackError, with topic and time, if most
+    can't.
     """
-    read = message_reader(opened, topic, make)
-    return ((message, read(message)) for message in opened.timed(topic))
+    where = f"{opened.path}: {topic}"
+    try:
+        decode = make(message_type_of(opened, topic))
+    except McaptrackError as error:
+        raise McaptrackError(f"{where}: {error}") from None
+    return _read_messages(opened, topic, decode, UnreadMessages(where, opened.channel(topic).messages), empty)
+
+
+def _read_messages(
+    opened: log.Log, topic: str, decode: Callable[[bytes], Any], unread: UnreadMessages, empty: Any
+) -> Iterator[tuple[log.Message, Any]]:
+    for message in opened.timed(topic):
+        try:
+            decoded = decode(message.payload)
+        except McaptrackError as error:
+            unread.add(message.t_ns, str(error))
+            decoded = empty
+        yield message, decoded
+    unread.warn("it counts as empty")

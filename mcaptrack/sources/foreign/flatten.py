@@ -34,6 +34,8 @@ Path = tuple[str, ...]
 
 _MAX_DEPTH: Final = 32
 _LIMIT_NS: Final = 2**63
+#: If more messages of a channel can't be read, and more than half, it is of another type.
+_MOST_UNREAD: Final = 100
 #: The field names of times in ROS 1, ROS 2, JSON of bridges, and protobuf.
 _TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
 
@@ -69,6 +71,34 @@ def frame_of(opened: log.Log, topic: str) -> str:
         return next((str(decode(message.payload)) for message in opened.messages(topic)), "")
     except McaptrackError:
         return ""
+
+
+class UnreadMessages:
+    """The messages of a channel that can't be read: their times, and why."""
+
+    def __init__(self, where: str, total: int = 0) -> None:
+        self._where, self._total, self._why = where, total, dict[int, str]()
+
+    def count(self, messages: int) -> None:
+        """Count messages that are read next."""
+        self._total += messages
+
+    def add(self, t_ns: int, why: str) -> None:
+        """Add a message. Raises McaptrackError if most are of another type."""
+        self._why[t_ns] = why
+        unread = len(self._why)
+        if unread == self._total or (unread > _MOST_UNREAD and 2 * unread > self._total):
+            raise McaptrackError(f"{self._where}{self}")
+
+    def warn(self, so: str) -> None:
+        """Warn of them, if there are any, and ``so`` of what follows."""
+        if self._why:
+            warn(f"{self._where}{self}; {so}", "lost")
+
+    def __str__(self) -> str:
+        first = min(self._why)
+        many = f"; {len(self._why)} of {self._total} messages are like this" if len(self._why) > 1 else ""
+        return f" at {first} ns: {self._why[first]}{many}"
 
 
 def message_reader(
