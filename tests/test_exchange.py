@@ -228,7 +228,7 @@ class TestCvat:
         [
             (BOMB, ":1: a document type, which CVAT doesn't write"),
             (OUTER, ":1: a document type"),
-            ("<annotation><object/></annotation>", ":1: XML that begins with <annotation>"),
+            ("<labels><object/></labels>", ":1: XML that begins with <labels>"),
             ("<annotations>\n<track>", ":2: not valid XML: no element found"),
             ("<annotations></annotations>", " holds no boxes"),
             ('<annotations><image id="0"><points label="a" points="1,2"/></image></annotations>', "only 1 of <points>"),
@@ -279,7 +279,7 @@ class TestCvat:
 
 
 def test_coco_of_polygons_and_of_numbers_with_a_point(tmp_path):
-    """The box around polygons, where there is no bbox; a mask alone is refused; 1.0 is 1, as pandas writes it."""
+    """The box around polygons, where there is no bbox; a mask that can't be read is refused; 1.0 is 1, as pandas writes it."""
     images = [{"id": 1, "file_name": "0.jpg"}, {"id": 2, "file_name": "1.jpg"}]
     shape = {"image_id": 2.0, "category_id": 1.0, "segmentation": [[5, 7, 9, 7, 9, 20], [4, 8, 5, 8, 5, 9]]}
     content = {"images": images, "annotations": [shape], "categories": [{"id": 1, "name": "person"}]}
@@ -287,7 +287,7 @@ def test_coco_of_polygons_and_of_numbers_with_a_point(tmp_path):
     assert (labels.frame.tolist(), labels.boxes_px.tolist()) == ([1], [[4, 7, 5, 13]])
     assert any("1 boxes are those around polygons" in words for words in labels.remarks)
     shape["segmentation"] = {"counts": "abc", "size": [80, 100]}
-    with pytest.raises(McaptrackError, match=r"annotation 0 has a mask \(RLE\) and no bbox"):
+    with pytest.raises(McaptrackError, match="annotation 0 has no bbox, and a mask that can't be read"):
         read(tmp_path, json.dumps(content), "a.json")
 
 

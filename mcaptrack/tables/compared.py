@@ -108,7 +108,9 @@ def compare_files(
     Classes are those of ``options``, by default people, and of 3D boxes all. Tables have no classes, and are compared
     as a whole. Raises McaptrackError if the files can't be read or compared.
     """
-    have_3d = [is_3d(path, options.label_format, options.columns) for path in (tracks, ground_truth)]
+    have_3d = [
+        not _is_exported(path) and is_3d(path, options.label_format, options.columns) for path in (tracks, ground_truth)
+    ]
     if all(have_3d):
         return _boxes_3d(tracks, ground_truth, options)
     if any(have_3d):
@@ -201,7 +203,7 @@ class _PairJob(LabelJob):
 
 
 def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions) -> BoxTable:
-    if path.suffix.lower() in (".parquet", ".pq"):
+    if _is_exported(path):
         return _read_parquet(path, role, topics)
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks(path)
@@ -214,6 +216,14 @@ def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions)
     if not labels.has_ids:
         raise McaptrackError(f"{path} has no ids (all are -1); {role} need ids")
     return labels
+
+
+def _is_exported(path: Path) -> bool:
+    """Whether a file is a table of ``mcaptrack export``, and not of other software."""
+    if path.suffix.lower() not in (".parquet", ".pq") or not path.is_file():
+        return False
+    metadata = tables.file_metadata(path, "parquet")
+    return metadata is None or "table_version" in metadata  # what can't be read is refused as such a table
 
 
 def _is_blank(path: Path) -> bool:

@@ -22,7 +22,8 @@ def box_of_mask(mask: Mapping[str, Any]) -> list[float]:
     (height, width), counts = (int(side) for side in mask["size"]), mask["counts"]
     lengths = np.asarray(_unpacked(counts) if isinstance(counts, str) else counts, np.int64).reshape(-1)
     ends = np.cumsum(lengths)
-    if not 0 < height * width <= _MAX_PIXELS or (lengths < 0).any() or ends[-1:] > height * width:
+    is_possible = 0 < height * width <= _MAX_PIXELS and len(ends) and not (lengths < 0).any()
+    if not is_possible or ends[-1] > height * width:
         raise ValueError("the runs of a mask don't fit its size")
     first, last = ends[:-1:2], ends[1::2] - 1  # runs alternate, and the first is of what isn't the object
     first, last = (places[: len(last)][last >= first[: len(last)]] for places in (first, last))
