@@ -309,13 +309,14 @@ def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:
 
 def _overwritten(packages: Collection[str]) -> Iterator[str]:
     """Yield a fault for each module of these packages that another installed package brings, too, in the same files."""
-    try:
-        owners = metadata.packages_distributions()
-    except Exception:  # metadata of another package that can't be read
-        return
+    owners: dict[str, set[str]] = {}
+    for package in metadata.distributions():
+        with suppress(Exception):  # metadata of another package that can't be read
+            for path in package.files or ():
+                if len(path.parts) == 2 and path.name == "__init__.py":
+                    owners.setdefault(path.parts[0], set()).add(package.name)
     for module, names in owners.items():
-        file = f"{module}/__init__.py"
-        several = sorted({name for name in names if any(str(path) == file for path in metadata.files(name) or ())})
+        several = sorted(names)
         needed = [name for name in several if name in packages]
         if len(several) > 1 and needed:
             those = " and ".join(f"{name} {_version_of(name)}" for name in several)
