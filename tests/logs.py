@@ -168,5 +168,6 @@ def flat_table(rows: Sequence[Mapping[str, object]], blobs: bool) -> tuple[Table
     def flatten(payload: bytes) -> dict[tuple[str, ...], object]:
         return {(name,): value for name, value in rows[int.from_bytes(payload, "little")].items()}
 
-    fields = messages.inferred_fields("a.mcap: /a", lambda: iter([data]), flatten, lambda _: True, blobs)
+    source = messages.MessageSource("a.mcap: /a", len(rows), lambda: iter([data]), flatten)
+    fields = messages.inferred_fields(source, lambda _: True, blobs)
     return messages.messages_table("/a", "A", places, fields), [name for (name,) in fields.left_out]

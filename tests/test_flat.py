@@ -11,11 +11,13 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from grpc_tools import protoc
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import collected
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.flatten import flattener
 
@@ -215,6 +217,31 @@ def test_fields_of_json_become_columns_with_names_of_their_own(tmp_path):
     assert got["deep_l"] == [None, [1.0, 2.5], None]
     assert got["mixed"] == [None, None, '[1,{"a":1}]']
     assert got["half"] == ["?x", None, None]
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "json"])
+def test_an_unreadable_message_costs_itself_wherever_it_is(tmp_path, monkeypatch, encoding):
+    """Also as the first of a recording, alone in its batch; but a channel without any other is refused."""
+    monkeypatch.setattr(log.messages, "_BATCH_BYTES", 1)
+    good = b"\0\1\0\0" + np.float64(2.5).tobytes() if encoding == "cdr" else b'{"data": 2.5}'
+    schema = ("std_msgs/msg/Float64", "ros2msg", b"float64 data") if encoding == "cdr" else ("", "", b"")
+    for payloads in ([b"\0", good, good], [good, good, b"\0"], [b"\0"] * 3):
+        path = tmp_path / "a.mcap"
+        with path.open("wb") as stream:
+            writer = Writer(stream, chunk_size=1)  # a chunk for each message
+            writer.start()
+            channel = writer.register_channel("/x", encoding, writer.register_schema(*schema))
+            for payload in payloads:
+                writer.add_message(channel, 7, payload, 7)  # all at one time
+            writer.finish()
+        with mcaptrack.open(path) as opened, collected() as warnings:
+            if good not in payloads:
+                with pytest.raises(McaptrackError, match=r"/x at 7 ns: .*; 3 of 3 messages are like this"):
+                    opened.table("/x")
+                continue
+            values = opened.table("/x").column("data").to_pylist()
+        assert values == [None if payload != good else 2.5 for payload in payloads]
+        assert [warning.code for warning in warnings] == ["lost"]
 
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4)

@@ -46,6 +46,17 @@ class MessageFields(NamedTuple):
     columns: Callable[[], Iterator[tuple[int, Columns]]]
 
 
+class MessageSource(NamedTuple):
+    """The messages of a channel, or of a part of it: their place for errors, their number, their bytes in batches, and
+    the function that decodes a single one.
+    """
+
+    where: str
+    total: int
+    payloads: Callable[[], Iterator[Payloads]]
+    flatten: Flatten
+
+
 def messages_table(topic: str, schema_name: str, places: Pointers, fields: MessageFields) -> TablePieces:
     """A channel as a table: time and place of each message, then its fields."""
     import pyarrow as pa
@@ -73,10 +84,8 @@ def messages_table(topic: str, schema_name: str, places: Pointers, fields: Messa
 # Messages with a definition
 
 
-def typed_fields(
-    where: str, reader: RosColumns | ProtobufColumns, payloads: Callable[[], Iterator[Payloads]], flatten: Flatten
-) -> MessageFields:
-    """The fields of messages that are read as columns, or, where ``reader`` can't, each by ``flatten``."""
+def typed_fields(source: MessageSource, reader: RosColumns | ProtobufColumns) -> MessageFields:
+    """The fields of messages that are read as columns, or, where ``reader`` can't, each for itself."""
     nothing = np.empty(0, np.int64)
     types = {path: column.type for path, column in reader.read(np.empty(0, np.uint8), nothing, nothing).items()}
     for path in list(types):
@@ -86,10 +95,10 @@ def typed_fields(
         del types[path]  # its messages have no fields
 
     def columns() -> Iterator[tuple[int, Columns]]:
-        unread = UnreadMessages(where)
-        for batch in payloads():
+        unread = UnreadMessages(source.where, source.total)
+        for batch in source.payloads():
             unread.count(len(batch.t_ns))
-            yield len(batch.t_ns), _read(reader, batch, types, flatten, unread)
+            yield len(batch.t_ns), _read(reader, batch, types, source.flatten, unread)
         unread.warn("they have no values")
 
     return MessageFields(types, list(reader.left_out), columns)
@@ -145,18 +154,12 @@ def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: UnreadMessages)
 # Messages without one
 
 
-def inferred_fields(
-    where: str,
-    payloads: Callable[[], Iterator[Payloads]],
-    flatten: Flatten,
-    wanted: Callable[[Path], bool],
-    blobs: bool,
-) -> MessageFields:
+def inferred_fields(source: MessageSource, wanted: Callable[[Path], bool], blobs: bool) -> MessageFields:
     """The fields of messages by their values."""
-    stored, unread = _Stored(wanted, blobs), UnreadMessages(where)
-    for batch in payloads():
+    stored, unread = _Stored(wanted, blobs), UnreadMessages(source.where, source.total)
+    for batch in source.payloads():
         unread.count(len(batch.t_ns))
-        for row in _flat(batch, np.arange(len(batch.t_ns)), flatten, unread):
+        for row in _flat(batch, np.arange(len(batch.t_ns)), source.flatten, unread):
             stored.add(row)
     stored.close()
     unread.warn("they have no values")

@@ -651,6 +651,7 @@ def _read_messages(
     opened: log.Log, topic: str, decode: Callable[[bytes], Any], unread: UnreadMessages, empty: Any
 ) -> Iterator[tuple[log.Message, Any]]:
     for message in opened.timed(topic):
+        unread.count(1)
         try:
             decoded = decode(message.payload)
         except McaptrackError as error:

@@ -74,31 +74,32 @@ def frame_of(opened: log.Log, topic: str) -> str:
 
 
 class UnreadMessages:
-    """The messages of a channel that can't be read: their times, and why."""
+    """The messages of ``total`` that can't be read: their number, and the time of the first, and why."""
 
-    def __init__(self, where: str, total: int = 0) -> None:
-        self._where, self._total, self._why = where, total, dict[int, str]()
+    def __init__(self, where: str, total: int) -> None:
+        self._where, self._total = where, total
+        self._seen = self._unread = 0
+        self._first = (0, "")
 
     def count(self, messages: int) -> None:
         """Count messages that are read next."""
-        self._total += messages
+        self._seen += messages
 
     def add(self, t_ns: int, why: str) -> None:
         """Add a message. Raises McaptrackError if most are of another type."""
-        self._why[t_ns] = why
-        unread = len(self._why)
-        if unread == self._total or (unread > _MOST_UNREAD and 2 * unread > self._total):
+        self._first = min(self._first, (t_ns, why)) if self._unread else (t_ns, why)
+        self._unread += 1
+        if self._unread == self._total or (self._unread > _MOST_UNREAD and 2 * self._unread > self._seen):
             raise McaptrackError(f"{self._where}{self}")
 
     def warn(self, so: str) -> None:
         """Warn of them, if there are any, and ``so`` of what follows."""
-        if self._why:
+        if self._unread:
             warn(f"{self._where}{self}; {so}", "lost")
 
     def __str__(self) -> str:
-        first = min(self._why)
-        many = f"; {len(self._why)} of {self._total} messages are like this" if len(self._why) > 1 else ""
-        return f" at {first} ns: {self._why[first]}{many}"
+        many = f"; {self._unread} of {self._seen} messages are like this" if self._unread > 1 else ""
+        return f" at {self._first[0]} ns: {self._first[1]}{many}"
 
 
 def message_reader(

@@ -8,7 +8,7 @@ import os
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.location import Location, shortened
-from mcaptrack.log.messages import MessageLocations, Payloads
+from mcaptrack.log.messages import MessageLocations
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
@@ -310,27 +310,28 @@ class LogTables:
             return self._rows(schema, [topic]), []
         from mcaptrack.columns import Unsupported
 
-        kind, where = message_type_of(self.opened, topic), f"{self.opened.path}: {topic}"
-
-        def payloads() -> Iterator[Payloads]:
-            return self.opened.payloads(topic, part.start_ns, part.end_ns)
-
+        kind, where, span = (
+            message_type_of(self.opened, topic),
+            f"{self.opened.path}: {topic}",
+            (part.start_ns, part.end_ns),
+        )
         try:
             flatten = flattener(kind)
         except McaptrackError as error:
             raise McaptrackError(f"{where}: {error}") from None
+        places = self._pointers(topic, of_rows=False, span=span)
+        source = tables.MessageSource(where, len(places.t_ns), partial(self.opened.payloads, topic, *span), flatten)
 
         def fields_of(wanted: MessagesPart) -> tables.MessageFields:
             try:
-                return tables.typed_fields(where, column_reader(kind, wanted.wants, wanted.blobs), payloads, flatten)
+                return tables.typed_fields(source, column_reader(kind, wanted.wants, wanted.blobs))
             except Unsupported:
-                return tables.inferred_fields(where, payloads, flatten, wanted.wants, wanted.blobs)
+                return tables.inferred_fields(source, wanted.wants, wanted.blobs)
 
         fields = fields_of(part)
         if column := part.unknown([*fields.types, *fields.left_out]):
             all_fields = list_names([".".join(path) for path in fields_of(WHOLE).types], _FIELDS_LISTED)
             raise McaptrackError(f"{where} has no field {column}; it has {all_fields}")
-        places = self._pointers(topic, of_rows=False, span=(part.start_ns, part.end_ns))
         return tables.messages_table(topic, kind.name, places, fields), [".".join(path) for path in fields.left_out]
 
     # Parts of tables
