@@ -724,3 +724,12 @@ def test_two_files_of_one_role_are_refused(tmp_path):
     with pytest.raises(McaptrackError) as refused:
         ingested(path, tmp_path / "log.mcap", labels={"truth": other})
     assert str(refused.value) == f"{other} and {path} are both truth; give the role of {other} with `role=`"
+
+
+@pytest.mark.parametrize("ids", [("1.5", "2.5"), ("-5", "-6"), ("a", "7"), ("7", "8.0"), ("7", "8")])
+def test_ids_stay_as_they_are_or_it_is_said(tmp_path, ids):
+    path = tmp_path / "a.csv"
+    path.write_text("t,id,x_m,y_m,z_m\n" + "".join(f"{at},{who},1,2,0\n" for at in range(3) for who in ids))
+    labels = read_labels(path)
+    is_said = any("tracks are numbered from 1 on as they come" in remark for remark in labels.remarks)
+    assert is_said == ([str(number) for number in labels.id.tolist()] != [who.removesuffix(".0") for who in ids] * 3)

@@ -31,6 +31,7 @@ from mcaptrack.sources.ingest.labels.text import (
     FrameNames,
     Lines,
     TrackIds,
+    are_numbers,
     headings,
     lines_of,
     numbered,
@@ -704,8 +705,9 @@ def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
     track_id = np.full(len(cells.none), NO_ID)
     if "id" in places:
         is_known = np.array([not is_empty(text) and text not in _NO_IDS for text in ids], bool)
-        track_id[is_known] = numbered([ids[row] for row in np.flatnonzero(is_known)])
-        if not all(states_number(text) for text, known in zip(ids, is_known, strict=True) if known):
+        known_ids = [ids[row] for row in np.flatnonzero(is_known)]
+        track_id[is_known] = numbered(known_ids)
+        if not are_numbers(known_ids):
             remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
     facts = LabelFacts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
     facts.names = (cells.names if "name" in places else cells.classes).names

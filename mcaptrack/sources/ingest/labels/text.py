@@ -9,7 +9,7 @@ import math
 import re
 from array import array
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from io import TextIOWrapper
 from pathlib import Path, PurePath
 from typing import Any, Final, NamedTuple
@@ -208,11 +208,15 @@ class TrackIds:
         return ids, [f"{path}: {said}{', ...' if len(self._texts) > len(shown) else ''}"]
 
 
+def are_numbers(texts: Iterable[str]) -> bool:
+    """Whether all track ids are whole numbers, so that they stay as they are."""
+    return all(is_count(text.removesuffix(".0"), 16) for text in texts)
+
+
 def numbered(texts: list[str]) -> Ints:
     """Track ids (N,): the texts as numbers if all are, otherwise numbered from 1 on as they come."""
-    whole = [text.removesuffix(".0") for text in texts]
-    if all(is_count(text, 16) for text in whole):
-        return np.array([int(text) for text in whole], np.int64)
+    if are_numbers(texts):
+        return np.array([int(text.removesuffix(".0")) for text in texts], np.int64)
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(text, len(numbers) + 1) for text in texts], np.int64)
 
