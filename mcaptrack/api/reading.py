@@ -30,10 +30,10 @@ from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
-from mcaptrack.sources.cameras import cameras
+from mcaptrack.sources.cameras import VIDEO
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.own_rows import nanoseconds_of, times_of
-from mcaptrack.sources.pictures import Pictures, find_pictures
+from mcaptrack.sources.pictures import Pictures, find_pictures, only_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
 
@@ -313,7 +313,7 @@ class LogReader:
 
         """
         with self._now() as opened:
-            topic = _only_pictures(opened) if topic is None else topic
+            topic = (only_pictures(opened) or VIDEO) if topic is None else topic
             if (of_rows := _topic_of_rows(opened, topic)) is not None:
                 if times is not None:
                     text = f"`times=` chooses pictures, and {of_rows[0]} holds rows; choose rows by their t_ns"
@@ -549,12 +549,6 @@ def _topics(opened: Log, names: Any) -> set[str]:
             raise McaptrackError(f"`topics=` is a topic, or several, not {name!r:.40}")
         chosen.add(opened.channel(opened.find(name)).topic)
     return chosen
-
-
-def _only_pictures(opened: Log) -> str:
-    """Return the pictures of the only camera, or "video", of which there may be none or several."""
-    pictures = {camera.pictures for camera in cameras(opened) if camera.pictures}
-    return pictures.pop() if len(pictures) == 1 else "video"
 
 
 def _topic_of_rows(opened: Log, topic: str) -> tuple[str, Schema] | None:

@@ -8,10 +8,12 @@ from __future__ import annotations
 import re
 from bisect import bisect_left, insort
 from collections import deque
+from datetime import UTC, datetime
 from fractions import Fraction
 from typing import Final
 
 NS_PER_S: Final = 1_000_000_000
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 #: A longer time without frames is a jump of the clock, or a pause: nothing goes on after it, and its length has no
 #: effect. By default stages bridge at most 24 s (links by appearance); 60 s leaves room for options. An option that
 #: bridges more moves the limit.
@@ -55,6 +57,12 @@ def parse_ns(text: str) -> int | None:
     if not _WHOLE.fullmatch(text) or abs(int(text)) > LAST_NS:
         return None
     return int(text)
+
+
+def utc_ns(moment: str, fraction: str) -> int:
+    """The nanoseconds from 1970 to a moment of ISO 8601 in whole seconds, with its zone, and digits after the point."""
+    since = datetime.fromisoformat(moment) - _EPOCH
+    return (since.days * 86_400 + since.seconds) * NS_PER_S + int(fraction.ljust(9, "0"))
 
 
 def seconds_to_ns(seconds: float) -> int:

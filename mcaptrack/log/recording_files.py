@@ -12,7 +12,8 @@ from mcaptrack.location import P, sibling
 
 _BEGIN: Final = {b"#ROSBAG V": "a ROS 1 bag", b"SQLite format 3\0": "a database, as rosbag2 writes them"}
 _MATROSKA: Final = b"\x1a\x45\xdf\xa3"  # and WebM
-_ZSTD: Final = b"\x28\xb5\x2f\xfd"
+#: The first bytes of what zstd has compressed.
+ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _PARTS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd", ".bag")
 _SPLIT: Final = re.compile(r"(.+?)_(\d{1,9})(\.(?:mcap|db3)(?:\.zstd)?)")
 
@@ -69,7 +70,7 @@ def split_files_in(folder: Path) -> list[Path]:
 def _file(path: Path) -> str:
     with path.open("rb") as stream:
         head = stream.read(16)
-    if head.startswith(_ZSTD) and path.name.endswith(_PARTS):
+    if head.startswith(ZSTD) and path.name.endswith(_PARTS):
         return "a compressed file of rosbag2"
     if head[4:8] == b"ftyp" or head.startswith(_MATROSKA) or (head[:4], head[8:12]) == (b"RIFF", b"AVI "):
         return "a video"

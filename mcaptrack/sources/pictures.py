@@ -21,7 +21,7 @@ from mcaptrack.log.journal import recover_command
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import VIDEO
+from mcaptrack.sources.cameras import VIDEO, cameras
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray, read_head
 
 #: The backward search for a key picture: messages in the second step, the factor for each further step, and the maximum
@@ -69,13 +69,20 @@ def find_pictures(opened: log.Log, topic: str) -> str:
     topics = [channel.topic for channel in opened.channels.values() if foreign.holds_pictures(channel)]
     name = opened.find(topic, among=topics)
     if name not in topics and topic == VIDEO:  # the name of ingested pictures stands for those of the only camera
-        forms = [form for form in topics if not foreign.better_form(opened, form)]
-        seen = [form for form in forms if not foreign.depth_of(opened, form)] or forms
-        name = seen[0] if len(seen) == 1 else name
+        name = only_pictures(opened)
     if name not in topics:
         has = f"pictures in {', '.join(sorted(topics))}" if topics else "no pictures"
         raise McaptrackError(f"{opened.path} has no channel {topic} with pictures; it has {has}")
     return name
+
+
+def only_pictures(opened: log.Log) -> str:
+    """Return the pictures of the only camera, but for depths and worse forms of others; "" of none or several."""
+    topics = {camera.pictures for camera in cameras(opened) if camera.pictures}
+    if len(topics) > 1:
+        forms = [topic for topic in topics if not foreign.better_form(opened, topic)]
+        topics = {topic for topic in forms if not foreign.depth_of(opened, topic)} or {*forms}
+    return topics.pop() if len(topics) == 1 else ""
 
 
 class Pictures:

@@ -88,11 +88,7 @@ def typed_fields(source: MessageSource, reader: RosColumns | ProtobufColumns) ->
     """The fields of messages that are read as columns, or, where ``reader`` can't, each for itself."""
     nothing = np.empty(0, np.int64)
     types = {path: column.type for path, column in reader.read(np.empty(0, np.uint8), nothing, nothing).items()}
-    for path in list(types):
-        with suppress(ValueError):
-            _settled(types[path])
-            continue
-        del types[path]  # its messages have no fields
+    types = {path: kind for path, kind in types.items() if _has_fields(kind)}
 
     def columns() -> Iterator[tuple[int, Columns]]:
         unread = UnreadMessages(source.where, source.total)
@@ -211,7 +207,7 @@ class _Stored:
 
         out = {path: _common(list(kinds)) for path, kinds in self._types.items() if path not in self.left_out}
         several = {path for path in out if len(self._types[path]) > 1}
-        for _, columns in self._read(several):  # a number may be too large for the common type
+        for _, columns in self._read(several) if several else ():  # a number may be too large for the common type
             for path, column in columns.items():
                 try:
                     column.cast(out[path] or column.type)
@@ -276,17 +272,23 @@ def _common(kinds: Sequence[Any]) -> Any:
     if any(pa.types.is_unsigned_integer(kind) for kind in whole) and all(map(pa.types.is_integer, whole)):
         return pa.uint64()
     try:
-        schemas = [pa.schema([("", kind)]) for kind in kinds]
-        kind = _settled(pa.unify_schemas(schemas, promote_options="permissive").field(0).type)
-    except (pa.ArrowException, ValueError):
+        kind = pa.unify_schemas([pa.schema([("", kind)]) for kind in kinds], promote_options="permissive").field(0).type
+    except pa.ArrowException:
         return None
-    return None if pa.types.is_large_string(kind) else kind
+    return None if pa.types.is_large_string(kind) or not _has_fields(kind) else _settled(kind)
+
+
+def _has_fields(kind: Any) -> bool:
+    """Whether all messages of a type have fields; files can't hold others."""
+    import pyarrow as pa
+
+    if pa.types.is_list(kind):
+        return _has_fields(kind.value_type)
+    return not pa.types.is_struct(kind) or bool(kind.num_fields and all(_has_fields(field.type) for field in kind))
 
 
 def _settled(kind: Any) -> Any:
-    """A type as files and queries take it: times in UTC, and numbers where no value says what. Raises ValueError for
-    messages without fields, which files can't hold.
-    """
+    """A type as files and queries take it: times in UTC, and numbers where no value says what."""
     import pyarrow as pa
 
     if pa.types.is_null(kind):
@@ -296,8 +298,6 @@ def _settled(kind: Any) -> Any:
     if pa.types.is_list(kind):
         return pa.list_(_settled(kind.value_type))
     if pa.types.is_struct(kind):
-        if not kind.num_fields:
-            raise ValueError("messages without fields")
         return pa.struct([(field.name, _settled(field.type)) for field in kind])
     return kind
 

@@ -60,7 +60,7 @@ from mcaptrack.sources.foreign.fields import (
     shape_of_message,
     shape_of_type,
 )
-from mcaptrack.sources.foreign.flatten import UnreadMessages, message_type_of
+from mcaptrack.sources.foreign.flatten import UnreadMessages, message_type_of, payload_decoder
 from mcaptrack.sources.foreign.known_types import KNOWN, Known
 
 _KIND: Final = "message_reader"
@@ -639,17 +639,14 @@ def decoded_messages(
     Messages that can't be read count as ``empty``, with a warning. Raises McaptrackError, with topic and time, if most
     can't.
     """
-    where = f"{opened.path}: {topic}"
-    try:
-        decode = make(message_type_of(opened, topic))
-    except McaptrackError as error:
-        raise McaptrackError(f"{where}: {error}") from None
-    return _read_messages(opened, topic, decode, UnreadMessages(where, opened.channel(topic).messages), empty)
+    decode = payload_decoder(opened, topic, make)
+    return _read_messages(opened, topic, decode, empty)
 
 
 def _read_messages(
-    opened: log.Log, topic: str, decode: Callable[[bytes], Any], unread: UnreadMessages, empty: Any
+    opened: log.Log, topic: str, decode: Callable[[bytes], Any], empty: Any
 ) -> Iterator[tuple[log.Message, Any]]:
+    unread = UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
     for message in opened.timed(topic):
         unread.count(1)
         try:

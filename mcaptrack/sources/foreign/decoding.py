@@ -10,7 +10,6 @@ import base64
 import json
 import re
 from collections.abc import Callable
-from datetime import UTC, datetime
 from graphlib import TopologicalSorter
 from math import nan
 from types import SimpleNamespace
@@ -21,7 +20,7 @@ from mcap.well_known import MessageEncoding
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import NS_PER_S, utc_ns
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources.foreign.definitions import MessageType, ros_types, unpacked
 
@@ -128,7 +127,6 @@ def _ros_unpacker(kind: MessageType) -> Unpack:
 
 
 _RFC3339: Final = re.compile(r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?(Z|z|[+-]\d\d:\d\d)", re.ASCII)
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _LIMIT_NS: Final = 2**63
 
 
@@ -140,8 +138,7 @@ def stamp_of(message: Any) -> int:
         if not match:
             raise ValueError(f"{stamp[:40]!r} is no time")
         day, clock, fraction, zone = match.groups()
-        passed = datetime.fromisoformat(f"{day}T{clock}{zone.upper()}") - _EPOCH
-        t_ns = (passed.days * 86400 + passed.seconds) * NS_PER_S + int((fraction or "").ljust(9, "0"))
+        t_ns = utc_ns(f"{day}T{clock}{zone.upper()}", fraction or "")
     else:
         t_ns = _time_field(stamp, "sec", "secs", "seconds") * NS_PER_S + _time_field(
             stamp, "nsec", "nsecs", "nanosec", "nanos"

@@ -24,6 +24,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import read_beginning
+from mcaptrack.log.recording_files import ZSTD
 from mcaptrack.notices import warn
 from mcaptrack.schema import SCHEMAS
 from mcaptrack.schema.encodings import CDR, ros_definition, schema_of_ros
@@ -480,13 +481,12 @@ def _layout(types: Types, name: str) -> tuple[Any, ...]:
 # Messages that are compressed one by one.
 
 
-_ZSTD: Final = b"\x28\xb5\x2f\xfd"
 _MAX_MESSAGE_BYTES: Final = 2**28
 
 
 def is_packed(payload: bytes) -> bool:
     """Whether a CDR message is compressed, as rosbag2 does with all of a bag; others begin with a zero byte."""
-    return payload.startswith(_ZSTD)
+    return payload.startswith(ZSTD)
 
 
 def unpacked(payload: bytes) -> bytes:

@@ -102,14 +102,21 @@ class UnreadMessages:
         return f" at {self._first[0]} ns: {self._first[1]}{many}"
 
 
+def payload_decoder(
+    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
+) -> Callable[[bytes], Any]:
+    """What ``make`` makes for the type of a channel. Raises McaptrackError, with the topic, if that isn't read."""
+    try:
+        return make(message_type_of(opened, topic))
+    except McaptrackError as error:
+        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
+
+
 def message_reader(
     opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
 ) -> Callable[[log.Message], Any]:
     """A function that decodes messages of a channel by what ``make`` makes for their type; errors name the place."""
-    try:
-        decode = make(message_type_of(opened, topic))
-    except McaptrackError as error:
-        raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
+    decode = payload_decoder(opened, topic, make)
 
     def read(message: log.Message) -> Any:
         try:

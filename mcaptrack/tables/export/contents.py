@@ -28,7 +28,7 @@ from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes_3d
-from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of
+from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of, payload_decoder
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
 
 #: Tables about the places of messages, or about the whole log.
@@ -315,10 +315,7 @@ class LogTables:
             f"{self.opened.path}: {topic}",
             (part.start_ns, part.end_ns),
         )
-        try:
-            flatten = flattener(kind)
-        except McaptrackError as error:
-            raise McaptrackError(f"{where}: {error}") from None
+        flatten = payload_decoder(self.opened, topic, flattener)
         places = self._pointers(topic, of_rows=False, span=span)
         source = tables.MessageSource(where, len(places.t_ns), partial(self.opened.payloads, topic, *span), flatten)
 

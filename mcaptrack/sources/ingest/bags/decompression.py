@@ -13,12 +13,13 @@ from typing import IO, Any, Final
 from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
+from mcaptrack.log.recording_files import ZSTD
 
 ENVIRONMENT: Final = "MCAPTRACK_MAX_UNPACKED_MIB"
 #: The limit is this ratio, but at least this many MiB, unless the environment variable sets another one.
 _RATIO, _MIN_MIB = 64, 64
-#: The first bytes of packed files.
-_GZIP, _ZSTD = b"\x1f\x8b", b"\x28\xb5\x2f\xfd"
+#: The first bytes of what gzip has compressed.
+_GZIP: Final = b"\x1f\x8b"
 #: Small enough that Python handles signals between two pieces.
 _PIECE_BYTES: Final = 2**20
 #: One byte of zstd can expand to 32 KiB: without a declared size the input is fed in small pieces.
@@ -68,10 +69,10 @@ def opened(path: Path) -> IO[bytes]:
         stream = path.open("rb")
         magic = stream.read(4)
         stream.seek(0)
-        if not magic.startswith(_GZIP) and magic != _ZSTD:
+        if not magic.startswith(_GZIP) and magic != ZSTD:
             return stream
         with stream:
-            return BytesIO(_unpacked(stream.read(), magic == _ZSTD))
+            return BytesIO(_unpacked(stream.read(), magic == ZSTD))
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
     except NotUnpackedError as error:

@@ -18,6 +18,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import follow_links, read_beginning, refuse_special, temporary_folder, visible
+from mcaptrack.log.recording_files import ZSTD
 from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.foreign.definitions import Defined, MessageType, defined, is_defined, is_packed
@@ -29,7 +30,7 @@ from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables, text_of
 from mcaptrack.sources.sidecar import METADATA, holds_packed
 from mcaptrack.sources.video import IMAGE_SUFFIXES
 
-_MCAP, _ROS1, _SQLITE, _ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+_MCAP, _ROS1, _SQLITE = b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0"
 #: A message that is larger decompressed is not read.
 _MAX_MESSAGE_BYTES: Final = 2**28
 #: Definitions are tried on the messages of at most this many topics of a type.
@@ -97,7 +98,7 @@ def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Re
 
 def _decompressed_file(path: Path, opened: ExitStack) -> Path:
     """The file, or its decompressed copy if it is compressed as a whole."""
-    if not read_beginning(path, 16).startswith(_ZSTD):
+    if not read_beginning(path, 16).startswith(ZSTD):
         return path
     out = Path(opened.enter_context(temporary_folder())) / path.name.removesuffix(".zstd")
     decompression.unzstd_file(path, out)
@@ -384,7 +385,7 @@ def open_recording(path: Path) -> RecordingReader | None:
     head = read_beginning(path, 16)
     if head.startswith(_ROS1):
         return Bag1(path)
-    if head.startswith((_ZSTD, _MCAP, _SQLITE)):
+    if head.startswith((ZSTD, _MCAP, _SQLITE)):
         return open_files([path], path)
     if path.suffix.lower() in _SUFFIXES:
         what = "is empty" if not head else "does not begin as one does"

@@ -12,7 +12,6 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from functools import partial
 from itertools import chain, islice, takewhile
@@ -23,7 +22,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, utc_ns
 from mcaptrack.sources.ingest.labels.format import MAX_LINE, Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import (
@@ -414,7 +413,6 @@ def _boxes(columns: Mapping[str, Floats]) -> Floats:
 
 
 _ISO: Final = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)?")
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def iso_ns(text: str, without_zone: list[str]) -> int | None:
@@ -428,8 +426,7 @@ def iso_ns(text: str, without_zone: list[str]) -> int | None:
     if match[3] is None and not without_zone:
         without_zone.append(text.strip())
     zone = match[3] if match[3] not in (None, "Z", "UTC") else "+00:00"
-    since = datetime.fromisoformat(match[1] + zone) - _EPOCH
-    return (since.days * 86_400 + since.seconds) * NS_PER_S + int((match[2] or "").ljust(9, "0"))
+    return utc_ns(match[1] + zone, match[2] or "")
 
 
 def unit_of(header: str) -> tuple[str, float]:

@@ -27,7 +27,7 @@ from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.schema.classes import PEOPLE, PERSON
+from mcaptrack.schema.classes import COCO, PEOPLE, PERSON
 from mcaptrack.transforms.detect.onnx.layouts import (
     LAYOUTS,
     SURE,
@@ -61,20 +61,6 @@ _SHOWN: Final = 8
 # The classes of a detector: their names, the ones that are wanted, and their numbers in rows.
 
 
-#: The classes of COCO in the order of networks that count 80.
-COCO: Final = tuple(
-    """
-    person, bicycle, car, motorcycle, airplane, bus, train, truck, boat, traffic light, fire hydrant, stop sign,
-    parking meter, bench, bird, cat, dog, horse, sheep, cow, elephant, bear, zebra, giraffe, backpack, umbrella,
-    handbag, tie, suitcase, frisbee, skis, snowboard, sports ball, kite, baseball bat, baseball glove, skateboard,
-    surfboard, tennis racket, bottle, wine glass, cup, fork, knife, spoon, bowl, banana, apple, sandwich, orange,
-    broccoli, carrot, hot dog, pizza, donut, cake, chair, couch, potted plant, bed, dining table, toilet, tv, laptop,
-    mouse, remote, keyboard, cell phone, microwave, oven, toaster, sink, refrigerator, book, clock, vase, scissors,
-    teddy bear, hair drier, toothbrush
-    """.replace("\n    ", " ")
-    .strip()
-    .split(", ")
-)
 #: The numbers up to 90 that COCO's own numbers of categories leave out.
 _LEFT_OUT: Final = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
 
