@@ -128,3 +128,14 @@ def vision(layout: str, boxes) -> tuple[MessageType, bytes]:
 
 def boxes(kind: MessageType):
     return boxes_decoder(kind)
+
+
+def plain(message) -> object:
+    """A message as a bridge writes it in JSON."""
+    if isinstance(message, np.ndarray | list):
+        return [plain(one) for one in message]
+    fields = getattr(message, "__dataclass_fields__", None)
+    if fields is None:
+        return message.item() if isinstance(message, np.generic) else message
+    names = [name for name, one in fields.items() if "ClassVar" not in str(one.type) and name != "__msgtype__"]
+    return {name: plain(getattr(message, name)) for name in names}

@@ -130,15 +130,20 @@ def cvat(folder: Path, rows: Sequence[Row]) -> Path:
     return path
 
 
+def shares(row: Row) -> tuple[float, ...]:
+    """Centre and size of a box as shares of 640x480; those that are shares are far too large then."""
+    left, top, width, height = row.box
+    across, down = (1, 1) if width <= 2 else (640, 480)
+    return (left + width / 2) / across, (top + height / 2) / down, width / across, height / down
+
+
 def yolo(folder: Path, rows: Sequence[Row]) -> Path:
     """Shares of 640x480 of boxes in pixels; those that are shares are far too large then."""
     (folder / "labels").mkdir(exist_ok=True)
     for frame, mine in by_frame(rows).items():
         lines = []
         for row in mine:
-            left, top, width, height = row.box
-            scale = (1, 1) if width <= 2 else (640, 480)
-            place = ((left + width / 2) / scale[0], (top + height / 2) / scale[1], width / scale[0], height / scale[1])
+            place = shares(row)
             kind = {"person": "0", "77": "77"}.get(row.kind, "-1")
             lines.append(f"{kind} {' '.join(map(str, place))} {number(row.score, '1')} {number(row.id, '-1')}")
         (folder / "labels" / f"{frame:06}.txt").write_text("\n".join(lines))
@@ -294,10 +299,7 @@ def darknet(rows: Sequence[Row]) -> Any:
     for frame, mine in by_frame(rows).items():
         objects = []
         for row in mine:
-            left, top, width, height = row.box
-            scale = (1, 1) if width <= 2 else (640, 480)
-            place = ((left + width / 2) / scale[0], (top + height / 2) / scale[1], width / scale[0], height / scale[1])
-            place = dict(zip(("center_x", "center_y", "width", "height"), place, strict=True))
+            place = dict(zip(("center_x", "center_y", "width", "height"), shares(row), strict=True))
             objects.append(
                 {"name": row.kind or "", "class_id": "", "confidence": row.score, "relative_coordinates": place}
             )

@@ -13,7 +13,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import recorded
 from mcaptrack.sources.foreign import MessageType, boxes_decoder
 from mcaptrack.sources.foreign.fields import Message3d
-from tests.ros_messages import BAR, Ros
+from tests.ros_messages import BAR, Ros, plain
 from tests.space_logs import (
     SEEN,
     START_NS,
@@ -69,17 +69,6 @@ def autoware(package: str, kind: str, labels: tuple[str, ...] = LABELS) -> str:
         + BAR + f"MSG: {package}/Shape\nuint8 BOUNDING_BOX=0\nuint8 CYLINDER=1\nuint8 POLYGON=2\nuint8 type\n"
         "geometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions\n"
     )  # fmt: skip
-
-
-def plain(message) -> object:
-    """A message as a bridge writes it in JSON."""
-    if isinstance(message, np.ndarray | list):
-        return [plain(one) for one in message]
-    fields = getattr(message, "__dataclass_fields__", None)
-    if fields is None:
-        return message.item() if isinstance(message, np.generic) else message
-    names = [name for name, one in fields.items() if "ClassVar" not in str(one.type) and name != "__msgtype__"]
-    return {name: plain(getattr(message, name)) for name in names}
 
 
 def read(writer: Ros, message, encoding: str) -> Message3d:

@@ -16,7 +16,7 @@ from mcaptrack.notices import collected
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import named_detections
 from mcaptrack.sources.foreign.boxes import choosing, read_classes
-from tests.ros_messages import BAR, Ros
+from tests.ros_messages import BAR, Ros, plain
 
 START_NS = 1_700_000_000_000_000_000
 HEAD = {"stamp": {"sec": 1_700_000_000, "nanosec": 0}, "frame_id": "map"}
@@ -350,17 +350,6 @@ def value_of(ros: Ros, kind, value):
     if "string" in name[0]:
         return list(value or [])
     return np.array(value if value is not None else [0] * length, np.dtype(name[0]))
-
-
-def plain(message) -> object:
-    """A message as a bridge writes it in JSON."""
-    if isinstance(message, np.ndarray | list):
-        return [plain(one) for one in message]
-    fields = getattr(message, "__dataclass_fields__", None)
-    if fields is None:
-        return message.item() if isinstance(message, np.generic) else message
-    names = [name for name, one in fields.items() if "ClassVar" not in str(one.type) and name != "__msgtype__"]
-    return {name: plain(getattr(message, name)) for name in names}
 
 
 def whole(where: str, thing: dict) -> dict:

@@ -105,7 +105,9 @@ class UnreadMessages:
 def payload_decoder(
     opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
 ) -> Callable[[bytes], Any]:
-    """What ``make`` makes for the type of a channel. Raises McaptrackError, with the topic, if that isn't read."""
+    """A function that decodes payloads of a channel, which ``make`` makes for its type. Raises McaptrackError, with the
+    topic, if that type isn't read.
+    """
     try:
         return make(message_type_of(opened, topic))
     except McaptrackError as error:

@@ -34,10 +34,10 @@ _MAX_PLACE: Final = 1e8
 _MAX_SCORE: Final = 1e9
 _MAX_CLASS: Final = 2**31 - 1
 #: Boxes that are cut off at the edge of the picture reach a little beyond its whole size.
+_MOST_SHARE: Final = 2.0
 #: So many boxes are seldom shorter than this in pictures.
 _LEAST_PX: Final = 6.0
 _MANY_BOXES: Final = 20
-_MOST_SHARE: Final = 2.0
 #: Lengths are metres if the median lies between these.
 _LEAST_LENGTH_M, _MOST_LENGTH_M = 0.05, 60.0
 #: Headings are radians if none is larger than two turns.

@@ -15,7 +15,7 @@ import numpy as np
 
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.files import refuse_special
+from mcaptrack.files import refuse_special, visible
 from mcaptrack.registry import BUILT_IN, find
 from mcaptrack.schema.classes import ClassMap
 from mcaptrack.schema.spill import SpillFile, Stored
@@ -66,9 +66,7 @@ def label_file(path: Path, label_format: str = _AUTO) -> LabelFile:
     if label_format != _AUTO or not file.is_folder or file.holds_pictures or known_format(file):
         return file
     for pattern in PLACES:
-        inside = [
-            entry for entry in sorted(path.glob(pattern)) if entry.name[:1] != "." and known_format(LabelFile(entry))
-        ]
+        inside = [entry for entry in visible(path.glob(pattern)) if known_format(LabelFile(entry))]
         if len(inside) > 1:
             listed = list_names([str(entry.relative_to(path)) for entry in inside], _LISTED)
             raise McaptrackError(f"{path} holds labels in {len(inside)} places, {listed}; give one of them")
