@@ -421,6 +421,15 @@ def test_times_are_timestamps_and_durations_nanoseconds() -> None:
     assert columns["spans",].to_pylist() == [[NS + 5]]
 
 
+def test_times_that_64_bits_do_not_hold_are_null() -> None:
+    kind = importlib.import_module("foxglove_schemas_protobuf.Log_pb2").Log
+    messages = [kind() for _ in range(4)]
+    for message, seconds in zip(messages, (2**62, -(2**62), 5, 2**33), strict=True):
+        message.timestamp.seconds = seconds
+    columns = ProtobufColumns(kind.DESCRIPTOR).read(*laid_out([m.SerializeToString() for m in messages], None))
+    assert columns["timestamp",].cast(pa.int64()).to_pylist() == [None, None, 5 * NS, 2**33 * NS]
+
+
 def test_only_fields_that_are_wanted_are_read() -> None:
     store = store_of("cdr")
     name = "sensor_msgs/msg/Imu"

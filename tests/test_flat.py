@@ -7,11 +7,14 @@ import math
 
 import numpy as np
 import pytest
+import zstandard
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from grpc_tools import protoc
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
+from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
@@ -164,8 +167,9 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
     assert pq.ParquetFile(file).read().column("picture").to_pylist() == [b"\x00\xff"]
 
 
-@pytest.mark.parametrize("encoding", ["ros1", "cdr"])
-def test_ros_messages_are_read_by_their_definition(tmp_path, encoding):
+@pytest.mark.parametrize(("encoding", "is_packed"), [("ros1", False), ("cdr", False), ("cdr", True)])
+def test_ros_messages_are_read_by_their_definition(tmp_path, encoding, is_packed):
+    """Also those that rosbag2 compressed one by one."""
     text = ROS1_IMU
     if encoding == "cdr":
         text = text.replace("uint32 seq\ntime stamp", "builtin_interfaces/Time stamp").replace(
@@ -190,6 +194,7 @@ def test_ros_messages_are_read_by_their_definition(tmp_path, encoding):
     )
     write = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
     payload = bytes(write(message, "robot/msg/Imu"))
+    payload = zstandard.compress(payload) if is_packed else payload
     name, kind = ("robot/Imu", "ros1msg") if encoding == "ros1" else ("robot/msg/Imu", "ros2msg")
     table = one_channel(tmp_path / "a.mcap", name, kind, text.encode(), encoding, [payload])
     (row,) = table.to_pylist()
@@ -217,6 +222,28 @@ def test_fields_of_json_become_columns_with_names_of_their_own(tmp_path):
     assert got["deep_l"] == [None, [1.0, 2.5], None]
     assert got["mixed"] == [None, None, '[1,{"a":1}]']
     assert got["half"] == ["?x", None, None]
+
+
+def test_messages_that_protobuf_merges_are_those_that_are_written_merged(tmp_path):
+    """A field that stands twice can't be read as a column: such messages are decoded each for itself."""
+    twice = []
+    for far in (0, 2**62):
+        parts = [FrameTransform(child_frame_id="a"), FrameTransform(parent_frame_id="b")]
+        parts[0].translation.x, parts[1].translation.y = 1.5, 2.5
+        parts[0].timestamp.seconds, parts[1].timestamp.nanos = 5 + far, 7
+        twice.append(b"".join(part.SerializeToString() for part in parts))
+    schema = build_file_descriptor_set(FrameTransform).SerializeToString()
+    tables = []
+    for name, payloads in {
+        "twice": twice,
+        "merged": [FrameTransform.FromString(payload).SerializeToString() for payload in twice],
+    }.items():
+        path = tmp_path / f"{name}.mcap"
+        tables.append(one_channel(path, "foxglove.FrameTransform", "protobuf", schema, "protobuf", payloads))
+    rows = [table.select(fields(table)).to_pylist() for table in tables]
+    assert rows[0] == rows[1]
+    assert ns(tables[0], "timestamp") == [5_000_000_007, None]
+    assert (rows[0][0]["translation_x"], rows[0][0]["translation_y"], rows[0][0]["rotation_x"]) == (1.5, 2.5, None)
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "json"])

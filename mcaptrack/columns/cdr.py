@@ -80,9 +80,9 @@ class Unsupported(ValueError):
     """Messages of a type can't be read as columns."""
 
 
-def as_times(t_ns: Any) -> pa.Array:
+def as_times(t_ns: pa.Array) -> pa.Array:
     """Nanoseconds since 1970 (N,) as times in UTC."""
-    return pa.array(t_ns).cast(pa.timestamp("ns", tz="UTC"))
+    return t_ns.cast(pa.timestamp("ns", tz="UTC"))
 
 
 # Positions
@@ -415,8 +415,8 @@ class _Struct(_Type):
     def read(self, cursor: Cursor) -> pa.Array:
         if self.is_time:
             seconds, parts = (of.read(cursor).to_numpy().astype(np.int64) for _, of, _ in self.fields)
-            t_ns = seconds * _NS_PER_S + parts
-            return pa.array(t_ns) if self.is_duration else as_times(t_ns)
+            t_ns = pa.array(seconds * _NS_PER_S + parts)
+            return t_ns if self.is_duration else as_times(t_ns)
         columns, names = [], []
         for name, of, is_wanted in self.fields:
             if is_wanted:

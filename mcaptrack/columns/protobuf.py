@@ -47,6 +47,8 @@ _ZIGZAG: Final = (FieldDescriptor.TYPE_SINT32, FieldDescriptor.TYPE_SINT64)
 _SIZED: Final = (FieldDescriptor.TYPE_STRING, FieldDescriptor.TYPE_BYTES)
 _TIME, _DURATION = "google.protobuf.Timestamp", "google.protobuf.Duration"
 _NS_PER_S: Final = 10**9
+#: Times that are so far from 1970 have no nanoseconds in 64 bits: they are null.
+_FAR_S: Final = 2**63 // _NS_PER_S - 4
 #: Wire types: a varint, 8 bytes, as many bytes as its varint says, 4 bytes.
 _VARINT, _WIDE, _SIZED_BYTES, _NARROW = 0, 1, 2, 5
 #: Bytes behind a message that a varint at its end may be read beyond.
@@ -302,8 +304,9 @@ class ProtobufColumns:
         """Messages in a list, or times."""
         if of.full_name in (_TIME, _DURATION):
             seconds, parts = (self._column(field, rows, path).to_numpy().astype(np.int64) for field in of.fields)
-            t_ns = seconds * _NS_PER_S + parts
-            return as_times(t_ns) if of.full_name == _TIME else pa.array(t_ns)
+            is_far = np.abs(seconds) >= _FAR_S
+            t_ns = pa.array(np.where(is_far, 0, seconds) * _NS_PER_S + parts, mask=is_far)
+            return as_times(t_ns) if of.full_name == _TIME else t_ns
         columns = dict(self._nested(rows, path))
         if not columns:
             return pa.Array.from_buffers(pa.struct([]), rows.count, [None])

@@ -124,7 +124,8 @@ def _read(
             todo += [some for some in (rows[at + 1 :], rows[:at]) if len(some)]
         except Unsupported:
             flat = list(_flat(batch, rows, flatten, unread))
-            parts.append((rows, {path: pa.array([row.get(path) for row in flat], types[path]) for path in types}))
+            values = {path: [_with_numbers(row.get(path)) for row in flat] for path in types}
+            parts.append((rows, {path: pa.array(values[path], kind) for path, kind in types.items()}))
     if len(parts) == 1 and len(parts[0][0]) == len(batch.t_ns):
         return parts[0][1]
     read = np.concatenate([rows for rows, _ in parts] or [np.empty(0, np.int64)])
@@ -133,6 +134,15 @@ def _read(
     take = pa.array(place, mask=place < 0)
     joined = {path: pa.chunked_array([part[path] for _, part in parts], kind) for path, kind in types.items()}
     return {path: column.combine_chunks().take(take) for path, column in joined.items()}
+
+
+def _with_numbers(value: Any) -> Any:
+    """A value with whole nanoseconds for times, which Arrow takes where it is told that they are times."""
+    if isinstance(value, np.datetime64):
+        return int(value.astype("datetime64[ns]").astype(np.int64))
+    if isinstance(value, list):
+        return [_with_numbers(member) for member in value]
+    return {name: _with_numbers(member) for name, member in value.items()} if isinstance(value, dict) else value
 
 
 def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: UnreadMessages) -> Iterator[Mapping[Path, Any]]:

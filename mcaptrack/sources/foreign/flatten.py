@@ -36,7 +36,8 @@ _MAX_DEPTH: Final = 32
 _LIMIT_NS: Final = 2**63
 #: If more messages of a channel can't be read, and more than half, it is of another type.
 _MOST_UNREAD: Final = 100
-#: The field names of times in ROS 1, ROS 2, JSON of bridges, and protobuf.
+#: Times in protobuf, and the field names of those in ROS 1, ROS 2 and JSON of bridges.
+_OF_PROTOBUF: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 _TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
 
 
@@ -176,7 +177,7 @@ def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
 
 def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:
     fields = _fields(value)
-    if fields is None or (path and _nanoseconds(fields) is not None):
+    if fields is None or (path and _is_time(value, fields)):
         title, plain = _plain(path[-1] if path else "value", value, len(path))
         yield (*path[:-1], title), plain
         return
@@ -213,8 +214,16 @@ def _member(message: Any, field: Any) -> Any:
     return named(value) if isinstance(value, int) else [named(number) for number in value]
 
 
+def _is_time(value: Any, fields: Mapping[str, Any]) -> bool:
+    """Whether a message is a time or duration. JSON says no types: its times are those that 64 bits hold."""
+    if isinstance(value, dict):
+        return _nanoseconds(fields) is not None
+    descriptor = getattr(value, "DESCRIPTOR", None)
+    return set(fields) in _TIMES if descriptor is None else descriptor.full_name in _OF_PROTOBUF
+
+
 def _nanoseconds(fields: Mapping[str, Any]) -> int | None:
-    """A time or duration in nanoseconds; None if fields are none."""
+    """A time or duration in nanoseconds; None if fields are none, or if 64 bits don't hold it."""
     if set(fields) not in _TIMES:
         return None
     values = [*fields.values()]  # seconds come first
@@ -232,11 +241,15 @@ def _plain(name: str, value: Any, depth: int) -> tuple[str, Any]:
         raise ValueError(f"it is more than {_MAX_DEPTH} messages deep")
     fields = _fields(value)
     if fields is not None:
-        t_ns = _nanoseconds(fields)
-        if t_ns is None:
+        if not _is_time(value, fields):
             return name, dict(_plain(inner, member, depth + 1) for inner, member in fields.items())
-        kind = str(getattr(getattr(value, "DESCRIPTOR", None), "name", type(value).__name__))
-        return (f"{name}_ns", t_ns) if kind.endswith("Duration") else (name, np.datetime64(t_ns, "ns"))
+        t_ns, kind = (
+            _nanoseconds(fields),
+            str(getattr(getattr(value, "DESCRIPTOR", None), "name", type(value).__name__)),
+        )
+        if kind.endswith("Duration"):
+            return f"{name}_ns", t_ns
+        return name, None if t_ns is None else np.datetime64(t_ns, "ns")
     if isinstance(value, np.generic):
         return name, value.item()
     if isinstance(value, np.ndarray):
