@@ -54,7 +54,7 @@ def test_tracks_at_the_border_of_the_picture_are_not_joined_for_looking_alike():
     ratios = []
     for is_there in (False, True):
         placed = descriptors._replace(at_border=np.full(len(t_ns), is_there))
-        tracks = Tracks(step, track, track, np.arange(len(step)), nowhere, placed.find(t_ns, track))
+        tracks = Tracks(step, track, track, np.arange(len(step)), nowhere, placed.find(t_ns, track), track)
         seen = Appearance.of(placed, tracks, 0.4).between(tracks)
         ratios.append(seen.of_tracks(np.array([0, 0]), np.array([2, 3])).tolist())  # 1 goes on as 11, and as 12
     (alike, different), (alike_at_border, different_at_border) = ratios

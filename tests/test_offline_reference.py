@@ -51,7 +51,7 @@ def with_gaps(rng: np.random.Generator, first: int, places: np.ndarray, share: f
 def tracks_of(step, track, source, xy=None) -> Tracks:
     """Samples that are assigned to tracks; nothing is seen of them."""
     places = np.zeros((len(step), 2)) if xy is None else xy
-    return Tracks(step, track, source, np.arange(len(step)), places, np.full(len(step), -1))
+    return Tracks(step, track, source, np.arange(len(step)), places, np.full(len(step), -1), track)
 
 
 def laid_out(paths: Paths, noise_m: float):

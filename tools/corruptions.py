@@ -130,6 +130,11 @@ CORRUPTIONS: Final = {
 
 def corrupt(truth: Rows, how: Corruption, rng: np.random.Generator) -> Rows:
     """Tracks (step, id, x, y) as a tracker might make them of true rows, ordered by step."""
+    return with_people(truth, how, rng)[:, :4]
+
+
+def with_people(truth: Rows, how: Corruption, rng: np.random.Generator) -> Rows:
+    """The same with the person that each row is of in a last column, -1 for nobody."""
     ids = count(1)
     rows = np.concatenate([_one(truth[truth[:, 1] == who], how, rng, ids) for who in np.unique(truth[:, 1])])
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
@@ -138,22 +143,31 @@ def corrupt(truth: Rows, how: Corruption, rng: np.random.Generator) -> Rows:
     elif how.merge_m:
         rows = _merged(rows, how.merge_m, ids)
     rows = _exchanged(rows, how.swap, rng)
-    extra = [rows[:, :4]]
+    extra = [rows]
     for share, make in ((how.flicker, _flicker), (how.clutter, _clutter), (how.doubles, _double)):
         wanted = share * len(rows)
         while wanted > 0:
             ghost = make(truth, rng)
-            extra.append(np.column_stack([ghost[:, 0], np.full(len(ghost), next(ids)), ghost[:, 1:]]))
+            extra.append(
+                np.column_stack([ghost[:, 0], np.full(len(ghost), next(ids)), ghost[:, 1:], np.full(len(ghost), -1)])
+            )
             wanted -= len(ghost)
     for share, parts_of in ((how.lit, _lit(truth, rng)), (how.beside, _beside(rows, rng))):
         wanted = share * len(rows)
         while wanted > 0:
             ghost = next(parts_of)
-            extra.append(np.column_stack([ghost[:, 0], np.full(len(ghost), next(ids)), ghost[:, 1:]]))
+            extra.append(
+                np.column_stack([ghost[:, 0], np.full(len(ghost), next(ids)), ghost[:, 1:], np.full(len(ghost), -1)])
+            )
             wanted -= len(ghost)
     rows = np.concatenate(extra)
     rows = rows[(rows[:, 0] >= truth[:, 0].min()) & (rows[:, 0] <= truth[:, 0].max())]
     return rows[np.argsort(rows[:, 0], kind="stable")]
+
+
+def _nobody(ghost: Rows, name: int) -> Rows:
+    """A false track (step, x, y) as rows with an id, of no person."""
+    return np.column_stack([ghost[:, 0], np.full(len(ghost), name), ghost[:, 1:], np.full(len(ghost), -1)])
 
 
 def _one(path: Rows, how: Corruption, rng: np.random.Generator, ids: count) -> Rows:

@@ -18,31 +18,32 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from corruptions import corrupt
+from corruptions import with_people
 from crowds import drawn
-from regression import logistic, shift, show_reliability
+from regression import Chosen, logistic, multinomial, shift, show_reliability
 from reproduce import on_clock
 
 from mcaptrack import __version__
 from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.assignment import assign, solve
+from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import false_tracks, linking, offline
+from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
 from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.linking import Joins, find_joins, tracked_of
-from mcaptrack.transforms.retrack.motion_model import Trajectories
-from mcaptrack.transforms.retrack.weights import WEIGHTS, Logistic, probability
+from mcaptrack.transforms.retrack.motion_model import Trajectories, to_trajectories
+from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
 
 DEFAULT = PROFILES["default"]
 Found = TypeVar("Found")
@@ -55,6 +56,8 @@ MORE = (103, 104)
 JUDGED, JUDGED_STEPS = (111, 112, 113), 100
 #: A track is that of a person who is as near, by most of its first or last so many rows.
 GATE_M, ROWS = 1.0, 8
+#: A tracklet is that of the person of most of its first or last so many samples.
+NEAR: Final = 4
 #: The longest gap of pairs that weights are fitted on; and the least log odds of the best set of links.
 MAX_GAP_S, LEAST = 30.0, -4.0
 
@@ -65,28 +68,34 @@ class Run(NamedTuple):
     true: list[Frame]
     samples: list[Frame]
     args: tuple[Any, ...]
+    rows: np.ndarray
+
+    def people(self, tracks: Tracks) -> np.ndarray:
+        """The person of each sample of tracks (C,), or -1."""
+        step, ids, person = self.rows[:, 0] - self.rows[0, 0], self.rows[:, 1], self.rows[:, -1]
+        at = find_rows((ids.astype(int), step.astype(int)), (tracks.source, tracks.step))
+        return np.where(at >= 0, person[at].astype(int), -1)
 
 
 def runs(seeds: Iterable[int], steps: int) -> Iterator[Run]:
     """Scenes, tracked online."""
     for seed in seeds:
         for number, (truth, how) in enumerate(drawn(seed, steps)):
-            yield prepare(truth, corrupt(truth, how, np.random.default_rng([seed, number, 2])))
+            yield prepare(truth, with_people(truth, how, np.random.default_rng([seed, number, 2])))
 
 
 def prepare(truth: np.ndarray, made: np.ndarray) -> Run:
-    """A scene from the rows of the truth and of a tracker."""
+    """A scene from the rows of the truth and of a tracker, with the person of each."""
     clock = np.arange(int(truth[:, 0].min()), int(truth[:, 0].max()) + 1)
     true = on_clock(truth, clock)
-    samples = [frame for (frame,) in Sample(start_ns=true[0].t_ns)(on_clock(made, clock))]
+    samples = [frame for (frame,) in Sample(start_ns=true[0].t_ns)(on_clock(made[:, :4], clock))]
     run = LikelihoodPass(DEFAULT)
     for frame in samples:
         run.step(frame)
     run.finish()
     times = np.array([frame.t_ns for frame in samples])
-    return Run(
-        true, samples, (DEFAULT, motion_model(DEFAULT, run.noise_m), run.assignments, run.samples, run.steps, times)
-    )
+    model = motion_model(DEFAULT, run.noise_m)
+    return Run(true, samples, (DEFAULT, model, run.assignments, run.samples, run.steps, times), made)
 
 
 class _Reached(Exception):
@@ -170,8 +179,9 @@ class Pairs:
 
 def pairs_of(run: Run) -> Pairs:
     """The candidate links of a scene."""
-    sides = reached("link_pieces", FITTED, *run.args[1:])[0]
-    paths = sides.trajectories
+    model, tracks, *_ = reached("hypotheses_of", FITTED, *run.args[1:])
+    _, _, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+    sides = linking.TrackEnds.of(model, paths)
     i, j = linking.candidates(sides, MAX_GAP_S)
     gaps = sides.gaps(i, j)
     gap_s, found = gaps.seconds, linking.features(sides.model, gaps)
@@ -214,55 +224,51 @@ class Judged(NamedTuple):
     are_right: np.ndarray
 
 
-def judged_joins(run: Run, tracked: Tracks, found: Joins) -> tuple[Judged, np.ndarray]:
-    """Joins compared with who was there, and the true id of each assignment (C,), or -1.
-
-    Joins of two false tracks are neither right nor wrong.
-    """
-    _, track, count = np.unique(tracked.track, return_inverse=True, return_counts=True)
-    owner = owners(run, tracked.step, tracked.xy_m, count[track])
-
-    def who(at: int, way: int) -> int:
-        near = slice(at, at + ROWS) if way > 0 else slice(max(at - ROWS + 1, 0), at + 1)
-        own = (tracked.track[near] == tracked.track[at]) & (tracked.source[near] == tracked.source[at])
-        ids = owner[near][own]
-        return int(np.bincount(ids[ids >= 0]).argmax()) if (ids >= 0).sum() * 2 >= len(ids) else -1
-
-    pairs = [(who(a, -1), who(b, 1)) for a, b in zip(found.before, found.after, strict=True)]
-    sides = np.array(pairs, int).reshape(-1, 2)
-    counts = (sides >= 0).any(axis=1)
-    return Judged(found.features[counts], (sides[:, 0] == sides[:, 1])[counts]), owner
+def choices_of(run: Run) -> Chosen:
+    """What the ends and beginnings of tracklets should choose in a scene."""
+    model, tracks, max_gap_s, _ = reached("hypotheses_of", *run.args)
+    tracklets, before, after, _, gap, terms, leaves, comes, _ = Hypotheses.of(model, tracks, max_gap_s)
+    begins, ends = sides_of(tracks, tracklets, run.people(tracks))
+    same = np.flatnonzero((ends[before] >= 0) & (ends[before] == begins[after]))
+    right = []
+    for side, other in ((before, tracklets.begins[after]), (after, -tracklets.ends[before])):
+        nearest = same[np.lexsort((other[same], side[same]))]
+        link = np.full(len(ends), -1)
+        link[side[nearest][::-1]] = nearest[::-1]
+        right.append(link)
+    is_right = (right[0][before] == np.arange(len(before))) & (right[1][after] == np.arange(len(before)))
+    link_after, link_before = (np.where((link >= 0) & is_right[link], link, -1) for link in right)
+    link_after, link_before = np.where(ends < 0, -2, link_after), np.where(begins < 0, -2, link_before)
+    return Chosen(before, after, gap, terms, leaves, comes, link_after, link_before)
 
 
-def cuts_of(run: Run) -> Judged:
-    """The joins of the online tracks of a scene."""
-    model, tracks = reached("cut_joins", *run.args)[:2]
-    tracks = tracks.take(tracks.order)
-    return judged_joins(run, tracks, find_joins(tracked_of(model, tracks), model))[0]
+def sides_of(tracks: Tracks, tracklets: Tracklets, people: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The person at the beginning and at the end of each tracklet (K,): that of most of its first and last samples."""
+    order = np.lexsort((tracks.step, tracklets.of))
+    low = np.searchsorted(tracklets.of[order], np.arange(len(tracklets.first)))
+    parts = np.split(people[order], low[1:])
+    return np.array([_most(part[:NEAR]) for part in parts]), np.array([_most(part[-NEAR:]) for part in parts])
 
 
-def relinks_of(run: Run) -> Judged:
-    """The candidate links at the cuts of a scene: right are those that are nearest in time from both sides."""
-    sides, max_gap_s, _, pieces, _ = reached("link_pieces", *run.args)
-    found, paths = linking.find_candidates(sides, max_gap_s, pieces), sides.trajectories
-    owner = owners_of(run, paths)
-    ends, begins = usual(owner, paths, -1)[found.ends], usual(owner, paths, 1)[found.begins]
-    same = np.flatnonzero((ends >= 0) & (ends == begins))
-    right = np.ones(len(ends), bool)
-    for side in (found.ends, found.begins):
-        nearest = same[np.lexsort((found.gap_s[same], side[same]))]
-        right &= np.isin(np.arange(len(ends)), nearest[np.unique(side[nearest], return_index=True)[1]])
-    counts = found.at_cut & ((ends >= 0) | (begins >= 0))
-    return Judged(found.features[counts], right[counts])
+def _most(people: np.ndarray) -> int:
+    somebody = people[people >= 0]
+    return int(np.bincount(somebody).argmax()) if 2 * len(somebody) >= len(people) else -1
 
 
 def decisions_of(run: Run) -> tuple[Judged, Judged]:
-    """The joins of the offline tracks of a scene, and which tracks are people."""
+    """The joins of the offline tracks of a scene, and which tracks are people.
+
+    Joins of two false tracks are neither right nor wrong.
+    """
     decided, model, _, _ = reached("decision_rows", *run.args)
-    tracks = decided.tracked.tracks
-    made, owner = judged_joins(run, tracks, offline.find_kept_joins(decided, model))
+    tracks, people = decided.tracks, run.people(decided.tracks)
+    begins, ends = sides_of(tracks, decided.hypotheses.tracklets, people)
+    link = offline.find_joins(decided, model.step_s).link
+    sides = np.stack([ends[decided.hypotheses.before[link]], begins[decided.hypotheses.after[link]]])
+    counts = (sides >= 0).any(axis=0)
+    joins = Judged(decided.hypotheses.scored().log_odds()[link][counts], (sides[0] == sides[1])[counts])
     _, track, count = np.unique(tracks.track, return_inverse=True, return_counts=True)
-    return made, Judged(decided.log_odds[:, None], np.bincount(track, owner >= 0) * 2 >= count)
+    return joins, Judged(decided.log_odds[:, None], np.bincount(track, people >= 0) * 2 >= count)
 
 
 def told(find: Callable[[Run], Found], scenes: list[Run], what: str) -> Iterator[Found]:
@@ -279,20 +285,25 @@ def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any
     return {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
 
 
-def fit_cuts(scenes: list[Run]) -> dict[str, Any]:
-    """The weights of joins that may be cut, then of links at cuts."""
-    cuts = fit_judged(linking.JOIN_FEATURES, told(cuts_of, scenes, "joins that may be cut"))
-    install(linking, "_CUTS", cuts)
-    relinks = fit_judged(linking.RELINK_FEATURES, told(relinks_of, scenes, "links at cuts"))
-    install(linking, "_RELINKS", relinks)
-    return {"cuts": cuts, "relinks": relinks}
+def fit_choices(parts: Sequence[Chosen]) -> dict[str, Any]:
+    """The weights of what ends and beginnings choose."""
+    fitted = multinomial(parts, len(hypotheses.GAP_NAMES))
+    links = dict(zip(hypotheses.GAP_NAMES, fitted.links, strict=True))
+    ends, usual = hypotheses.END_TERMS, (*hypotheses.GAP_NAMES, "none")
+    return {
+        "links": {name: named(hypotheses.LINK_TERMS, weights) for name, weights in links.items()},
+        "leaves": named(ends, fitted.leaves),
+        "comes": named(ends, fitted.comes),
+        "usual_leaves": named(usual, fitted.usual_leaves),
+        "usual_comes": named(usual, fitted.usual_comes),
+    }
 
 
 def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
     """The weights of joins that are made, and of tracks."""
     of_joins, of_people = zip(*told(decisions_of, scenes, "decisions"), strict=True)
     return {
-        "joins": fit_judged(linking.JOIN_FEATURES, of_joins),
+        "joins": fit_judged(("end", "beginning"), of_joins),
         "decided": fit_judged(("log odds",), of_people),
     }
 
@@ -377,16 +388,16 @@ def main() -> None:
     if given.held:
         held(seeds, given.steps)
         return
-    linking._CUTS = linking._CUTS._replace(bias=np.inf)  # links don't depend on what is cut
     scenes = list(runs(seeds, given.steps))
     pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)
     install(linking, "_LINKS", links)
     linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
     linking._BY_GAP = np.array(links["usual by gap"])
-    others = list(runs(JUDGED, JUDGED_STEPS))
-    cuts = fit_cuts(others)
     more = [*scenes, *runs(MORE, given.steps)]
+    who = fit_choices(list(told(choices_of, more, "choices")))
+    hypotheses.CHOICES = Choices.from_entry(who, hypotheses.GAP_NAMES, hypotheses.LINK_TERMS, hypotheses.END_TERMS)
+    others = list(runs(JUDGED, JUDGED_STEPS))
     people = fit_people(list(told(people_of, more, "people")))
     install(false_tracks, "_PEOPLE", people)
     false_tracks._THROUGHOUT = people["stands throughout"]
@@ -401,7 +412,7 @@ def main() -> None:
         "licence": "Apache-2.0",
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }
-    fitted = {"card": card, "links": links, "people": people} | cuts | judged
+    fitted = {"card": card, "links": links, "who": who, "people": people} | judged
     text = json.dumps(fitted, indent=1) + "\n"
     if given.check:
         print("the same" if WEIGHTS.read_text(encoding="utf-8") == text else text)

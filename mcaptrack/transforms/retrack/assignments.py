@@ -22,8 +22,8 @@ from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, unit
 
 
 class Tracks(NamedTuple):
-    """Samples that are assigned to tracks, (C,) each: step, track, input id, sample, position (C, 2) in units, and the
-    descriptor of what is seen of it, or -1.
+    """Samples that are assigned to tracks, (C,) each: step, track, input id, sample, position (C, 2) in units, the
+    descriptor of what is seen of it, or -1, and the online track.
     """
 
     step: Ints
@@ -32,6 +32,7 @@ class Tracks(NamedTuple):
     sample: Ints
     xy_m: Floats
     look: Ints
+    online: Ints
 
     @property
     def order(self) -> Ints:

@@ -205,7 +205,7 @@ def _appearance(
     xy_m = middle_px * (_PERSON_M / np.median(tracks.boxes[:, 3])) if len(step) else middle_px
     boxes = np.arange(len(step))
     look = np.full(len(step), -1) if looks is None else looks.find(times_ns[tracks.frame], source)
-    samples = Tracks(step, source, source, boxes, xy_m, look)
+    samples = Tracks(step, source, source, boxes, xy_m, look, source)
     seen = Appearance.of(looks, samples, 1 / rate_hz)
     if seen is None or not seen.calibration.tells_apart:
         return seen and seen.calibration, None

@@ -27,20 +27,10 @@ from mcaptrack.schema.resampling import ANGLES, LINEAR
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers, Tracks
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
+from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
-from mcaptrack.transforms.retrack.linking import (
-    JOIN_FEATURES,
-    CutTracks,
-    Joins,
-    Tracked,
-    TrackEnds,
-    cut_joins,
-    find_joins,
-    link_pieces,
-    link_tracks,
-    with_appearance,
-)
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
+from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
+from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
 
@@ -138,63 +128,99 @@ def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
 # Letters: C assignments, K tracks, J joins, D decisions.
 
 
-JOINS: Final = Logistic.of("joins", JOIN_FEATURES)
+#: Whether a join is right, from its log odds as its end and as its beginning see them.
+JOINS: Final = Logistic.of("joins", ("end", "beginning"))
+#: An alternative is at least so likely as log odds.
+_MAY_BE: Final = -4.0
+#: Samples of another input id that last less, between two parts with one, are no join. Seconds.
+_BRIEF_S: Final = 1.0
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
 PERSON: Final = Logistic.of("decided", ("log odds",))
 _NO_ID: Final = -1
 
 
 class Decided(NamedTuple):
-    """The tracks of a log as they were decided, including those that are left out as false.
+    """The tracks (C,) of a log as they were decided, those that are left out included, ordered by track and step.
 
     ``log_odds`` (K,) that tracks are people, of the test of false tracks, and which were ``kept`` (K,), are ordered by
-    id. ``appearance`` is None where it isn't used.
+    id. ``hypotheses`` are those about these tracks.
     """
 
-    tracked: Tracked
+    tracks: Tracks
     log_odds: Floats
     kept: Bools
-    appearance: Appearance | None = None
+    hypotheses: Hypotheses
 
 
 def decision_rows(decided: Decided, model: MotionModel, samples: LogSamples, steps: Sequence[int]) -> Iterator[Rows]:
     """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track."""
-    parts = _joined(decided, find_kept_joins(decided, model), model.step_s), _persons(decided, model.step_s)
+    parts = _joined(decided, model.step_s), _persons(decided, model.step_s)
     at, rows = np.concatenate([places for places, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
-    places = samples.take(decided.tracked.tracks.sample[at])
+    places = samples.take(decided.tracks.sample[at])
     rows["x_m"], rows["y_m"] = places["x_m"], places["y_m"]
     rows["x_px"], rows["y_px"] = places["x_px"] + places["w_px"] / 2, places["y_px"] + places["h_px"] / 2
-    step = decided.tracked.tracks.step[at]
+    step = decided.tracks.step[at]
     order = np.lexsort((rows["source_id"], rows["track_id"], rows["kind"], step))
     ends = np.append(0, np.searchsorted(step[order], steps, "right")).tolist()
     rows = DECISIONS.check(rows.take(order))
     yield from (rows[low:high] for low, high in pairwise(ends))
 
 
-def find_kept_joins(decided: Decided, model: MotionModel) -> Joins:
+class Joins(NamedTuple):
+    """Where tracks go on with another input id (J,): assignments before and after, and the candidate links there."""
+
+    before: Ints
+    after: Ints
+    link: Ints
+
+
+def find_joins(decided: Decided, step_s: float) -> Joins:
     """The joins of the tracks that were kept."""
-    joins = find_joins(decided.tracked, model)
-    number = np.cumsum(run_starts(decided.tracked.tracks.track)) - 1
-    kept = decided.kept[number[joins.after]]
-    return Joins(*(values[kept] for values in joins))
+    tracks, (tracklets, before, after, *_) = decided.tracks, decided.hypotheses
+    starts = np.flatnonzero(run_starts(tracks.track, tracks.source))
+    track, source, step = (values[starts] for values in (tracks.track, tracks.source, tracks.step))
+    is_brief = np.zeros(len(starts), bool)
+    lasts_s = (step[2:] - step[1:-1]) * step_s
+    is_brief[1:-1] = (track[2:] == track[:-2]) & (source[2:] == source[:-2]) & (lasts_s < _BRIEF_S)
+    starts = starts[~is_brief]
+    starts = starts[run_starts(tracks.track[starts], tracks.source[starts])]
+    number = np.cumsum(run_starts(tracks.track)) - 1
+    follows = starts[1:][(number[starts[1:]] == number[starts[:-1]]) & decided.kept[number[starts[1:]]]]
+    pair = tracklets.of[follows - 1] * len(tracklets.first) + tracklets.of[follows]
+    return Joins(follows - 1, follows, np.searchsorted(before * len(tracklets.first) + after, pair))
 
 
-def _joined(decided: Decided, joins: Joins, step_s: float) -> tuple[Ints, Rows]:
+def _joined(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     """The assignment of each join (J,), and its row."""
-    step, track, source = decided.tracked.tracks[:3]
+    step, track, source = decided.tracks[:3]
+    joins, log_odds = find_joins(decided, step_s), decided.hypotheses.scored().log_odds()
     rows = DECISIONS.empty(len(joins.after))
     rows["kind"], rows["track_id"] = DecisionKind.JOINED, track[joins.after]
     rows["previous_id"], rows["source_id"] = source[joins.before], source[joins.after]
-    by_motion = JOINS.probability(joins.features)
-    rows["probability"] = with_appearance(by_motion, joins, decided.tracked.tracks, decided.appearance)
-    rows["alternative_id"] = np.where(joins.alternative >= 0, source[joins.alternative], _NO_ID)
+    rows["probability"] = JOINS.probability(log_odds[joins.link])
+    rows["alternative_id"] = _alternatives(decided.hypotheses, log_odds[:, 0])[joins.link]
     rows["duration_s"] = (step[joins.after] - step[joins.before]) * step_s
     return joins.after, rows
 
 
+def _alternatives(hypotheses: Hypotheses, log_odds: Floats) -> Ints:
+    """The input id of the likeliest other link of the end of each link (E,), or -1 if there is none that may be."""
+    order = np.lexsort((-log_odds, hypotheses.before))
+    rank = np.arange(len(order)) - np.maximum.accumulate(
+        np.where(run_starts(hypotheses.before[order]), np.arange(len(order)), 0)
+    )
+    other = np.full((2, len(hypotheses.tracklets.first)), _NO_ID)  # the best of each end, and the second
+    for place in (0, 1):
+        link = order[(rank == place) & (log_odds[order] >= _MAY_BE)]
+        other[place, hypotheses.before[link]] = hypotheses.tracklets.source[hypotheses.after[link]]
+    best = np.zeros(len(order), bool)
+    best[order[rank == 0]] = True
+    return np.asarray(np.where(best, other[1, hypotheses.before], other[0, hypotheses.before]))
+
+
 def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     """The first assignment of each track (K,), and the row that says whether it is a person."""
-    step, track, source = decided.tracked.tracks[:3]
+    step, track, source = decided.tracks[:3]
     starts = run_starts(track)
     first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
     rows = DECISIONS.empty(len(first))
@@ -456,7 +482,7 @@ def offline_tracks(
     descriptors = options.stored_looks if options.looks is None else options.looks
     seen_ns = times_ns[np.searchsorted(steps, step)]
     look = np.full(len(step), -1) if descriptors is None else descriptors.find(seen_ns, source)
-    tracks = Tracks(step, track, source, sample, xy, look)
+    tracks = Tracks(step, track, source, sample, xy, look, track)
     if not options.shares_samples:
         tracks = taken(tracks, np.unique(sample, return_index=True)[1])
     seen = Appearance.of(options.looks, tracks, model.step_s)
@@ -470,14 +496,12 @@ def offline_tracks(
     rows = TrackRows.of(tracks.step, tracks.track, tracks.sample)
     is_decided = DECISIONS in options.writes.values()
     moved: Moved | None = None
-    states: tuple[State, State] | None = None
     ids, of = np.unique(tracks.track, return_inverse=True)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
     odds = np.full(len(ids), np.inf)
     if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
-        _, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-        forward, backward, smoothed = smooth(model, trajectories)
-        states = taken(forward, row), taken(backward, row)
+        _, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+        _, _, smoothed = smooth(model, trajectories)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             when = times_ns[np.minimum(np.searchsorted(steps, rows.step), len(times_ns) - 1)]
             moved = moved_to(smoothed.mean[:, :2] * movers.unit_m, rows, samples, options.ground_planes, when)
@@ -499,8 +523,9 @@ def offline_tracks(
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
     left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
-    if is_decided and states is not None:
-        decided = Decided(Tracked(tracks, *states), np.where(is_fixed, np.inf, odds), keeps, appearance)
+    if is_decided and len(ids):
+        hypotheses = hypotheses_of(model, tracks, options.link_s / movers.unit_m, appearance)
+        decided = Decided(tracks, np.where(is_fixed, np.inf, odds), keeps, hypotheses)
         decisions = decision_rows(decided, model, samples, steps)
     by_step = rows_by_step(taken(rows, left), samples, moved and moved.take(left), steps)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
@@ -532,19 +557,42 @@ def _linked(
     options: RetrackOptions, model: MotionModel, tracks: Tracks, movers: Movers, appearance: Appearance | None
 ) -> Tracks:
     """Link tracks of the same person; in pictures they are cut first where they seem to be of two."""
-    pieces: CutTracks | None = None
+    most_s, least = options.link_s / movers.unit_m, options.link_confidence
     if not movers.on_ground:
-        tracks, cuts = cut_joins(model, tracks, options.link_confidence, appearance)
-        pieces = CutTracks.of(tracks, cuts)
+        hypotheses = hypotheses_of(model, tracks, most_s, appearance)
+        tracklets = hypotheses.tracklets
+        root = _roots(hypotheses.scored().best(least), tracklets.begins)
+        return tracks._replace(track=_ids(tracklets.online, root)[tracklets.of])
     ids, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-    ends, limits = TrackEnds.of(model, trajectories), (options.link_s / movers.unit_m, options.link_confidence)
+    ends = TrackEnds.of(model, trajectories)
     seen = None if appearance is None else appearance.between(tracks).of_tracks
-    if pieces is None:
-        continued_by = link_tracks(ends, *limits, MAX_MISFIT, seen)
-    else:
-        continued_by = link_pieces(ends, *limits, pieces, seen)
-    root = np.arange(len(ids))
-    order = np.argsort(ends.begins, kind="stable")  # a continuation begins later
-    for earlier in order[continued_by[order] >= 0].tolist():
-        root[continued_by[earlier]] = root[earlier]
+    root = _roots(link_tracks(ends, most_s, least, MAX_MISFIT, seen), ends.begins)
     return tracks._replace(track=np.asarray(ids[root][np.searchsorted(ids, tracks.track)]))
+
+
+def _roots(goes_on: Ints, begins: Ints) -> Ints:
+    """The first of the chain that each tracklet (K,) is part of; ``goes_on`` (K,) is which follows it, or -1."""
+    root = np.arange(len(goes_on))
+    order = np.argsort(begins, kind="stable")  # a continuation begins later
+    for earlier in order[goes_on[order] >= 0].tolist():
+        root[goes_on[earlier]] = root[earlier]
+    return root
+
+
+def _ids(online: Ints, root: Ints) -> Ints:
+    """The ids of the tracks of tracklets (K,): that of the online track that it began in, if no other one has it."""
+    first = np.unique(root)
+    ids = online[first]
+    again = np.ones(len(first), bool)
+    again[np.unique(ids, return_index=True)[1]] = False
+    ids[again] = online.max(initial=0) + 1 + np.arange(np.count_nonzero(again))
+    return np.asarray(ids[np.searchsorted(first, root)])
+
+
+def hypotheses_of(model: MotionModel, tracks: Tracks, max_gap_s: float, appearance: Appearance | None) -> Hypotheses:
+    """The hypotheses about who is who in tracks, with what the log shows of their looks."""
+    hypotheses = Hypotheses.of(model, tracks, max_gap_s)
+    if appearance is None:
+        return hypotheses
+    sides = appearance.between(tracks._replace(track=hypotheses.tracklets.of))
+    return hypotheses._replace(evidence=sides.of_tracks(hypotheses.before, hypotheses.after))

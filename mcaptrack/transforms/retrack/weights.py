@@ -41,6 +41,36 @@ class Logistic(NamedTuple):
         return probability(self.log_odds(features))
 
 
+class Choices(NamedTuple):
+    """Multinomial logits of what ends and beginnings of tracklets choose: one of the links, or none.
+
+    ``links`` (H, F) are the weights of the terms of links by the class of their gap, ``leaves`` and ``comes`` (G,) of
+    the terms of ends and beginnings; ``usual_leaves`` and ``usual_comes`` (H + 1,) say how often each class is chosen
+    where they were fitted, and none (the last).
+    """
+
+    links: Floats
+    leaves: Floats
+    comes: Floats
+    usual_leaves: Floats
+    usual_comes: Floats
+
+    @classmethod
+    def of(cls, model: str, gaps: Sequence[str], terms: Sequence[str], end_terms: Sequence[str]) -> Choices:
+        """The model of this name in the file, for terms in this order."""
+        return cls.from_entry(_FILE[model], gaps, terms, end_terms)
+
+    @classmethod
+    def from_entry(
+        cls, entry: Mapping[str, Any], gaps: Sequence[str], terms: Sequence[str], end_terms: Sequence[str]
+    ) -> Choices:
+        """The model of an entry of such a file."""
+        links = [[entry["links"][gap][name] for name in terms] for gap in gaps]
+        ends = [[entry[side][name] for name in end_terms] for side in ("leaves", "comes")]
+        usual = [[entry[side][name] for name in (*gaps, "none")] for side in ("usual_leaves", "usual_comes")]
+        return cls(np.array(links), *map(np.array, (*ends, *usual)))
+
+
 def probability(log_odds: Floats) -> Floats:
     """Log odds as probabilities."""
     return np.asarray(1 / (1 + np.exp(-log_odds)))

@@ -1,0 +1,386 @@
+"""Who is who over a whole log: tracklets, what may have become of each, how likely that is, and the best of it.
+
+A tracklet is what nobody doubts: samples that the online tracker gave to one track in a row, all with one input id. At
+its end a person goes on as a later tracklet or leaves; at its beginning one goes on from an earlier tracklet or comes.
+Each end chooses one of these, and so does each beginning, with probabilities in proportion to exp(score) (a multinomial
+logit: McFadden 1974). Scores are sums of named terms with fitted weights. What the log itself says of how many people
+leave, and for how long they are missed, shifts them (Saerens et al. 2002: the expectation-maximisation of priors). The
+best set of links is one assignment over the log, and the probability of each link comes of the same choices.
+
+Letters: C assignments, K tracklets, E candidate links, F terms of a link, G terms of an end.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_ends, run_starts
+from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.linking import (
+    Gaps,
+    are_in_reach,
+    assigned_links,
+    features,
+    has_chance,
+    log_odds,
+    spread_m2,
+)
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
+from mcaptrack.transforms.retrack.weights import Choices
+
+#: The terms of a link: by the motion of the tracks that both tracklets are part of, by that of the tracklets alone,
+#: the seconds between, whether the input or the online tracker took both for one, the numbers of samples of both and
+#: of the tracks before and after, and two that are the same for all links of a log: how often its input ids change, and
+#: how many online tracks it has.
+LINK_TERMS: Final = (
+    "link",
+    "miss",
+    "misfit to noise",
+    "misfit",
+    "misfit or stay",
+    "turn",
+    "stay and speed",
+    "misfit and speed",
+    "speed",
+    "noise",
+    "miss alone",
+    "misfit to noise alone",
+    "gap",
+    "log gap",
+    "same input id",
+    "same track",
+    "samples before",
+    "samples after",
+    "track before",
+    "track after",
+    "rate of input ids",
+    "rate of tracks",
+)
+#: The terms of an end where a person leaves, or of a beginning where one comes.
+END_TERMS: Final = (
+    "end",
+    "ends here",
+    "border",
+    "speed",
+    "last second",
+    "log left",
+    "long left",
+    "samples",
+    "single",
+    "few",
+)
+#: Links have weights by the length of their gap: no step between, and up to so many seconds.
+GAPS_S: Final = (1.7, 5.0)
+GAP_NAMES: Final = ("next step", "up to 1.7 s", "up to 5 s", "longer")
+#: The number of ends and beginnings with the usual shares that count beside those of a log.
+_USUAL_ENDS: Final = 20.0
+#: Added to distances and speeds before taking logarithms: differences below these mean nothing.
+_NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
+#: A long tracklet has so many samples, few are fewer than that; people are counted in squares of this size.
+_LONG, _FEW, _CELL_M = 8, 4, 1.0
+#: Links are kept from these odds on, as a share of those of the least confidence: pieces of a person that stay apart
+#: cost more than wrong ones that go together. (Chosen on synthetic crowds.)
+_ENOUGH: Final = 1 / 5
+#: The number of pairs that are examined at once.
+_BATCH: Final = 1_000_000
+#: What ends and beginnings choose.
+CHOICES = Choices.of("who", GAP_NAMES, LINK_TERMS, END_TERMS)
+
+
+class Tracklets(NamedTuple):
+    """Tracklets (K,), ordered by their first steps; ``of`` (C,) is the tracklet of each assignment.
+
+    ``first`` and ``last`` (K,) are assignments, ``begins`` and ``ends`` (K,) their steps, ``count`` the numbers of
+    assignments, ``source`` the input ids and ``online`` the ids of online tracks.
+    """
+
+    of: Ints
+    first: Ints
+    last: Ints
+    begins: Ints
+    ends: Ints
+    count: Ints
+    source: Ints
+    online: Ints
+
+    @classmethod
+    def in_tracks(cls, tracks: Tracks) -> Tracklets:
+        """The tracklets of tracks (C,): an online track that was split has one at least for each part."""
+        order = tracks.order
+        starts = run_starts(tracks.track[order], tracks.online[order], tracks.source[order])
+        first, last = order[np.flatnonzero(starts)], order[np.flatnonzero(run_ends(starts))]
+        by_begin = np.lexsort((tracks.source[first], tracks.track[first], tracks.step[first]))
+        rank = np.empty_like(by_begin)
+        rank[by_begin] = np.arange(len(by_begin))
+        of = np.empty(len(order), np.int64)
+        of[order] = rank[np.cumsum(starts) - 1]
+        first, last = first[by_begin], last[by_begin]
+        steps = tracks.step[first], tracks.step[last]
+        return cls(of, first, last, *steps, np.bincount(of), tracks.source[first], tracks.online[first])
+
+
+class Hypotheses(NamedTuple):
+    """What may have become of the tracklets of a log.
+
+    ``before`` and ``after`` (E,) are the tracklets of candidate links, ``gap_s`` (E,) the seconds between them and
+    ``gap`` (E,) the class of that; ``terms`` (E, F) are those of links, ``leaves`` and ``comes`` (K, G) of ends.
+    ``evidence`` (E,) is the log likelihood ratio of what else tells whether both are one person.
+    """
+
+    tracklets: Tracklets
+    before: Ints
+    after: Ints
+    gap_s: Floats
+    gap: Ints
+    terms: Floats
+    leaves: Floats
+    comes: Floats
+    evidence: Floats
+
+    @classmethod
+    def of(cls, model: MotionModel, tracks: Tracks, max_gap_s: float) -> Hypotheses:
+        """The hypotheses about tracks as they are now; ``evidence`` is 0."""
+        tracklets = Tracklets.in_tracks(tracks)
+        tracked, alone = (_states(model, tracks, name) for name in (tracks.track, tracklets.of))
+        before, after = _candidates(model, tracks, tracklets, tracked, max_gap_s)
+        gap_s = np.asarray((tracklets.begins[after] - tracklets.ends[before]) * model.step_s, np.float64)
+        gaps, gaps_alone = (
+            Gaps(taken(forward, tracklets.last[before]), taken(backward, tracklets.first[after]), gap_s)
+            for forward, backward in (tracked, alone)
+        )
+        terms = np.column_stack(
+            [
+                np.ones(len(before)),
+                *_motion_terms(model, gaps),
+                *features(model, gaps_alone)[:, :2].T,
+                gap_s,
+                np.log(gap_s + 0.2),
+                *_same(tracklets, before, after),
+                *_samples(tracks, tracklets, before, after),
+                *np.broadcast_to(_rates(tracks, tracklets)[:, None], (2, len(before))),
+            ]
+        )
+        bounds = np.maximum.accumulate([1.5 * model.step_s, *GAPS_S])
+        ends = (_end_terms(model, tracks, tracklets, tracked, leaving) for leaving in (True, False))
+        return cls(
+            tracklets,
+            before,
+            after,
+            gap_s,
+            np.searchsorted(bounds, gap_s),
+            terms.astype(np.float64),
+            *ends,
+            np.zeros(len(before)),
+        )
+
+    def scored(self) -> Scored:
+        """The scores of all hypotheses, with the shares of this log."""
+        choices = CHOICES
+        link = (self.terms * choices.links[self.gap]).sum(axis=1) + self.evidence
+        sides = []
+        for which, terms, weights, usual in (
+            (self.before, self.leaves, choices.leaves, choices.usual_leaves),
+            (self.after, self.comes, choices.comes, choices.usual_comes),
+        ):
+            end = terms @ weights
+            shift = _shifts(which, link, end, self.gap, usual)
+            sides.append((link + shift[self.gap], end + shift[-1]))
+        return Scored(self, *sides[0], *sides[1])
+
+
+class Scored(NamedTuple):
+    """The scores of links as ends see them and as beginnings do, ``out`` and ``into`` (E,), of leaving and of coming,
+    ``leaves`` and ``comes`` (K,).
+    """
+
+    hypotheses: Hypotheses
+    out: Floats
+    leaves: Floats
+    into: Floats
+    comes: Floats
+
+    def best(self, min_confidence: float) -> Ints:
+        """For each tracklet the one that it goes on as, or -1; (K,)."""
+        before, after = self.hypotheses.before, self.hypotheses.after
+        least = np.log(min_confidence / (1 - min_confidence) * _ENOUGH)
+        gain = (self.out - self.leaves[before] + self.into - self.comes[after]) / 2 - least
+        goes_on = np.full(len(self.leaves), -1)
+        good = np.flatnonzero(gain > 0)
+        links = good[assigned_links(before[good], after[good], np.round(gain[good], 6), len(goes_on))]
+        goes_on[before[links]] = after[links]
+        return goes_on
+
+    def log_odds(self) -> Floats:
+        """The log odds of each link against all else that its end, and that its beginning, may choose, (E, 2)."""
+        sides = (self.hypotheses.before, self.out, self.leaves), (self.hypotheses.after, self.into, self.comes)
+        return np.stack([_against_others(*side) for side in sides], axis=1)
+
+
+def _states(model: MotionModel, tracks: Tracks, name: Ints) -> tuple[State, State]:
+    """The states of each assignment (C,) from those before it and from those after it with the same ``name``."""
+    _, row, trajectories = to_trajectories(tracks.step, name, tracks.xy_m)
+    forward, backward = filtered(model, trajectories)
+    return taken(forward, row), taken(backward, row)
+
+
+def _candidates(
+    model: MotionModel, tracks: Tracks, tracklets: Tracklets, states: tuple[State, State], max_gap_s: float
+) -> tuple[Ints, Ints]:
+    """Pairs (E,) of a tracklet and a later one that may be one person, and all that follow each other in a track."""
+    low = np.searchsorted(tracklets.begins, tracklets.ends + 1)
+    count = np.searchsorted(tracklets.begins, tracklets.ends + round(max_gap_s / model.step_s), "right") - low
+    follows = _following(tracks, tracklets)
+    joined = np.flatnonzero(follows >= 0)
+    pairs = [joined * len(follows) + follows[joined]]
+    for part in batches(count, _BATCH):
+        before = part.start + group_index(count[part])
+        after = ragged_range(low[part], count[part])
+        gap_s = np.asarray((tracklets.begins[after] - tracklets.ends[before]) * model.step_s, np.float64)
+        gaps = Gaps(taken(states[0], tracklets.last[before]), taken(states[1], tracklets.first[after]), gap_s)
+        near = np.flatnonzero(are_in_reach(gaps))
+        near = near[has_chance(log_odds(features(model, taken(gaps, near))))]
+        pairs.append(before[near] * len(follows) + after[near])
+    before, after = np.divmod(np.unique(np.concatenate(pairs)), max(len(follows), 1))
+    return before, after
+
+
+def _following(tracks: Tracks, tracklets: Tracklets) -> Ints:
+    """The tracklet that follows each one in its track, or -1; (K,)."""
+    order = np.lexsort((tracklets.begins, tracks.track[tracklets.first]))
+    track = tracks.track[tracklets.first][order]
+    out = np.full(len(order), -1)
+    same = np.flatnonzero(track[1:] == track[:-1])
+    out[order[same]] = order[same + 1]
+    return out
+
+
+def _motion_terms(model: MotionModel, gaps: Gaps) -> list[Floats]:
+    """The terms of how the motion before a gap fits that after it."""
+    before, after, gap_s = gaps
+    span = gap_s[:, None]
+    way = after.mean[:, :2] - before.mean[:, :2]
+    left, came = before.mean[:, 2:], after.mean[:, 2:]
+    length = [np.hypot(*vector.T) for vector in (way - left * span, way - came * span, way - (left + came) / 2 * span)]
+    miss, misfit, stay = np.minimum(*length[:2]), length[2], np.hypot(*way.T)
+    speed = np.log(np.maximum(np.hypot(*left.T), np.hypot(*came.T)) + _SPEED_M_PER_S)
+    noise_m2 = spread_m2(model, gaps)
+    return [
+        np.log(miss + _NEAR_M),
+        np.log1p(misfit**2 / noise_m2 / 2),
+        np.log(misfit + 0.2),
+        np.log(np.minimum(misfit, stay) + _NEAR_M),
+        np.log(np.hypot(*(came - left).T) + _SPEED_M_PER_S),
+        np.log(stay + _NEAR_M) * speed,
+        np.log(misfit + _NEAR_M) * speed,
+        speed,
+        np.log(noise_m2),
+    ]
+
+
+def _same(tracklets: Tracklets, before: Ints, after: Ints) -> tuple[Bools, Bools]:
+    """Whether links (E,) join one input id, and one online track."""
+    return tracklets.source[before] == tracklets.source[after], tracklets.online[before] == tracklets.online[after]
+
+
+def _samples(tracks: Tracks, tracklets: Tracklets, before: Ints, after: Ints) -> list[Floats]:
+    """The logarithms of the numbers of samples of both tracklets of links (E,), and of their tracks up to the end of
+    the one and from the beginning of the other on.
+    """
+    order = tracks.order
+    starts = run_starts(tracks.track[order])
+    length = np.diff(np.append(np.flatnonzero(starts), len(order)))
+    place = np.empty_like(order)
+    place[order] = ragged_range(0, length)
+    rest = np.empty_like(order)
+    rest[order] = np.repeat(length, length)
+    so_far, left = place[tracklets.last] + 1, (rest - place)[tracklets.first]
+    return [np.log(count) for count in (tracklets.count[before], tracklets.count[after], so_far[before], left[after])]
+
+
+def _rates(tracks: Tracks, tracklets: Tracklets) -> Floats:
+    """The logarithms of the numbers of tracklets and of online tracks of the log, for each of its samples."""
+    counts = np.array([len(tracklets.first), len(np.unique(tracks.online))])
+    return np.asarray(np.log((counts + 1) / (len(tracks.step) + 50)))
+
+
+def _end_terms(
+    model: MotionModel, tracks: Tracks, tracklets: Tracklets, states: tuple[State, State], leaving: bool
+) -> Floats:
+    """The terms of leaving at the ends of tracklets, or of coming at their beginnings, (K, G)."""
+    at, state = (tracklets.last, states[0]) if leaving else (tracklets.first, states[1])
+    here = tracks.xy_m[at]
+    speed = np.hypot(*state.mean[at, 2:].T)
+    is_long = tracklets.count >= _LONG
+    sides = np.concatenate([tracks.xy_m[tracklets.first[is_long]], tracks.xy_m[tracklets.last[is_long]]])
+    low, high = np.percentile(tracks.xy_m, [1, 99], axis=0)
+    ends_here = np.maximum(_around(sides, here) - is_long + 0.5, 0.1) / (_around(tracks.xy_m, here) + 5)
+    border_m = np.maximum(np.minimum(here - low, high - here).min(axis=1), 0.0)
+    steps = tracks.step.max() - tracklets.ends if leaving else tracklets.begins - tracks.step.min()
+    left_s = steps * model.step_s
+    return np.column_stack(
+        [
+            np.ones(len(at)),
+            np.log(ends_here),
+            np.log(border_m + 0.5),
+            np.log(speed + 0.1),
+            left_s < 1,
+            np.log(left_s + 1),
+            left_s > 20,
+            np.log(tracklets.count),
+            tracklets.count == 1,
+            tracklets.count < _FEW,
+        ]
+    ).astype(np.float64)
+
+
+def _around(points: Floats, xy: Floats) -> Floats:
+    """The number of points (N, 2) in the square of each position (K, 2) and in the eight around it, (K,)."""
+    corner = np.concatenate([points, xy]).min(axis=0)
+    squares, at = (((places - corner) // _CELL_M).astype(np.int64) + 1 for places in (points, xy))
+    height = max(int(squares[:, 1].max(initial=0)), int(at[:, 1].max(initial=0))) + 2
+    square, count = np.unique(squares @ [height, 1], return_counts=True)
+    total = np.zeros(len(xy))
+    for beside in (np.array([[-1], [0], [1]]) * height + [-1, 0, 1]).ravel().tolist():
+        wanted = at @ [height, 1] + beside
+        place = np.minimum(np.searchsorted(square, wanted), len(square) - 1)
+        total += np.where(square[place] == wanted, count[place], 0) if len(square) else 0
+    return total
+
+
+def _shifts(which: Ints, link: Floats, end: Floats, gap: Ints, usual: Floats) -> Floats:
+    """The shifts of the scores of links by the classes of their gaps, and of leaving (the last one), in this log.
+
+    ``which`` (E,) is the end that may choose each link. What ends choose on average is what is usual where weights were
+    fitted, ``usual``; in this log it is what its own ends choose under these shifts, which is found by iteration.
+    """
+    count, classes = len(end), len(usual) - 1
+    shift = np.zeros(classes + 1)
+    for _ in range(30):
+        chosen = _shares(which, link + shift[gap], end + shift[-1], gap, classes)
+        share = (chosen.sum(axis=0) + _USUAL_ENDS * usual) / (count + _USUAL_ENDS)
+        before, shift = shift, np.log(share / usual)
+        if np.abs(shift - before).max() < 1e-3:
+            break
+    return shift
+
+
+def _shares(which: Ints, link: Floats, end: Floats, gap: Ints, classes: int) -> Floats:
+    """The probability that each end (K,) chooses a link of each class, and that it chooses none, (K, classes + 1)."""
+    top = end.copy()
+    np.maximum.at(top, which, link)
+    odds = np.column_stack([np.zeros((len(end), classes)), np.exp(end - top)])
+    np.add.at(odds, (which, gap), np.exp(link - top[which]))
+    return np.asarray(odds / odds.sum(axis=1, keepdims=True))
+
+
+def _against_others(which: Ints, link: Floats, end: Floats) -> Floats:
+    """The log odds (E,) of each link against all others of its end (K,), and against none."""
+    top = end.copy()
+    np.maximum.at(top, which, link)
+    own = np.exp(link - top[which])
+    total = (np.exp(end - top) + np.bincount(which, own, minlength=len(end)))[which]
+    rest = np.maximum(total - own, 1e-9 * total)
+    return np.asarray(np.log(np.maximum(own, 1e-12) / rest))
