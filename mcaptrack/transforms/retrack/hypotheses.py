@@ -12,11 +12,12 @@ Letters: C assignments, K tracklets, E candidate links, F terms of a link, G ter
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_ends, run_starts
 from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.linking import (
@@ -30,6 +31,9 @@ from mcaptrack.transforms.retrack.linking import (
 )
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import Choices
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 #: The terms of a link: by the motion of the tracks that both tracklets are part of, by that of the tracklets alone,
 #: the seconds between, whether the input or the online tracker took both for one, the numbers of samples of both and
@@ -52,6 +56,7 @@ LINK_TERMS: Final = (
     "log gap",
     "same input id",
     "same track",
+    "beside one track",
     "samples before",
     "samples after",
     "track before",
@@ -63,6 +68,7 @@ LINK_TERMS: Final = (
 END_TERMS: Final = (
     "end",
     "ends here",
+    "beside a track",
     "border",
     "speed",
     "last second",
@@ -79,6 +85,9 @@ GAP_NAMES: Final = ("next step", "up to 1.7 s", "up to 5 s", "longer")
 _USUAL_ENDS: Final = 20.0
 #: Added to distances and speeds before taking logarithms: differences below these mean nothing.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
+#: A person who is lost beside another one may be hidden by that one, or in one detection with that one; from this
+#: distance on nothing speaks for it, and at half of it half as much.
+_BESIDE_M: Final = 2.0
 #: A long tracklet has so many samples, few are fewer than that; people are counted in squares of this size.
 _LONG, _FEW, _CELL_M = 8, 4, 1.0
 #: Links are kept from these odds on, as a share of those of the least confidence: pieces of a person that stay apart
@@ -145,6 +154,7 @@ class Hypotheses(NamedTuple):
         """The hypotheses about tracks as they are now; ``evidence`` is 0."""
         tracklets = Tracklets.in_tracks(tracks)
         tracked, alone = (_states(model, tracks, name) for name in (tracks.track, tracklets.of))
+        beside = [_beside(model, tracks, which) for which in (tracklets.last, tracklets.first)]
         before, after = _candidates(model, tracks, tracklets, tracked, max_gap_s)
         gap_s = np.asarray((tracklets.begins[after] - tracklets.ends[before]) * model.step_s, np.float64)
         gaps, gaps_alone = (
@@ -159,12 +169,16 @@ class Hypotheses(NamedTuple):
                 gap_s,
                 np.log(gap_s + 0.2),
                 *_same(tracklets, before, after),
+                np.asarray(beside[0][before].minimum(beside[1][after]).max(axis=1).todense()).ravel(),
                 *_samples(tracks, tracklets, before, after),
                 *np.broadcast_to(_rates(tracks, tracklets)[:, None], (2, len(before))),
             ]
         )
         bounds = np.maximum.accumulate([1.5 * model.step_s, *GAPS_S])
-        ends = (_end_terms(model, tracks, tracklets, tracked, leaving) for leaving in (True, False))
+        nearest = [np.asarray(near.max(axis=1).todense()).ravel() for near in beside]
+        ends = (
+            _end_terms(model, tracks, tracklets, tracked, nearest[not leaving], leaving) for leaving in (True, False)
+        )
         return cls(
             tracklets,
             before,
@@ -307,9 +321,17 @@ def _rates(tracks: Tracks, tracklets: Tracklets) -> Floats:
 
 
 def _end_terms(
-    model: MotionModel, tracks: Tracks, tracklets: Tracklets, states: tuple[State, State], leaving: bool
+    model: MotionModel,
+    tracks: Tracks,
+    tracklets: Tracklets,
+    states: tuple[State, State],
+    beside: Floats,
+    leaving: bool,
 ) -> Floats:
-    """The terms of leaving at the ends of tracklets, or of coming at their beginnings, (K, G)."""
+    """The terms of leaving at the ends of tracklets, or of coming at their beginnings, (K, G).
+
+    ``beside`` (K,) is how near another track is there, from 0 to 1.
+    """
     at, state = (tracklets.last, states[0]) if leaving else (tracklets.first, states[1])
     here = tracks.xy_m[at]
     speed = np.hypot(*state.mean[at, 2:].T)
@@ -324,6 +346,7 @@ def _end_terms(
         [
             np.ones(len(at)),
             np.log(ends_here),
+            beside,
             np.log(border_m + 0.5),
             np.log(speed + 0.1),
             left_s < 1,
@@ -334,6 +357,23 @@ def _end_terms(
             tracklets.count < _FEW,
         ]
     ).astype(np.float64)
+
+
+def _beside(model: MotionModel, tracks: Tracks, at: Ints) -> csr_array:
+    """How near each track is to assignments (K,) of others at their steps, from 0 to 1; sparse, (K, tracks).
+
+    Tracks are also where they are expected while they are missed.
+    """
+    from scipy.sparse import csr_array
+
+    ids, row, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+    track, xy_m = group_index(np.diff(paths.first)), filtered(model, paths)[0].mean[:, :2]
+    here = tracks.xy_m[at]
+    squares = [np.concatenate([places - _BESIDE_M / 2, places + _BESIDE_M / 2], axis=1) for places in (here, xy_m)]
+    which, other = touching_pairs(*squares, tracks.step[at], paths.step)
+    which, other = (pair[track[other] != track[row[at[which]]]] for pair in (which, other))
+    near = np.maximum(1 - np.hypot(*(here[which] - xy_m[other]).T) / _BESIDE_M, 0.0)
+    return csr_array((near, (which, track[other])), shape=(len(at), len(ids)))
 
 
 def _around(points: Floats, xy: Floats) -> Floats:

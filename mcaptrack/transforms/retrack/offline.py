@@ -38,6 +38,8 @@ from mcaptrack.transforms.retrack.weights import Logistic, probability
 MAX_MISFIT: Final = (0.6, 0.2)
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
+#: Who is who is decided so often, each time with the motion of the tracks that were decided before.
+_SWEEPS: Final = 2
 #: The number of times that encounters are examined again after identities were swapped.
 _ROUNDS: Final = 5
 
@@ -559,10 +561,12 @@ def _linked(
     """Link tracks of the same person; in pictures they are cut first where they seem to be of two."""
     most_s, least = options.link_s / movers.unit_m, options.link_confidence
     if not movers.on_ground:
-        hypotheses = hypotheses_of(model, tracks, most_s, appearance)
-        tracklets = hypotheses.tracklets
-        root = _roots(hypotheses.scored().best(least), tracklets.begins)
-        return tracks._replace(track=_ids(tracklets.online, root)[tracklets.of])
+        for _ in range(_SWEEPS):
+            hypotheses = hypotheses_of(model, tracks, most_s, appearance)
+            tracklets = hypotheses.tracklets
+            root = _roots(hypotheses.scored().best(least), tracklets.begins)
+            tracks = tracks._replace(track=_ids(tracklets.online, root)[tracklets.of])
+        return tracks
     ids, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     ends = TrackEnds.of(model, trajectories)
     seen = None if appearance is None else appearance.between(tracks).of_tracks
