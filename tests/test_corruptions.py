@@ -93,9 +93,7 @@ def test_weights_go_by_the_names_of_features_in_any_order():
     names = ("gap", "miss")
     found = json.loads(WEIGHTS.read_text())["links"]["weights"]
     assert Logistic.of("links", names).weights.tolist() == [found["gap"], found["miss"]]
-    of_joins = linking.JOIN_FEATURES
-    models = {"links": linking.FEATURES, "people": false_tracks.FEATURES, "cuts": of_joins, "joins": of_joins}
-    for model, features in (models | {"relinks": linking.RELINK_FEATURES}).items():
+    for model, features in {"links": linking.FEATURES, "people": false_tracks.FEATURES}.items():
         assert set(json.loads(WEIGHTS.read_text())[model]["weights"]) == set(features)
 
 

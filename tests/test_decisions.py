@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,21 +12,14 @@ from hypothesis import strategies as st
 
 from mcaptrack import log
 from mcaptrack.evaluation.events import lifecycle_of
-from mcaptrack.geometry.arrays import taken
 from mcaptrack.schema import DECISIONS, DecisionKind, EventKind, Frame
 from mcaptrack.transforms import Retrack
-from mcaptrack.transforms.retrack import linking as join_steps
-from mcaptrack.transforms.retrack.linking import cut_joins, find_joins, tracked_of
-from mcaptrack.transforms.retrack.motion_model import MotionModel
 from mcaptrack.viewing.report.identity_events import Doubt, IdentityEvent, find_doubtful_tracks
 from tests.commands import done
-from tests.references.offline import Motion, cut, joins
-from tests.test_offline_reference import tracks_of as assigned
-from tests.worlds import crossing_tracks, noisy_tracks, tracks_at
+from tests.worlds import noisy_tracks, tracks_at
 
 STEP_S = 0.4
 QUICK = [Phase.explicit, Phase.generate]
-MODEL, SLOW = MotionModel(0.2, 1.75, 0.12, 0.08, 0.4), Motion(0.2, 1.75, 0.12, 0.08, STEP_S)
 
 
 def decided(frames: list[Frame], transform: Retrack | None = None) -> tuple[list[Frame], list[Frame]]:
@@ -72,49 +64,6 @@ def test_joins_are_the_repairs_among_events_and_tracks_are_kept_or_left_out(seed
     every = rows_of(decisions)
     assert ((every["probability"] >= 0) & (every["probability"] <= 1)).all()
     assert (every["track_id"][every["kind"] == DecisionKind.LEFT_OUT] == -1).all()
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=6, phases=QUICK)
-def test_joins_and_cuts_equal_the_reference(seed):
-    rng = np.random.default_rng(seed)
-    frames = crossing_tracks(rng) if rng.random() < 0.5 else noisy_tracks(rng, ticks=40)
-    rows = [(tick, row) for tick, frame in enumerate(frames) for row in frame.rows[frame.rows["observed"]]]
-    step = np.array([tick for tick, _ in rows])
-    source = np.array([int(row["track_id"]) for _, row in rows])
-    xy = np.array([(row["x_m"], row["y_m"]) for _, row in rows])
-    track = source // 3 * 10 + (step // 9 + source) % 2  # tracks that take over one another's ids now and then
-    _, once = np.unique(np.column_stack([step, track]), axis=0, return_index=True)
-    once = once[np.lexsort((step[once], track[once]))]
-    step, source, xy, track = step[once], source[once], xy[once], track[once]
-    paths: dict = {}
-    ids: dict = {}
-    for at, name, own, place in zip(step.tolist(), track.tolist(), source.tolist(), xy.tolist(), strict=True):
-        paths.setdefault(name, {})[at] = tuple(place)
-        ids.setdefault(name, {})[at] = own
-    found = find_joins(tracked_of(MODEL, assigned(step, track, source, xy)), MODEL)
-    wanted = joins(SLOW, paths, ids)
-    assert [(int(track[a]), int(step[a])) for a in found.after] == [(name, at) for name, at, _ in wanted]
-    np.testing.assert_allclose(
-        found.features, np.array([one for *_, one in wanted]).reshape(-1, 15), rtol=1e-6, atol=1e-9
-    )
-    pieces, wanted_cuts = cut(SLOW, paths, ids, 0.5)
-    order = rng.permutation(len(step))
-    made, cuts = cut_joins(MODEL, taken(assigned(step, track, source, xy), order), 0.5)
-    names = zip(track[order].tolist(), step[order].tolist(), strict=True)
-    assert made.track.tolist() == [pieces[name][at] for name, at in names]
-    np.testing.assert_allclose(np.column_stack(cuts), np.array(wanted_cuts).reshape(-1, 3), rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize(("least", "wanted"), [(0.5, [(5, 6)]), (0.2, [(5, 6)]), (0.72, [(5, 6), (6, 7)])])
-def test_joins_below_70_percent_are_cut_or_below_what_links_need(monkeypatch, least, wanted):
-    likely = SimpleNamespace(probability=lambda features: np.array([0.69, 0.71, 0.73]))
-    monkeypatch.setattr(join_steps, "_CUTS", likely)
-    step = np.arange(40)
-    xy = np.column_stack([0.5 * step, np.zeros(40)])
-    tracks, cuts = cut_joins(MODEL, assigned(step, np.full(40, 5), step // 10, xy), least)
-    assert [*zip(cuts.before.tolist(), cuts.after.tolist(), strict=True)] == wanted
-    assert [int(tracks.track[at]) for at in (9, 10, 20, 30)] == [5, 6, 6 if len(wanted) == 1 else 7, 5 + len(wanted)]
 
 
 def test_the_alternative_is_the_neighbour_and_a_join_in_a_crowd_is_less_certain():

@@ -14,14 +14,15 @@ from mcaptrack.notices import collected
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import identity_swaps, linking
 from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import compatible, find_swaps, resolve_swaps, swapped_by_pace
 from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
-from mcaptrack.transforms.retrack.linking import Cuts, CutTracks, TrackEnds, find_candidates, link_pieces, link_tracks
+from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.memory import held
-from tests.references import cut_links
-from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, links
+from tests.references.hypotheses import Claim, swept
+from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, links, usual_by_gap
 from tests.references.online import Bends
 from tests.tiers import thorough
 from tools.corruptions import STEP_S, corrupt
@@ -109,58 +110,22 @@ def test_links_equal_the_reference(seed):
 
 
 @given(seed=SEEDS)
-@settings(max_examples=6)
-def test_links_of_tracks_that_were_cut_equal_the_reference(seed):
-    """Some tracks were one with another one before, and two or three share an input id."""
+@settings(max_examples=8)
+def test_who_is_who_equals_the_reference(seed):
+    """Tracks that were of other online tracks for a while, and change their input ids now and then."""
     rng = np.random.default_rng(seed)
     model, motion = models(rng)
-    paths = scattered(rng, int(rng.integers(2, 14)))
-    names = sorted(paths)
-    pairs = [(a, b) for a in names for b in names if max(paths[a]) < min(paths[b])]
-    cuts: dict[int, tuple[int, float]] = {}
-    for number in rng.permutation(len(pairs)).tolist():
-        before, after = pairs[number]
-        if before not in cuts and after not in {one for one, _ in cuts.values()} and rng.random() < 0.4:
-            cuts[before] = after, float(rng.choice([0.0, rng.random() * 0.7]))
-    given_cuts = [(before, after, likely) for before, (after, likely) in cuts.items()]
-    ids = {name: {step: int(rng.integers(3)) + 5 * (step // 12) for step in path} for name, path in paths.items()}
-    most_s, least = float(rng.choice([1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
-    out, _ = laid_out(paths, model.noise_m)
-    rows = [(step, name, ids[name][step]) for name, path in paths.items() for step in path]
-    step, track, source = np.array(rows)[rng.permutation(len(rows))].T
-    sides = np.array(given_cuts).reshape(-1, 3)
-    pieces = CutTracks.of(tracks_of(step, track, source), Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
-    found = link_pieces(TrackEnds.of(model, out), most_s, least, pieces)
-    wanted = cut_links.links(motion, paths, ids, most_s, least, given_cuts)
-    assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == wanted
-
-
-def cut_at(paths: Paths, ids: dict[int, int], cuts: list[tuple[int, int, float]]):
-    """What the links of such tracks are decided by; each has one input id."""
-    model = MotionModel(0.1, 1.0, 0.1, 0.0, 0.4)
-    out, _ = laid_out(paths, 0.1)
-    step, track = np.array([(step, name) for name, path in paths.items() for step in path]).T
-    sides = np.array(cuts).reshape(-1, 3)
-    source = np.array([ids.get(name, name) for name in track.tolist()])
-    pieces = CutTracks.of(tracks_of(step, track, source), Cuts(*sides[:, :2].astype(int).T, sides[:, 2]))
-    return TrackEnds.of(model, out), pieces
-
-
-def straight(first: int, aside_m: float) -> dict[int, tuple[float, float]]:
-    return {step: (0.4 * step, aside_m) for step in range(first, first + 15)}
-
-
-@pytest.mark.parametrize(
-    ("since", "source", "may_be"), [(28, 5, True), (28, 6, False), (29, 5, False)], ids=["5.6 s", "another id", "6 s"]
-)
-def test_pieces_with_one_input_id_may_be_linked_within_6_s_however_they_move(since, source, may_be):
-    """Cut at step 14, a track goes on as another piece, and its input id is seen again later, 12 m aside."""
-    paths = {1: straight(0, 0.0), 2: straight(15, 0.5), 3: straight(since, -12.0)}
-    ends, pieces = cut_at(paths, {1: 5, 3: source}, [(1, 2, 0.1)])
-    found = find_candidates(ends, 20.0, pieces)
-    pairs = set(zip(found.ends.tolist(), found.begins.tolist(), strict=True))
-    assert (0, 1) in pairs
-    assert ((0, 2) in pairs) == may_be
+    paths = scattered(rng, int(rng.integers(2, 12)))
+    claims = [
+        Claim(step, name, name % 5 + 7 * (step // 9 % 2), step // 12 + name % 3, at)
+        for name, path in paths.items()
+        for step, at in path.items()
+    ]
+    step, track, online, source = np.array([(c.step, c.track, c.online, c.source) for c in claims]).T
+    tracks = tracks_of(step, track, source, np.array([claim.at for claim in claims]))._replace(online=online)
+    most_s, least = float(rng.choice([0.0, 1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
+    found = Hypotheses.of(model, tracks, most_s).scored().best(least)
+    assert found.tolist() == swept(motion, claims, most_s, least)
 
 
 @given(seed=SEEDS)
@@ -182,9 +147,10 @@ def test_shifts_by_the_length_of_gaps_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
     count = int(rng.integers(0, 40))
     odds, gap_s = rng.normal(rng.normal(0, 2), 2, count), rng.choice(np.arange(0.4, 20, 0.4), count)
-    made = {(k, k): (float(odds[k]), False, float(gap_s[k])) for k in range(count)}
     found = linking.prior_shifts(odds, gap_s)
-    np.testing.assert_allclose(found, cut_links.usual_by_gap(made), atol=1e-3)
+    made = {k: (float(odds[k]), False, float(gap_s[k])) for k in range(count)}
+    wanted = usual_by_gap(made)
+    np.testing.assert_allclose(found, wanted, atol=1e-3)
 
 
 def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alone():

@@ -22,12 +22,8 @@ FITTED = json.loads((files("mcaptrack") / "transforms/retrack/weights.json").rea
 LINKS = FITTED["links"]["weights"]
 LINK_NAMES = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 LINK_WEIGHTS = [LINKS[name] for name in LINK_NAMES]
+GAPS_S, BY_GAP, GAP_LINKS = (0.9, 1.7, 3.3, 6.5, 13.0, 1e9), FITTED["links"]["usual by gap"], 5.0
 LINK_BIAS, LINK_USUAL, LINK_LEAST = (FITTED["links"][name] for name in ("bias", "usual", "least"))
-CUTS, CUT_BIAS = FITTED["cuts"]["weights"], FITTED["cuts"]["bias"]
-JOIN_NAMES = (*LINK_NAMES, "margin", "alternative", "taken over", "given away", "log before", "log after")
-JOIN_NAMES = (*JOIN_NAMES, "log rate", "log elsewhere")
-JOIN_MARGIN, JOIN_BRIEF_S, JOIN_QUESTIONED, JOIN_RATE_SAMPLES = 12.0, 1.0, 0.7, 50
-Cut = tuple[int, int, float]  # the ids of both pieces, and the probability that they belong together
 MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_COST, LEAST_GAIN = 2.0, 10, 2.0, 1.0, 1.0, 1.0
 DRIFTS = (0.05, 0.15, 0.4, 1.2)
 
@@ -146,97 +142,37 @@ def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float
     return {names[i]: names[j] for (i, j), odds in made.items() if sigmoid(odds + shift) > least}
 
 
-# Joins: a track goes on with another input track. Is it the same person?
+def gap_class(gap_s: float) -> int:
+    """The class of a gap: the first one with a bound that isn't less."""
+    return next(number for number, bound in enumerate(GAPS_S) if gap_s <= bound)
 
 
-def joins(motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> list[tuple[int, int, list[float]]]:
-    """Each join as its track, the first step of the new input id, and its features; by track and step."""
-    ahead = {name: motion.filtered(path) for name, path in paths.items()}
-    back = {name: motion.backwards(path) for name, path in paths.items()}
-    held: dict[int, list[tuple[int, int]]] = {}  # steps and tracks of each input id
-    for name in sorted(paths):
-        for step in sorted(paths[name]):
-            held.setdefault(ids[name][step], []).append((step, name))
-    for places in held.values():
-        places.sort()
+def usual_by_gap(made: dict[object, tuple[float, bool, float]]) -> list[float]:
+    """By how much the log odds of links over gaps of each class are shifted: all links count as some of each class.
 
-    def fit(a: tuple[int, int], b: tuple[int, int]) -> float:
-        """Student's distribution with two degrees of freedom."""
-        before, after, gap_s = ahead[a[0]][a[1]], back[b[0]][b[1]], (b[1] - a[1]) * motion.step_s
-        misfit = link_features(motion, before, after, gap_s)[1]
-        return -2 * misfit - log(link_spread(motion, before, after, gap_s))
-
+    Links have log odds, whether they don't count, and the seconds of their gap.
+    """
+    elsewhere = [(odds, gap_class(gap_s)) for odds, is_other, gap_s in made.values() if not is_other]
+    all_of = usual([odds for odds, _ in elsewhere])
     out = []
-    for name in sorted(paths):
-        for before, after, counts in source_changes(ids[name], JOIN_BRIEF_S / motion.step_s):
-            gap_s = (after - before) * motion.step_s
-            margin, own = JOIN_MARGIN, fit((name, before), (name, after))
-            for other in sorted(paths):
-                if other == name or after not in paths[other]:
-                    continue
-                reach = hypot(*(back[other][after].mean[:, 0] - ahead[name][before].mean[:, 0]))
-                if reach > 1 + REACH_M_PER_S * gap_s:
-                    continue
-                value = own - fit((name, before), (other, after))
-                earlier = [step for step in paths[other] if step < after]
-                if earlier:
-                    theirs = other, max(earlier)
-                    value += fit(theirs, (other, after)) - fit(theirs, (name, after))
-                margin = min(margin, value)
-            had, has = held[ids[name][after]], held[ids[name][before]]
-            at, since = had.index((after, name)), has.index((before, name)) + 1
-            features = link_features(motion, ahead[name][before], back[name][after], gap_s)
-            features += [max(margin, -JOIN_MARGIN), float(margin < JOIN_MARGIN)]
-            features += [float(at > 0 and had[at - 1][1] != name), float(since < len(has) and has[since][1] != name)]
-            out.append((name, after, [*features, log(counts[0]), log(counts[1])]))
-    samples = sum(len(path) for path in paths.values())
-    elsewhere = sum(sum(features[9:11]) for *_, features in out)
-    for *_, features in out:
-        features += [log((len(out) + 1) / (samples + JOIN_RATE_SAMPLES)), log((elsewhere + 0.5) / (len(out) + 1))]
+    for one, often in enumerate(BY_GAP):
+        here = [odds for odds, number in elsewhere if number == one]
+        expected, shift = sigmoid(log(often / (1 - often)) + all_of), 0.0
+        for _ in range(50):
+            right = sum(sigmoid(odds + shift) for odds in here) + GAP_LINKS * expected
+            share = right / (len(here) + GAP_LINKS)
+            shift = log(share / (1 - share)) - log(often / (1 - often))
+        out.append(shift)
     return out
 
 
-def source_changes(ids: dict[int, int], brief: float) -> list[tuple[int, int, tuple[int, int]]]:
-    """The steps before and after each change of the input id, and the numbers of samples of both; without brief ones."""
-    runs: list[list[int]] = []
-    for step in sorted(ids):
-        if runs and ids[runs[-1][-1]] == ids[step]:
-            runs[-1].append(step)
-        else:
-            runs.append([step])
-    long: list[list[int]] = []
-    for number, run in enumerate(runs):
-        inner = 0 < number < len(runs) - 1
-        is_between = inner and ids[runs[number - 1][0]] == ids[runs[number + 1][0]]
-        is_brief = is_between and runs[number + 1][0] - run[0] < brief
-        if long and (is_brief or ids[long[-1][0]] == ids[run[0]]):
-            long[-1] += run
-        else:
-            long.append(list(run))
-    return [(a[-1], b[0], (len(a), len(b))) for a, b in pairwise(long)]
-
-
-def cut(
-    motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]], least: float
-) -> tuple[dict[int, dict[int, int]], list[Cut]]:
-    """The track of each step after tracks are cut at joins that are less likely to be right; and the cuts."""
-    following, cuts = max(paths, default=0), {}
-    for name, step, features in joins(motion, paths, ids):
-        odds = sum(CUTS[one] * value for one, value in zip(JOIN_NAMES, features, strict=True)) + CUT_BIAS
-        if sigmoid(odds) < max(JOIN_QUESTIONED, least):
-            following += 1
-            cuts[name, step] = following, sigmoid(odds)
-    out: dict[int, dict[int, int]] = {}
-    pieces = []
-    for name, path in paths.items():
-        now = name
-        for step in sorted(path):
-            if (name, step) in cuts:
-                piece, likely = cuts[name, step]
-                pieces.append((now, piece, likely))
-                now = piece
-            out.setdefault(name, {})[step] = now
-    return out, sorted(pieces, key=lambda one: one[1])
+def usual(made: list[float]) -> float:
+    """By how much the log odds of links are shifted in this log."""
+    shift = 0.0
+    for _ in range(1000):
+        share = (sum(sigmoid(odds + shift) for odds in made) + 0.3) / (len(made) + 3)
+        shift = log(share / (1 - share)) - log(LINK_USUAL / (1 - LINK_USUAL))
+    return shift
 
 
 # Encounters: two people come near each other; were their track ids swapped?

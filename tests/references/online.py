@@ -8,8 +8,16 @@ from math import exp, floor, hypot, inf, log, log10, pi, sqrt
 
 import numpy as np
 
-from tests.references.cut_links import gap_class, usual_by_gap
-from tests.references.offline import LINK_BIAS, LINK_LEAST, LINK_WEIGHTS, Motion, State, link_features
+from tests.references.offline import (
+    LINK_BIAS,
+    LINK_LEAST,
+    LINK_WEIGHTS,
+    Motion,
+    State,
+    gap_class,
+    link_features,
+    usual_by_gap,
+)
 from tests.references.retracking import (
     LEAST,
     Claims,

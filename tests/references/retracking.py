@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from tests.references.cut_links import linked
 from tests.references.false_tracks import log_odds_in_log
-from tests.references.offline import Motion, cut, exchanged, sigmoid
+from tests.references.hypotheses import Claim, swept
+from tests.references.offline import Motion, exchanged, sigmoid
 
 Point = tuple[float, float]
 Row = dict[str, float]
@@ -117,20 +117,16 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
     motion = Motion(max(noise_m, LEAST), max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
     of = {(step, row["track_id"]): row for step, rows in zip(steps, samples, strict=True) for row in rows}
     paths = claims.paths(of, o.shares_samples)
-    if o.link_s > 0:
-        ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
-        pieces: dict[int, dict[int, Row]] = {}
-        after_cuts, cuts = cut(motion, places_of(paths), ids, o.link_confidence)
-        for track, names in after_cuts.items():
-            for step, piece in names.items():
-                pieces.setdefault(piece, {})[step] = paths[track][step]
-        paths = pieces
-        ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
-        name = linked(motion, places_of(paths), ids, o.link_s, o.link_confidence, cuts)
-        joined: dict[int, dict[int, Row]] = {}
-        for track, path in paths.items():
-            joined.setdefault(name[track], {}).update(path)
-        paths = joined
+    online = {(step, row["track_id"]): track for track, path in paths.items() for step, row in path.items()}
+    for _ in range(2 if o.link_s > 0 else 0):
+        places = [(track, step, row) for track, path in paths.items() for step, row in path.items()]
+        held = [
+            Claim(step, track, online[step, row["track_id"]], row["track_id"], (row["x_m"], row["y_m"]))
+            for track, step, row in places
+        ]
+        paths = {}
+        for track, (_, step, row) in zip(swept(motion, held, o.link_s, o.link_confidence), places, strict=True):
+            paths.setdefault(track, {})[step] = row
     for _ in range(5 if o.resolve_swaps else 0):
         ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
         owner, count = exchanged(motion, places_of(paths), ids)

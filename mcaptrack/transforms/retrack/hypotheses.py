@@ -24,6 +24,7 @@ from mcaptrack.transforms.retrack.linking import (
     Gaps,
     are_in_reach,
     assigned_links,
+    chains,
     features,
     has_chance,
     log_odds,
@@ -217,15 +218,24 @@ class Scored(NamedTuple):
     comes: Floats
 
     def best(self, min_confidence: float) -> Ints:
-        """For each tracklet the one that it goes on as, or -1; (K,)."""
-        before, after = self.hypotheses.before, self.hypotheses.after
+        """The tracks of all assignments (C,) by the best set of links.
+
+        Each has the id of the online track that it begins in; of several the first, and the others have new ids.
+        """
+        tracklets, before, after, *_ = self.hypotheses
         least = np.log(min_confidence / (1 - min_confidence) * _ENOUGH)
         gain = (self.out - self.leaves[before] + self.into - self.comes[after]) / 2 - least
         goes_on = np.full(len(self.leaves), -1)
         good = np.flatnonzero(gain > 0)
         links = good[assigned_links(before[good], after[good], np.round(gain[good], 6), len(goes_on))]
         goes_on[before[links]] = after[links]
-        return goes_on
+        root = chains(goes_on, tracklets.begins)
+        first = np.unique(root)
+        ids = tracklets.online[first]
+        again = np.ones(len(first), bool)
+        again[np.unique(ids, return_index=True)[1]] = False
+        ids[again] = tracklets.online.max(initial=0) + 1 + np.arange(np.count_nonzero(again))
+        return np.asarray(ids[np.searchsorted(first, root)][tracklets.of])
 
     def log_odds(self) -> Floats:
         """The log odds of each link against all else that its end, and that its beginning, may choose, (E, 2)."""

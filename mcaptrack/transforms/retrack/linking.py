@@ -110,6 +110,15 @@ def link_tracks(
     return continued_by
 
 
+def chains(continued_by: Ints, begins: Ints) -> Ints:
+    """The first of the chain that each track (K,) is part of; ``continued_by`` (K,) is the next of it, or -1."""
+    root = np.arange(len(continued_by))
+    order = np.argsort(begins, kind="stable")  # a continuation begins later
+    for earlier in order[continued_by[order] >= 0].tolist():
+        root[continued_by[earlier]] = root[earlier]
+    return root
+
+
 def log_odds(values: Floats) -> Floats:
     """The log odds that links with these features (E, F) are right, where as many are as usual."""
     return _LINKS.log_odds(values)

@@ -29,7 +29,7 @@ from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSam
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
-from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
+from mcaptrack.transforms.retrack.linking import TrackEnds, chains, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
@@ -563,34 +563,13 @@ def _linked(
     if not movers.on_ground:
         for _ in range(_SWEEPS):
             hypotheses = hypotheses_of(model, tracks, most_s, appearance)
-            tracklets = hypotheses.tracklets
-            root = _roots(hypotheses.scored().best(least), tracklets.begins)
-            tracks = tracks._replace(track=_ids(tracklets.online, root)[tracklets.of])
+            tracks = tracks._replace(track=hypotheses.scored().best(least))
         return tracks
     ids, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     ends = TrackEnds.of(model, trajectories)
     seen = None if appearance is None else appearance.between(tracks).of_tracks
-    root = _roots(link_tracks(ends, most_s, least, MAX_MISFIT, seen), ends.begins)
+    root = chains(link_tracks(ends, most_s, least, MAX_MISFIT, seen), ends.begins)
     return tracks._replace(track=np.asarray(ids[root][np.searchsorted(ids, tracks.track)]))
-
-
-def _roots(goes_on: Ints, begins: Ints) -> Ints:
-    """The first of the chain that each tracklet (K,) is part of; ``goes_on`` (K,) is which follows it, or -1."""
-    root = np.arange(len(goes_on))
-    order = np.argsort(begins, kind="stable")  # a continuation begins later
-    for earlier in order[goes_on[order] >= 0].tolist():
-        root[goes_on[earlier]] = root[earlier]
-    return root
-
-
-def _ids(online: Ints, root: Ints) -> Ints:
-    """The ids of the tracks of tracklets (K,): that of the online track that it began in, if no other one has it."""
-    first = np.unique(root)
-    ids = online[first]
-    again = np.ones(len(first), bool)
-    again[np.unique(ids, return_index=True)[1]] = False
-    ids[again] = online.max(initial=0) + 1 + np.arange(np.count_nonzero(again))
-    return np.asarray(ids[np.searchsorted(first, root)])
 
 
 def hypotheses_of(model: MotionModel, tracks: Tracks, max_gap_s: float, appearance: Appearance | None) -> Hypotheses:
