@@ -154,8 +154,9 @@ class Hypotheses(NamedTuple):
     def of(cls, model: MotionModel, tracks: Tracks, max_gap_s: float) -> Hypotheses:
         """The hypotheses about tracks as they are now; ``evidence`` is 0."""
         tracklets = Tracklets.in_tracks(tracks)
-        tracked, alone = (_states(model, tracks, name) for name in (tracks.track, tracklets.of))
-        beside = [_beside(model, tracks, which) for which in (tracklets.last, tracklets.first)]
+        tracked, beside = _tracked(model, tracks, tracklets)
+        _, row, paths = to_trajectories(tracks.step, tracklets.of, tracks.xy_m)
+        alone = [taken(states, row) for states in filtered(model, paths)]
         before, after = _candidates(model, tracks, tracklets, tracked, max_gap_s)
         gap_s = np.asarray((tracklets.begins[after] - tracklets.ends[before]) * model.step_s, np.float64)
         gaps, gaps_alone = (
@@ -243,11 +244,28 @@ class Scored(NamedTuple):
         return np.stack([_against_others(*side) for side in sides], axis=1)
 
 
-def _states(model: MotionModel, tracks: Tracks, name: Ints) -> tuple[State, State]:
-    """The states of each assignment (C,) from those before it and from those after it with the same ``name``."""
-    _, row, trajectories = to_trajectories(tracks.step, name, tracks.xy_m)
-    forward, backward = filtered(model, trajectories)
-    return taken(forward, row), taken(backward, row)
+def _tracked(
+    model: MotionModel, tracks: Tracks, tracklets: Tracklets
+) -> tuple[tuple[State, State], tuple[csr_array, csr_array]]:
+    """The states of each assignment (C,) from those of its track before it, and from those after it; and how near each
+    track is to the ends and to the beginnings of tracklets of others, from 0 to 1: sparse, (K, tracks).
+
+    Tracks are also where they are expected while they are missed.
+    """
+    from scipy.sparse import csr_array
+
+    ids, row, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+    forward, backward = filtered(model, paths)
+    track, at = group_index(np.diff(paths.first)), np.concatenate([tracklets.last, tracklets.first])
+    here, xy_m = tracks.xy_m[at], forward.mean[:, :2]
+    squares = [np.concatenate([places - _BESIDE_M / 2, places + _BESIDE_M / 2], axis=1) for places in (here, xy_m)]
+    which, other = touching_pairs(*squares, tracks.step[at], paths.step)
+    is_other = track[other] != track[row[at[which]]]
+    which, other = which[is_other], other[is_other]
+    near = np.maximum(1 - np.hypot(*(here[which] - xy_m[other]).T) / _BESIDE_M, 0.0)
+    beside = csr_array((near, (which, track[other])), shape=(len(at), len(ids)))
+    count = len(tracklets.last)
+    return (taken(forward, row), taken(backward, row)), (beside[:count], beside[count:])
 
 
 def _candidates(
@@ -367,23 +385,6 @@ def _end_terms(
             tracklets.count < _FEW,
         ]
     ).astype(np.float64)
-
-
-def _beside(model: MotionModel, tracks: Tracks, at: Ints) -> csr_array:
-    """How near each track is to assignments (K,) of others at their steps, from 0 to 1; sparse, (K, tracks).
-
-    Tracks are also where they are expected while they are missed.
-    """
-    from scipy.sparse import csr_array
-
-    ids, row, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-    track, xy_m = group_index(np.diff(paths.first)), filtered(model, paths)[0].mean[:, :2]
-    here = tracks.xy_m[at]
-    squares = [np.concatenate([places - _BESIDE_M / 2, places + _BESIDE_M / 2], axis=1) for places in (here, xy_m)]
-    which, other = touching_pairs(*squares, tracks.step[at], paths.step)
-    which, other = (pair[track[other] != track[row[at[which]]]] for pair in (which, other))
-    near = np.maximum(1 - np.hypot(*(here[which] - xy_m[other]).T) / _BESIDE_M, 0.0)
-    return csr_array((near, (which, track[other])), shape=(len(at), len(ids)))
 
 
 def _around(points: Floats, xy: Floats) -> Floats:
