@@ -103,7 +103,7 @@ CHOICES = Choices.of("who", GAP_NAMES, LINK_TERMS, END_TERMS)
 class Tracklets(NamedTuple):
     """Tracklets (K,), ordered by their first steps; ``of`` (C,) is the tracklet of each assignment.
 
-    ``first`` and ``last`` (K,) are assignments, ``begins`` and ``ends`` (K,) their steps, ``count`` the numbers of
+    ``first`` and ``last`` (K,) are assignments, ``begins`` and ``ends`` (K,) their steps, ``samples`` the numbers of
     assignments, ``source`` the input ids and ``online`` the ids of online tracks.
     """
 
@@ -112,7 +112,7 @@ class Tracklets(NamedTuple):
     last: Ints
     begins: Ints
     ends: Ints
-    count: Ints
+    samples: Ints
     source: Ints
     online: Ints
 
@@ -178,7 +178,7 @@ class Hypotheses(NamedTuple):
         )
         bounds = np.maximum.accumulate([1.5 * model.step_s, *GAPS_S])
         nearest = [np.asarray(near.max(axis=1).todense()).ravel() for near in beside]
-        ends = (
+        leaves, comes = (
             _end_terms(model, tracks, tracklets, tracked, nearest[not leaving], leaving) for leaving in (True, False)
         )
         return cls(
@@ -188,7 +188,8 @@ class Hypotheses(NamedTuple):
             gap_s,
             np.searchsorted(bounds, gap_s),
             terms.astype(np.float64),
-            *ends,
+            leaves,
+            comes,
             np.zeros(len(before)),
         )
 
@@ -258,8 +259,8 @@ def _tracked(
     forward, backward = filtered(model, paths)
     track, at = group_index(np.diff(paths.first)), np.concatenate([tracklets.last, tracklets.first])
     here, xy_m = tracks.xy_m[at], forward.mean[:, :2]
-    squares = [np.concatenate([places - _BESIDE_M / 2, places + _BESIDE_M / 2], axis=1) for places in (here, xy_m)]
-    which, other = touching_pairs(*squares, tracks.step[at], paths.step)
+    own, others = (np.concatenate([xy - _BESIDE_M / 2, xy + _BESIDE_M / 2], axis=1) for xy in (here, xy_m))
+    which, other = touching_pairs(own, others, tracks.step[at], paths.step)
     is_other = track[other] != track[row[at[which]]]
     which, other = which[is_other], other[is_other]
     near = np.maximum(1 - np.hypot(*(here[which] - xy_m[other]).T) / _BESIDE_M, 0.0)
@@ -339,7 +340,9 @@ def _samples(tracks: Tracks, tracklets: Tracklets, before: Ints, after: Ints) ->
     rest = np.empty_like(order)
     rest[order] = np.repeat(length, length)
     so_far, left = place[tracklets.last] + 1, (rest - place)[tracklets.first]
-    return [np.log(count) for count in (tracklets.count[before], tracklets.count[after], so_far[before], left[after])]
+    return [
+        np.log(count) for count in (tracklets.samples[before], tracklets.samples[after], so_far[before], left[after])
+    ]
 
 
 def _rates(tracks: Tracks, tracklets: Tracklets) -> Floats:
@@ -363,7 +366,7 @@ def _end_terms(
     at, state = (tracklets.last, states[0]) if leaving else (tracklets.first, states[1])
     here = tracks.xy_m[at]
     speed = np.hypot(*state.mean[at, 2:].T)
-    is_long = tracklets.count >= _LONG
+    is_long = tracklets.samples >= _LONG
     sides = np.concatenate([tracks.xy_m[tracklets.first[is_long]], tracks.xy_m[tracklets.last[is_long]]])
     low, high = np.percentile(tracks.xy_m, [1, 99], axis=0)
     ends_here = np.maximum(_around(sides, here) - is_long + 0.5, 0.1) / (_around(tracks.xy_m, here) + 5)
@@ -380,9 +383,9 @@ def _end_terms(
             left_s < 1,
             np.log(left_s + 1),
             left_s > 20,
-            np.log(tracklets.count),
-            tracklets.count == 1,
-            tracklets.count < _FEW,
+            np.log(tracklets.samples),
+            tracklets.samples == 1,
+            tracklets.samples < _FEW,
         ]
     ).astype(np.float64)
 
