@@ -133,7 +133,7 @@ class Tracklets(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """What may have become of the tracklets of a log.
+    """The hypotheses about the tracklets of a log.
 
     ``before`` and ``after`` (E,) are the tracklets of candidate links, ``gap_s`` (E,) the seconds between them and
     ``gap`` (E,) the class of that; ``terms`` (E, F) are those of links, ``leaves`` and ``comes`` (K, G) of ends.
