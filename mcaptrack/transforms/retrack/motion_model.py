@@ -186,6 +186,10 @@ def smooth(model: MotionModel, trajectories: Trajectories, noise_m: Floats | flo
 _LEVELS_M: Final = 0.8 / 4.0 ** np.arange(6)
 #: Tracks may begin at any speed.
 _ANY_SPEED_M_PER_S: Final = 20.0
+#: People walk at about this speed. As a recording runs faster, velocities change by the power of 1.5 more.
+_WALK_M_PER_S: Final = 1.4
+#: Steps over which speeds are measured, and the factor by which turns are doubted.
+_SPEED_STEPS, _DOUBT = 3, 2.0
 #: Rounds of expectation maximization; each level counts as if so many tracks had been of it.
 _ROUNDS, _SEEN_BEFORE = 30, 0.5
 #: The least variance of noise in m^2, and about how many rows of trajectories are filtered at once.
@@ -202,17 +206,29 @@ class _Fits(NamedTuple):
     log_spread: Floats
 
 
-def smooth_in_log(model: MotionModel, trajectories: Trajectories, noise_m: float | None) -> State:
+def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known: bool) -> State:
     """The state of every row from past, present and future, with the noise and the turns of the log.
 
-    ``noise_m`` is None if it is to be estimated. Of the model, noise and speed have no influence.
+    Noise is estimated if it isn't known. A track that seems to turn more sharply than one of the model would at the
+    usual speed of the log is taken to turn half as sharply, because noise that lasts looks like turns.
     """
-    model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
-    spans = spans_of(trajectories.first, _ROWS_AT_ONCE)
-    fits = [_fits(model, trajectories, low, high) for low, high in spans]
+    any_speed = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
+    fits = [_fits(any_speed, trajectories, *span) for span in spans_of(trajectories.first, _ROWS_AT_ONCE)]
     if not fits:
         return smooth(model, trajectories)
-    return smooth(model, trajectories, np.exp(_of_levels(joined(fits), noise_m) @ np.log(_LEVELS_M)))
+    level_m = np.exp(_of_levels(joined(fits), model.noise_m if is_noise_known else None) @ np.log(_LEVELS_M))
+    faster = max(_usual_speed(trajectories, model.step_s) / _WALK_M_PER_S, 1.0)
+    usual_m = model.noise_m / faster**1.5
+    return smooth(any_speed, trajectories, np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m)))
+
+
+def _usual_speed(trajectories: Trajectories, step_s: float) -> float:
+    """The root mean square of speeds over some steps, in m/s; 0 if no track is seen as long."""
+    off = trajectories.xy_m[_SPEED_STEPS:] - trajectories.xy_m[:-_SPEED_STEPS]
+    track = group_index(np.diff(trajectories.first))
+    square = (off**2).sum(axis=1)[track[_SPEED_STEPS:] == track[:-_SPEED_STEPS]]
+    square = square[np.isfinite(square)]
+    return float(np.sqrt(square.mean())) / (_SPEED_STEPS * step_s) if len(square) else 0.0
 
 
 def _fits(model: MotionModel, trajectories: Trajectories, low: int, high: int) -> _Fits:

@@ -464,8 +464,7 @@ def offline_tracks(
             forward, backward = filtered(model, trajectories)
             states = taken(forward, row), taken(backward, row)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
-            noise_m = None if options.noise_m is None else model.noise_m
-            moved_m = smooth_in_log(model, trajectories, noise_m).mean[:, :2] * movers.unit_m
+            moved_m = smooth_in_log(model, trajectories, options.noise_m is not None).mean[:, :2] * movers.unit_m
         if movers.on_ground:
             odds = scored_log_odds(
                 smoothed.mean[:, :2] * movers.unit_m,
