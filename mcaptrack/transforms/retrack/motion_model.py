@@ -20,6 +20,8 @@ from mcaptrack.schema.framing import spans_of
 
 #: Standard deviation of measured positions per axis in metres, until it is estimated.
 DEFAULT_NOISE_M: Final = 0.2
+#: People walk at about this speed.
+WALK_M_PER_S: Final = 1.4
 
 
 class State(NamedTuple):
@@ -186,8 +188,6 @@ def smooth(model: MotionModel, trajectories: Trajectories, noise_m: Floats | flo
 _LEVELS_M: Final = 0.8 / 4.0 ** np.arange(6)
 #: Tracks may begin at any speed.
 _ANY_SPEED_M_PER_S: Final = 20.0
-#: People walk at about this speed. As a recording runs faster, velocities change by the power of 1.5 more.
-_WALK_M_PER_S: Final = 1.4
 #: Steps over which speeds are measured, and the factor by which turns are doubted.
 _SPEED_STEPS, _DOUBT = 3, 2.0
 #: Rounds of expectation maximization; each level counts as if so many tracks had been of it.
@@ -206,7 +206,7 @@ class _Fits(NamedTuple):
     log_spread: Floats
 
 
-def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known: bool) -> State:
+def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known: bool, unit_m: float) -> State:
     """The state of every row from past, present and future, with the noise and the turns of the log.
 
     Noise is estimated if it isn't known. A track that seems to turn more sharply than one of the model would at the
@@ -217,7 +217,7 @@ def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known
     if not fits:
         return smooth(model, trajectories)
     level_m = np.exp(_of_levels(joined(fits), model.noise_m if is_noise_known else None) @ np.log(_LEVELS_M))
-    faster = max(_usual_speed(trajectories, model.step_s) / _WALK_M_PER_S, 1.0)
+    faster = max(_usual_speed(trajectories, model.step_s) * unit_m / WALK_M_PER_S, 1.0)
     usual_m = model.noise_m / faster**1.5
     return smooth(any_speed, trajectories, np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m)))
 

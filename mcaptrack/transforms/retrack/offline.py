@@ -381,7 +381,8 @@ def rows_by_step(
     """The rows of tracks at each of ``steps``, at ``times_ns``, ordered by id; each track has the class of most of its
     rows.
 
-    Rows are moved to ``xy_m`` (R, 2), if any. Boxes in the picture move with those between samples; samples keep theirs.
+    Rows are moved to ``xy_m`` (R, 2), if any; boxes in the picture move with those between samples, those of samples
+    stay.
     """
     order = np.lexsort((rows.track, rows.step))
     rows = taken(rows, order)
@@ -464,7 +465,8 @@ def offline_tracks(
             forward, backward = filtered(model, trajectories)
             states = taken(forward, row), taken(backward, row)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
-            moved_m = smooth_in_log(model, trajectories, options.noise_m is not None).mean[:, :2] * movers.unit_m
+            is_known = options.noise_m is not None
+            moved_m = smooth_in_log(model, trajectories, is_known, movers.unit_m).mean[:, :2] * movers.unit_m
         if movers.on_ground:
             odds = scored_log_odds(
                 smoothed.mean[:, :2] * movers.unit_m,
