@@ -131,7 +131,8 @@ class RetrackOptions:
 
     # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture; whether
     # ellipses of predictions follow the log, and the unit of offline tracks its speed; whether a sample that was
-    # assigned to two tracks stays with both; the descriptors of samples, if appearance is compared, and if it is stored.
+    # assigned to two tracks stays with both; the descriptors of samples, if appearance is compared, and if it is
+    # stored.
     links_in_picture: ClassVar[bool] = False
     follows_log: ClassVar[bool] = True
     follows_speed: ClassVar[bool] = False
