@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.references.cut_links import linked
 from tests.references.false_tracks import log_odds_in_log
-from tests.references.offline import Motion, cut, exchanged, sigmoid
+from tests.references.offline import Motion, cut, exchanged, sigmoid, smoothed_in_log
 
 Point = tuple[float, float]
 Row = dict[str, float]
@@ -142,11 +142,12 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         if not count:
             break
     tracks = {track: filled(path, track) for track, path in paths.items()}
+    smoothed = smoothed_in_log(motion, places_of(paths), o.noise_m is not None) if paths else {}
     odds = log_odds_in_log(motion, places_of(paths), (steps[0], steps[-1]))
     for track in list(tracks):
         if o.smooth:
-            for step, state in motion.smoothed(places_of(paths)[track]).items():
-                move_to(tracks[track][step], state.mean[:, 0], o.ground_planes)
+            for step, state in smoothed[track].items():
+                move_to(tracks[track][step], state.mean[:, 0], () if step in paths[track] else o.ground_planes)
         if len(tracks[track]) < round(o.min_track_s * o.rate_hz) + 1 or sigmoid(odds[track]) < o.track_confidence:
             del tracks[track]
     return [[tracks[track][step] for track in sorted(tracks) if step in tracks[track]] for step in steps]

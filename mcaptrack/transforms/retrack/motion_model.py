@@ -141,12 +141,12 @@ class _Steps(NamedTuple):
         return cls(forward, first[1:][order][place] - 1 - step, [0, *np.cumsum(alive).tolist()])
 
 
-def filtered(model: MotionModel, trajectories: Trajectories) -> tuple[State, State]:
+def filtered(model: MotionModel, trajectories: Trajectories, steps: _Steps | None = None) -> tuple[State, State]:
     """The state of every row from past and present, and from present and future.
 
     The filters run over all tracks at once, forward and backward together.
     """
-    steps = _Steps.of(trajectories.first)
+    steps = steps or _Steps.of(trajectories.first)
     rows = np.stack([steps.forward, steps.backward], axis=-1).reshape(-1)
     noise_m = np.full(len(rows), model.noise_m)
     both = _filter(model, trajectories.xy_m.T.take(rows, axis=1), noise_m, [2 * bound for bound in steps.bounds])
@@ -156,21 +156,21 @@ def filtered(model: MotionModel, trajectories: Trajectories) -> tuple[State, Sta
     return forward, backward
 
 
-def smooth(model: MotionModel, trajectories: Trajectories, noise_m: Floats | float | None = None) -> State:
-    """The state of every row from past, present and future (RTS smoother).
-
-    ``noise_m`` is that of the positions of each track, (K,), or of all; by default that of the model.
+def smooth(model: MotionModel, trajectories: Trajectories) -> tuple[State, State, State]:
+    """The state of every row: from past and present, from present and future, and from all (RTS smoother).
 
     Source: Rauch, Tung, Striebel 1965.
     """
-    steps, count = _Steps.of(trajectories.first), np.diff(trajectories.first)
-    of_track = np.broadcast_to(model.noise_m if noise_m is None else noise_m, len(count))
-    of_row = np.repeat(of_track, count)[steps.forward]
-    rows = _filter(model, trajectories.xy_m.T.take(steps.forward, axis=1), of_row, steps.bounds)
-    forward = _states(rows, steps.forward)
-    smoothed = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
-    _smooth_back(model, smoothed, steps.bounds)
-    return _states(smoothed, steps.backward)
+    steps = _Steps.of(trajectories.first)
+    forward, backward = filtered(model, trajectories, steps)
+    return forward, backward, _smoothed(model, forward, steps)
+
+
+def _smoothed(model: MotionModel, forward: State, steps: _Steps) -> State:
+    """The state of every row from all of its track, from that of past and present."""
+    rows = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
+    _smooth_back(model, rows, steps.bounds)
+    return _states(rows, steps.backward)
 
 
 # How noisy the positions of a log are, and how sharply each of its tracks turns.
@@ -206,20 +206,23 @@ class _Fits(NamedTuple):
     log_spread: Floats
 
 
-def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known: bool, unit_m: float) -> State:
-    """The state of every row from past, present and future, with the noise and the turns of the log.
+def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known: bool, unit_m: float) -> Floats:
+    """The position of every row (N, 2) from past, present and future, with the noise and the turns of the log.
 
     Noise is estimated if it isn't known. A track that seems to turn more sharply than one of the model would at the
-    usual speed of the log is taken to turn half as sharply, because noise that lasts looks like turns.
+    usual speed of the log is taken to turn half as sharply, because noise that lasts looks like turns. Positions are in
+    units of ``unit_m`` metres.
     """
-    any_speed = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
-    fits = [_fits(any_speed, trajectories, *span) for span in spans_of(trajectories.first, _ROWS_AT_ONCE)]
-    if not fits:
-        return smooth(model, trajectories)
+    fits = [_fits(model, trajectories, *span) for span in spans_of(trajectories.first, _ROWS_AT_ONCE)]
     level_m = np.exp(_of_levels(joined(fits), model.noise_m if is_noise_known else None) @ np.log(_LEVELS_M))
     faster = max(_usual_speed(trajectories, model.step_s) * unit_m / WALK_M_PER_S, 1.0)
     usual_m = model.noise_m / faster**1.5
-    return smooth(any_speed, trajectories, np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m)))
+    of_track = np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m))
+    steps = _Steps.of(trajectories.first)
+    noise_m = np.repeat(of_track, np.diff(trajectories.first))[steps.forward]
+    model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
+    forward = _filter(model, trajectories.xy_m.T.take(steps.forward, axis=1), noise_m, steps.bounds)
+    return _smoothed(model, _states(forward, steps.forward), steps).mean[:, :2]
 
 
 def _usual_speed(trajectories: Trajectories, step_s: float) -> float:
@@ -235,6 +238,7 @@ def _fits(model: MotionModel, trajectories: Trajectories, low: int, high: int) -
     """How well filters expect the positions of some of the tracks, K from ``low`` to ``high``."""
     first, levels = trajectories.first[low : high + 1], len(_LEVELS_M)
     steps = _Steps.of(first - first[0])
+    model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
     bounds = levels * np.array(steps.bounds)
     xy_m = trajectories.xy_m[first[0] : first[-1]].T.take(np.repeat(steps.forward, levels), axis=1)
     noise_m = np.tile(_LEVELS_M, len(steps.forward))

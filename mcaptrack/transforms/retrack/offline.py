@@ -43,7 +43,7 @@ from mcaptrack.transforms.retrack.linking import (
 from mcaptrack.transforms.retrack.motion_model import (
     MotionModel,
     State,
-    filtered,
+    smooth,
     smooth_in_log,
     to_trajectories,
 )
@@ -459,12 +459,10 @@ def offline_tracks(
     odds = np.full(len(ids), np.inf)
     if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
         _, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-        smoothed = smooth_in_log(model, trajectories, options.noise_m is not None, movers.unit_m)
-        if is_decided:
-            forward, backward = filtered(model, trajectories)
-            states = taken(forward, row), taken(backward, row)
+        forward, backward, smoothed = smooth(model, trajectories)
+        states = taken(forward, row), taken(backward, row)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
-            moved_m = smoothed.mean[:, :2] * movers.unit_m
+            moved_m = movers.unit_m * smooth_in_log(model, trajectories, options.noise_m is not None, movers.unit_m)
         if movers.on_ground:
             odds = scored_log_odds(
                 smoothed.mean[:, :2] * movers.unit_m,
