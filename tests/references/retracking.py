@@ -70,6 +70,18 @@ def steps_of(times_ns: list[int], rate_hz: float) -> list[int]:
     return steps[: len(times_ns)]
 
 
+def median_speed(samples: list[list[Row]], times_ns: list[int]) -> float:
+    """The median in m/s of the speeds over three samples of a track, of those above 0.5; 0 if they are fewer than 30."""
+    paths: dict[int, list[tuple[int, float, float]]] = {}
+    for t_ns, rows in zip(times_ns, samples, strict=True):
+        for row in rows:
+            paths.setdefault(row["track_id"], []).append((t_ns, row["x_m"], row["y_m"]))
+    pairs = [(a, b) for path in paths.values() for a, b in zip(path, path[3:], strict=False)]
+    speeds = [np.hypot(b[1] - a[1], b[2] - a[2]) / (b[0] - a[0]) * 1e9 for a, b in pairs]
+    speeds = [speed for speed in speeds if speed > 0.5]
+    return float(np.median(speeds)) if len(speeds) >= 30 else 0.0
+
+
 @dataclass
 class Claims:
     """The samples of tracks, in the order in which they were assigned."""

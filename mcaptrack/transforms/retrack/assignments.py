@@ -194,9 +194,9 @@ class Movers(NamedTuple):
     drift_m_per_s: float | None = None
 
 
-#: Speeds are measured over so many steps. What is slower stands; where most go so much faster than walkers, units are
-#: larger.
-_PACE_STEPS: Final = 3
+#: Speeds are measured over so many steps, and so many say something. What is slower stands; where most go so much
+#: faster than walkers, units are larger.
+_PACE_STEPS, _LEAST_SPEEDS = 3, 30
 _STANDS_M_PER_S, _FAST = 0.5, 1.5
 #: People in pictures.
 PEOPLE: Final[Movers] = Movers()
@@ -241,7 +241,7 @@ def at_pace_of_log(movers: Movers, frames: Sequence[Frame]) -> Movers:
         speeds.append(way_m[usable] / passed_s[usable] / movers.unit_m)
     going = np.concatenate(speeds)
     going = going[going > _STANDS_M_PER_S]
-    faster = float(np.median(going)) / WALK_M_PER_S if len(going) else 0.0
+    faster = float(np.median(going)) / WALK_M_PER_S if len(going) >= _LEAST_SPEEDS else 0.0
     return movers._replace(unit_m=movers.unit_m * faster) if faster > _FAST else movers
 
 
