@@ -120,8 +120,8 @@ def smoothed_in_log(motion: Motion, paths: dict[int, Path], is_noise_known: bool
         share /= share.sum()
         if not is_noise_known:
             off = sum(likely[name][k] * fits[name][k][0] for name in fits for k in range(6))
-            variance = max(off / (2 * total), 1e-6)
-    usual = motion.noise_m / max(usual_speed(motion, paths) / 1.4, 1.0) ** 1.5
+            variance = max(off / (2 * (total + 30)), 1e-6)
+    usual = motion.noise_m / max(usual_speed(motion, paths) / 1.4, 1.0) ** 2
     out = {}
     for name, path in paths.items():
         level_m = exp(sum(p * log(level.noise_m) for p, level in zip(likely[name], levels, strict=True)))

@@ -192,6 +192,8 @@ _ANY_SPEED_M_PER_S: Final = 20.0
 _SPEED_STEPS, _DOUBT = 3, 2.0
 #: Rounds of expectation maximization; each level counts as if so many tracks had been of it.
 _ROUNDS, _SEEN_BEFORE = 30, 0.5
+#: As if so many positions had been without noise: a few that are off show a turn rather than noise.
+_EXACT: Final = 30.0
 #: The least variance of noise in m^2, and about how many rows of trajectories are filtered at once.
 _LEAST_VARIANCE_M2, _ROWS_AT_ONCE = 1e-6, 2**15
 
@@ -216,7 +218,7 @@ def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known
     fits = [_fits(model, trajectories, *span) for span in spans_of(trajectories.first, _ROWS_AT_ONCE)]
     level_m = np.exp(_of_levels(joined(fits), model.noise_m if is_noise_known else None) @ np.log(_LEVELS_M))
     faster = max(_usual_speed(trajectories, model.step_s) * unit_m / WALK_M_PER_S, 1.0)
-    usual_m = model.noise_m / faster**1.5
+    usual_m = model.noise_m / faster**2
     of_track = np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m))
     steps = _Steps.of(trajectories.first)
     noise_m = np.repeat(of_track, np.diff(trajectories.first))[steps.forward]
@@ -271,7 +273,7 @@ def _of_levels(fits: _Fits, noise_m: float | None) -> Floats:
         share = of_level.sum(axis=0) + _SEEN_BEFORE
         share /= share.sum()
         if noise_m is None:
-            variance_m2 = max((of_level * fits.squares_m2).sum() / (2 * total), _LEAST_VARIANCE_M2)
+            variance_m2 = max((of_level * fits.squares_m2).sum() / (2 * (total + _EXACT)), _LEAST_VARIANCE_M2)
     return np.asarray(of_level)
 
 
