@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
 from mcaptrack.notices import collected
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import identity_swaps, linking
+from mcaptrack.transforms.retrack import identity_swaps, linking, motion_model
 from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import compatible, find_swaps, resolve_swaps, swapped_by_pace
 from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
 from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.memory import held
 from tests.references.hypotheses import Claim, swept
-from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, links, usual_by_gap
+from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, links, smoothed_in_log, usual_by_gap
 from tests.references.online import Bends
 from tests.tiers import thorough
 from tools.corruptions import STEP_S, corrupt
@@ -94,6 +94,21 @@ def test_filtered_and_smoothed_states_equal_the_reference(seed):
         theirs = [state for path in paths.values() for state in dict(sorted(other(path).items())).values()]
         np.testing.assert_allclose(states.mean, [s.mean.T.ravel() for s in theirs], atol=1e-9)
         np.testing.assert_allclose(states.cov, [s.cov[[0, 0, 1], [0, 1, 1]] for s in theirs], atol=1e-9)
+
+
+@given(seed=SEEDS, is_noise_known=st.booleans())
+@settings(max_examples=10)
+def test_smoothing_that_follows_the_log_equals_the_reference(seed, is_noise_known):
+    rng = np.random.default_rng(seed)
+    model, motion = models(rng)
+    paths = scattered(rng, int(rng.integers(1, 5)))
+    out, _ = laid_out(paths, model.noise_m)
+    wanted = smoothed_in_log(motion, paths, is_noise_known)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(motion_model, "_ROWS_AT_ONCE", int(rng.choice([5, 2**15])))
+        found = smooth_in_log(model, out, is_noise_known, 1.0)
+    theirs = [state.mean[:, 0] for name in sorted(paths) for _, state in sorted(wanted[name].items())]
+    np.testing.assert_allclose(found, theirs, atol=1e-6)
 
 
 @given(seed=SEEDS)

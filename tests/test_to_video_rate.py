@@ -13,7 +13,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms.retrack.assignments import LogSamples
-from mcaptrack.transforms.retrack.offline import TrackRows, move_rows, moved_to, rows_by_step
+from mcaptrack.transforms.retrack.offline import TrackRows, move_rows, rows_by_step
 from mcaptrack.transforms.to_video_rate import linked_tracks, mended_ends, to_video_rate
 from tests.worlds import ns
 
@@ -358,6 +358,11 @@ class Scene:
         track, step, row = np.array(pairs).T
         self.track_rows = TrackRows.of(step, track, row)
 
+    def by_step(self, xy_m: np.ndarray | None, planes: tuple) -> list:
+        """The rows at each step, moved to these positions, if any."""
+        steps = np.arange(self.steps[-1] + 1)
+        return list(rows_by_step(self.track_rows, self.samples, xy_m, planes, steps, ns(1) * steps * 2 // 5))
+
     def slowly(self) -> dict[int, list[dict[str, float]]]:
         """The rows at each step, by rising ids."""
         out: dict[int, list[dict[str, float]]] = {}
@@ -389,7 +394,7 @@ def test_rows_between_samples_are_interpolated(seed: int, part_rows: int, monkey
     monkeypatch.setattr(framing, "PART_ROWS", part_rows)
     scene = Scene(seed)
     wanted = scene.slowly()
-    found = list(rows_by_step(scene.track_rows, scene.samples, None, range(scene.steps[-1] + 1)))
+    found = scene.by_step(None, PLANES)
     assert len(found) == scene.steps[-1] + 1
     assert sum(map(len, found)) == sum(map(len, wanted.values()))
     for step, rows in enumerate(found):
@@ -407,16 +412,15 @@ def test_rows_between_samples_are_interpolated(seed: int, part_rows: int, monkey
 
 
 @pytest.mark.parametrize("planes", [PLANES, ()])
-def test_boxes_move_with_their_positions_where_there_is_a_plane(planes: tuple):
+def test_boxes_of_rows_between_samples_move_with_their_positions_where_there_is_a_plane(planes: tuple):
     """By a metre along x and two along y, which are 10 and 20 px, and from the third second on 20 and 40 px."""
     scene = Scene(9)
     rows, wanted = scene.track_rows, scene.slowly()
     at = np.stack([rows.between(scene.samples.column(name)) for name in ("x_m", "y_m")], axis=-1)
-    moved = moved_to(at + [1.0, 2.0], rows, scene.samples, planes, np.array([ns(one / 2.5) for one in rows.step]))
-    assert (moved.shift_px is None) == (not planes)
-    for step, some in enumerate(rows_by_step(rows, scene.samples, moved, range(scene.steps[-1] + 1))):
-        px = (0 if not planes else 10 if step / 2.5 < 3 else 20) * np.array([1, 2])
+    for step, some in enumerate(scene.by_step(at + [1.0, 2.0], planes)):
         for row, one in zip(some, wanted.get(step, []), strict=True):
+            stays = not planes or row["source_id"] >= 0
+            px = (0 if stays else 10 if step / 2.5 < 3 else 20) * np.array([1, 2])
             assert (row["x_m"], row["y_m"]) == pytest.approx((one["x_m"] + 1, one["y_m"] + 2))
             assert (row["x_px"], row["y_px"]) == pytest.approx((one["x_px"] + px[0], one["y_px"] + px[1]))
             assert (row["w_px"], row["h_px"]) == pytest.approx((one["w_px"], one["h_px"]))

@@ -175,7 +175,7 @@ case(
 )  # fmt: skip
 case(
     "drift_m_per_s", "a person goes round in circles, 15 degrees a tick",
-    replace(LIKELY, drift_ratio=0.0, smooth=True), CIRCLES, off_the_path, {1.0: "least", 0.3: "more", 0.1: "most"},
+    replace(LIKELY, drift_ratio=0.0, smooth=True), CIRCLES, off_the_path, {0.3: "least", 0.1: "more", 0.02: "most"},
 )  # fmt: skip
 case(
     "drift_ratio", "a person goes round in circles, 15 degrees a tick",

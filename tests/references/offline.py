@@ -7,7 +7,7 @@ when the package changes. Only the weights and biases that tools/fit_retrack.py 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from itertools import combinations, pairwise
 from math import exp, hypot, inf, log
@@ -92,6 +92,58 @@ class State:
 
 def sigmoid(odds: float) -> float:
     return 1 / (1 + exp(-odds))
+
+
+# Smoothing that follows the log.
+
+
+def smoothed_in_log(motion: Motion, paths: dict[int, Path], is_noise_known: bool) -> dict[int, dict[int, State]]:
+    """The state of each track at every step, with the noise of the log and the turns of each track."""
+    levels = [replace(motion, noise_m=0.8 / 4**k, speed_m_per_s=20.0) for k in range(6)]
+    fits = {name: [expected(level, path) for level in levels] for name, path in paths.items()}
+    total = max(sum(len(path) - 1 for path in paths.values()), 1)
+    alone = [max(sum(fit[k][0] for fit in fits.values()) / (2 * total), 1e-6) for k in range(6)]
+    best = min(range(6), key=lambda k: total * log(alone[k]) + sum(fit[k][1] for fit in fits.values()))
+    variance = max(motion.noise_m**2, 1e-6) if is_noise_known else alone[best]
+    share = np.full(6, 1 / 6)
+    for _ in range(30):
+        likely = {}
+        for name, fit in fits.items():
+            score = [log(p) - square / (2 * variance) - spread for p, (square, spread) in zip(share, fit, strict=True)]
+            weight = np.exp(np.array(score) - max(score))
+            likely[name] = weight / weight.sum()
+        share = sum(likely.values()) + 0.5
+        share /= share.sum()
+        if not is_noise_known:
+            off = sum(likely[name][k] * fits[name][k][0] for name in fits for k in range(6))
+            variance = max(off / (2 * (total + 30)), 1e-6)
+    usual = motion.noise_m / max(usual_speed(motion, paths) / 1.4, 1.0) ** 2
+    out = {}
+    for name, path in paths.items():
+        level_m = exp(sum(p * log(level.noise_m) for p, level in zip(likely[name], levels, strict=True)))
+        out[name] = replace(levels[0], noise_m=max(level_m, min(usual, 2 * level_m))).smoothed(path)
+    return out
+
+
+def expected(motion: Motion, path: Path) -> tuple[float, float]:
+    """How far off positions are where they are expected, squared and summed; and logarithms of what that should be.
+
+    Both as multiples of the noise's variance, the first times that in m^2.
+    """
+    states, square, spread = motion.filtered(path), 0.0, 0.0
+    for step in sorted(path)[1:]:
+        state, _ = motion.ahead(states[step - 1])
+        factor = state.cov[0, 0] / motion.noise_m**2 + 1
+        square += ((np.array(path[step]) - state.mean[:, 0]) ** 2).sum() / factor
+        spread += log(factor)
+    return square, spread
+
+
+def usual_speed(motion: Motion, paths: dict[int, Path]) -> float:
+    """The root mean square of speeds over three steps."""
+    pairs = [(path[step], path[step + 3]) for path in paths.values() for step in path if step + 3 in path]
+    squares = [(hypot(b[0] - a[0], b[1] - a[1]) / (3 * motion.step_s)) ** 2 for a, b in pairs]
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
 
 
 # Links over gaps.

@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.references.false_tracks import log_odds_in_log
 from tests.references.hypotheses import Claim, swept
-from tests.references.offline import Motion, exchanged, sigmoid
+from tests.references.offline import Motion, exchanged, sigmoid, smoothed_in_log
 
 Point = tuple[float, float]
 Row = dict[str, float]
@@ -68,6 +68,18 @@ def steps_of(times_ns: list[int], rate_hz: float) -> list[int]:
     for before, now in pairwise(times_ns):
         steps.append(steps[-1] + max(1, round((now - before) / 1e9 * rate_hz)))
     return steps[: len(times_ns)]
+
+
+def median_speed(samples: list[list[Row]], times_ns: list[int]) -> float:
+    """The median in m/s of the speeds over three samples of a track, of those above 0.5; 0 if they are fewer than 30."""
+    paths: dict[int, list[tuple[int, float, float]]] = {}
+    for t_ns, rows in zip(times_ns, samples, strict=True):
+        for row in rows:
+            paths.setdefault(row["track_id"], []).append((t_ns, row["x_m"], row["y_m"]))
+    pairs = [(a, b) for path in paths.values() for a, b in zip(path, path[3:], strict=False)]
+    speeds = [np.hypot(b[1] - a[1], b[2] - a[2]) / (b[0] - a[0]) * 1e9 for a, b in pairs]
+    speeds = [speed for speed in speeds if speed > 0.5]
+    return float(np.median(speeds)) if len(speeds) >= 30 else 0.0
 
 
 @dataclass
@@ -138,11 +150,12 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         if not count:
             break
     tracks = {track: filled(path, track) for track, path in paths.items()}
+    smoothed = smoothed_in_log(motion, places_of(paths), o.noise_m is not None) if paths else {}
     odds = log_odds_in_log(motion, places_of(paths), (steps[0], steps[-1]))
     for track in list(tracks):
         if o.smooth:
-            for step, state in motion.smoothed(places_of(paths)[track]).items():
-                move_to(tracks[track][step], state.mean[:, 0], o.ground_planes)
+            for step, state in smoothed[track].items():
+                move_to(tracks[track][step], state.mean[:, 0], () if step in paths[track] else o.ground_planes)
         if len(tracks[track]) < round(o.min_track_s * o.rate_hz) + 1 or sigmoid(odds[track]) < o.track_confidence:
             del tracks[track]
     return [[tracks[track][step] for track in sorted(tracks) if step in tracks[track]] for step in steps]

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.clocks import steps_passed
+from mcaptrack.geometry.clocks import NS_PER_S, steps_passed
 from mcaptrack.geometry.ragged import find_rows, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.classes import first_classes
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import frame_numbers, has_any, joined_parts, row_ends, spans_of, split_rows, unique_values
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
+from mcaptrack.transforms.retrack.motion_model import WALK_M_PER_S
 
 
 class Tracks(NamedTuple):
@@ -194,6 +195,10 @@ class Movers(NamedTuple):
     drift_m_per_s: float | None = None
 
 
+#: Speeds are measured over so many steps, and so many say something. What is slower stands; where most go so much
+#: faster than walkers, units are larger.
+_PACE_STEPS, _LEAST_SPEEDS = 3, 30
+_STANDS_M_PER_S, _FAST = 0.5, 1.5
 #: People in pictures.
 PEOPLE: Final[Movers] = Movers()
 
@@ -218,6 +223,27 @@ def movers_of(frames: Sequence[Frame], class_names: ClassNames, usual_score: flo
     drift_m_per_s = limits.drift_m_per_s if on_ground else None
     (unit_m,) = units_m([number], class_names, class_limits)
     return Movers(unit_m, on_ground, usual_score, drift_m_per_s)
+
+
+def at_pace_of_log(movers: Movers, frames: Sequence[Frame]) -> Movers:
+    """The same kind of tracks in a larger unit, if most of those that go anywhere go faster than people walk.
+
+    Runners and skaters, bicycles, a recording that is read at another rate: in this unit they walk. It takes the whole
+    log to know it, so that it is for offline tracks.
+    """
+    speeds = [np.empty(0)]
+    for _, _, part in joined_parts(TRACKS, frames):
+        order = np.lexsort((part.row_ns, part.rows["track_id"]))
+        track, x_m, y_m = (part.rows[name][order] for name in ("track_id", "x_m", "y_m"))
+        before, after = order[:-_PACE_STEPS], order[_PACE_STEPS:]
+        passed_s = (part.row_ns[after] - part.row_ns[before]) / NS_PER_S
+        way_m = np.hypot(*(values[_PACE_STEPS:] - values[:-_PACE_STEPS] for values in (x_m, y_m)))
+        usable = (track[_PACE_STEPS:] == track[:-_PACE_STEPS]) & (passed_s > 0)
+        speeds.append(way_m[usable] / passed_s[usable] / movers.unit_m)
+    going = np.concatenate(speeds)
+    going = going[going > _STANDS_M_PER_S]
+    faster = float(np.median(going)) / WALK_M_PER_S if len(going) >= _LEAST_SPEEDS else 0.0
+    return movers._replace(unit_m=movers.unit_m * faster) if faster > _FAST else movers
 
 
 def _is_slow(frames: Sequence[Frame]) -> bool:

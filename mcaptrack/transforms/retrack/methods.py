@@ -22,6 +22,7 @@ from mcaptrack.transforms.retrack.appearance import AppearanceCalibration
 from mcaptrack.transforms.retrack.assignments import (
     Movers,
     OnlinePass,
+    at_pace_of_log,
     join_classes,
     movers_of,
     split_classes,
@@ -210,16 +211,24 @@ def _retracked(
 ) -> list[Iterable[Frame]]:
     """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    run = KeptIds(options, movers, frames) if movers.on_ground else new_pass(options, movers)
-    for frame in () if movers.on_ground else frames:
-        run.step(frame)
-    run.finish()
+    online = KeptIds(options, movers, frames) if movers.on_ground else _passed(new_pass(options, movers), frames)
+    run = online
+    if options.follows_speed and not movers.on_ground and (paced := at_pace_of_log(movers, frames)) != movers:
+        movers, run = paced, _passed(new_pass(options, paced), frames)
     model = motion_model(options, run.noise_m, movers)
     offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
     seen.extend([] if offline.calibration is None else [offline.calibration])
     times = frames.t_ns.tolist(), frames.numbers.tolist()
     tracks, decisions, looks = (map(Frame, *times, rows) for rows in (offline.tracks, offline.decisions, offline.looks))
-    return [tracks, *run.outputs(), decisions, looks][: len(options.writes)]
+    return [tracks, *online.outputs(), decisions, looks][: len(options.writes)]
+
+
+def _passed(run: OnlinePass, frames: FrameColumns) -> OnlinePass:
+    """A pass that has seen all frames."""
+    for frame in frames:
+        run.step(frame)
+    run.finish()
+    return run
 
 
 _PAPER: Final = RetrackByConsistency(

@@ -9,16 +9,19 @@ Letters: K tracks or pairs, N rows of trajectories.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Floats, Ints, joined
 from mcaptrack.geometry.ragged import group_index, ragged_range
+from mcaptrack.schema.framing import spans_of
 
 #: Standard deviation of measured positions per axis in metres, until it is estimated.
 DEFAULT_NOISE_M: Final = 0.2
+#: People walk at about this speed.
+WALK_M_PER_S: Final = 1.4
 
 
 class State(NamedTuple):
@@ -43,8 +46,8 @@ class MotionModel:
     drift_ratio: float
     step_s: float
 
-    def initial(self, xy_m: Floats, noise_m: float) -> StateRows:
-        """States of tracks that were measured once, at (2, K), with this noise."""
+    def initial(self, xy_m: Floats, noise_m: Floats | float) -> StateRows:
+        """States of tracks that were measured once, at (2, K), with this noise, (K,) or one for all."""
         out = StateRows(np.zeros((4, xy_m.shape[1])), np.zeros((3, xy_m.shape[1])))
         out.mean[:2], out.cov[0], out.cov[2] = xy_m, noise_m**2, self.speed_m_per_s**2
         return out
@@ -145,7 +148,8 @@ def filtered(model: MotionModel, trajectories: Trajectories, steps: _Steps | Non
     """
     steps = steps or _Steps.of(trajectories.first)
     rows = np.stack([steps.forward, steps.backward], axis=-1).reshape(-1)
-    both = _filter(model, trajectories.xy_m.T.take(rows, axis=1), [2 * bound for bound in steps.bounds])
+    noise_m = np.full(len(rows), model.noise_m)
+    both = _filter(model, trajectories.xy_m.T.take(rows, axis=1), noise_m, [2 * bound for bound in steps.bounds])
     forward = _states(both.take(slice(0, None, 2)), steps.forward)
     backward = _states(both.take(slice(1, None, 2)), steps.backward)
     backward.mean[:, 2:] *= -1
@@ -159,9 +163,118 @@ def smooth(model: MotionModel, trajectories: Trajectories) -> tuple[State, State
     """
     steps = _Steps.of(trajectories.first)
     forward, backward = filtered(model, trajectories, steps)
-    smoothed = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
-    _smooth_back(model, smoothed, steps.bounds)
-    return forward, backward, _states(smoothed, steps.backward)
+    return forward, backward, _smoothed(model, forward, steps)
+
+
+def _smoothed(model: MotionModel, forward: State, steps: _Steps) -> State:
+    """The state of every row from all of its track, from that of past and present."""
+    rows = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
+    _smooth_back(model, rows, steps.bounds)
+    return _states(rows, steps.backward)
+
+
+# How noisy the positions of a log are, and how sharply each of its tracks turns.
+#
+# Where a smoother sees a track depends on the ratio of noise and drift alone. So the model's drift is kept: a track
+# that turns more sharply is smoothed as if its positions had less noise, one that goes straight as if they had more.
+# A filter at each of some levels says how likely the positions of each track are. Noise is the same for all tracks; it
+# and the shares of levels are estimated together (expectation maximization: Dempster, Laird and Rubin 1977), so that a
+# short track is smoothed as most are, a long one as it moves itself. Noise that lasts looks like turns, and is left.
+#
+# Letters: K tracks, G levels, N rows of trajectories.
+
+
+#: The noise in m at each level; at the next one tracks turn four times as sharply.
+_LEVELS_M: Final = 0.8 / 4.0 ** np.arange(6)
+#: Tracks may begin at any speed.
+_ANY_SPEED_M_PER_S: Final = 20.0
+#: Steps over which speeds are measured, and the factor by which turns are doubted.
+_SPEED_STEPS, _DOUBT = 3, 2.0
+#: Rounds of expectation maximization; each level counts as if so many tracks had been of it.
+_ROUNDS, _SEEN_BEFORE = 30, 0.5
+#: As if so many positions had been without noise: a few that are off show a turn rather than noise.
+_EXACT: Final = 30.0
+#: The least variance of noise in m^2, and about how many rows of trajectories are filtered at once.
+_LEAST_VARIANCE_M2, _ROWS_AT_ONCE = 1e-6, 2**15
+
+
+class _Fits(NamedTuple):
+    """How well filters expect positions at each level: how many each track has, (K,); sums of the squares of what they
+    are off, in m^2 of noise, (K, G); and sums of the logarithms of the variances of that, as multiples of noise's.
+    """
+
+    count: Floats
+    squares_m2: Floats
+    log_spread: Floats
+
+
+def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known: bool, unit_m: float) -> Floats:
+    """The position of every row (N, 2) from past, present and future, with the noise and the turns of the log.
+
+    Noise is estimated if it isn't known. A track that seems to turn more sharply than one of the model would at the
+    usual speed of the log is taken to turn half as sharply, because noise that lasts looks like turns. Positions are in
+    units of ``unit_m`` metres.
+    """
+    fits = [_fits(model, trajectories, *span) for span in spans_of(trajectories.first, _ROWS_AT_ONCE)]
+    level_m = np.exp(_of_levels(joined(fits), model.noise_m if is_noise_known else None) @ np.log(_LEVELS_M))
+    faster = max(_usual_speed(trajectories, model.step_s) * unit_m / WALK_M_PER_S, 1.0)
+    usual_m = model.noise_m / faster**2
+    of_track = np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m))
+    steps = _Steps.of(trajectories.first)
+    noise_m = np.repeat(of_track, np.diff(trajectories.first))[steps.forward]
+    model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
+    forward = _filter(model, trajectories.xy_m.T.take(steps.forward, axis=1), noise_m, steps.bounds)
+    return _smoothed(model, _states(forward, steps.forward), steps).mean[:, :2]
+
+
+def _usual_speed(trajectories: Trajectories, step_s: float) -> float:
+    """The root mean square of speeds over some steps, in m/s; 0 if no track is seen as long."""
+    off = trajectories.xy_m[_SPEED_STEPS:] - trajectories.xy_m[:-_SPEED_STEPS]
+    track = group_index(np.diff(trajectories.first))
+    square = (off**2).sum(axis=1)[track[_SPEED_STEPS:] == track[:-_SPEED_STEPS]]
+    square = square[np.isfinite(square)]
+    return float(np.sqrt(square.mean())) / (_SPEED_STEPS * step_s) if len(square) else 0.0
+
+
+def _fits(model: MotionModel, trajectories: Trajectories, low: int, high: int) -> _Fits:
+    """How well filters expect the positions of some of the tracks, K from ``low`` to ``high``."""
+    first, levels = trajectories.first[low : high + 1], len(_LEVELS_M)
+    steps = _Steps.of(first - first[0])
+    model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
+    bounds = levels * np.array(steps.bounds)
+    xy_m = trajectories.xy_m[first[0] : first[-1]].T.take(np.repeat(steps.forward, levels), axis=1)
+    noise_m = np.tile(_LEVELS_M, len(steps.forward))
+    expected = _filter(model, xy_m, noise_m, bounds.tolist())
+    model.predict(expected, model.step_s, expected)
+    size = np.diff(bounds)
+    later = np.arange(bounds[1], bounds[-1])
+    later = later[np.isfinite(xy_m[0, later])]
+    before = later - np.repeat(size[:-1], size[1:])[later - bounds[1]]
+    spread = expected.cov[0, before] / noise_m[later] ** 2 + 1
+    squares_m2 = ((xy_m[:, later] - expected.mean[:2, before]) ** 2).sum(axis=0) / spread
+    of = np.repeat(group_index(np.diff(first))[steps.forward] * levels, levels)[later] + later % levels
+    shape, cells = (high - low, levels), (high - low) * levels
+    each = (np.bincount(of, weights, cells).reshape(shape) for weights in (None, squares_m2, np.log(spread)))
+    count, *sums = each
+    return _Fits(count[:, 0].astype(float), *sums)
+
+
+def _of_levels(fits: _Fits, noise_m: float | None) -> Floats:
+    """The probability that each track is of each level, (K, G)."""
+    total = max(fits.count.sum(), 1.0)
+    alone_m2 = np.maximum(fits.squares_m2.sum(axis=0) / (2 * total), _LEAST_VARIANCE_M2)  # if all are of this level
+    best = (total * np.log(alone_m2) + fits.log_spread.sum(axis=0)).argmin()
+    variance_m2 = alone_m2[best] if noise_m is None else max(noise_m**2, _LEAST_VARIANCE_M2)
+    share = np.ones(len(_LEVELS_M)) / len(_LEVELS_M)
+    for _ in range(_ROUNDS):
+        log_odds = np.log(share) - fits.squares_m2 / (2 * variance_m2) - fits.log_spread
+        of_level = np.exp(log_odds - log_odds.max(axis=1, keepdims=True))
+        of_level /= of_level.sum(axis=1, keepdims=True)
+        share = of_level.sum(axis=0) + _SEEN_BEFORE
+        share /= share.sum()
+        if noise_m is None:
+            variance_m2 = max((of_level * fits.squares_m2).sum() / (2 * (total + _EXACT)), _LEAST_VARIANCE_M2)
+    return np.asarray(of_level)
 
 
 def _states(rows: StateRows, place: Ints) -> State:
@@ -205,26 +318,27 @@ def _by_length(first: Ints) -> tuple[Ints, Ints]:
     return order, alive
 
 
-def _filter(model: MotionModel, xy_m: Floats, bounds: Sequence[int]) -> StateRows:
-    """The states (M,) of filters that read positions (2, M), NaN inside gaps, step by step as ``bounds`` says."""
+def _filter(model: MotionModel, xy_m: Floats, noise_m: Floats, bounds: Sequence[int]) -> StateRows:
+    """The states (M,) of filters that read positions (2, M), NaN inside gaps, with noise (M,), step by step as
+    ``bounds`` says.
+    """
     count = xy_m.shape[1]
     out = StateRows(np.empty((4, count)), np.empty((3, count)))
     if not count:
         return out
     start = slice(bounds[0], bounds[1])
-    for part, values in zip(out, model.initial(xy_m[:, start], model.noise_m), strict=True):
+    for part, values in zip(out, model.initial(xy_m[:, start], noise_m[start]), strict=True):
         part[:, start] = values
-    out.cov[0, start] = model.noise_m * model.noise_m
     is_measured = np.isfinite(xy_m[0])
     is_whole = np.logical_and.reduceat(is_measured, bounds[:-1]).tolist()
     for before, low, high, whole in zip(bounds, bounds[1:], bounds[2:], is_whole[1:], strict=False):
         now, here = out.take(slice(low, high)), slice(low, high)
         model.predict(out.take(slice(before, before + high - low)), model.step_s, now)
         if whole:
-            update(now, xy_m[:, here], model.noise_m)
+            update(now, xy_m[:, here], noise_m[here])
             continue
         (which,) = is_measured[here].nonzero()
         some = now.take(which)
-        update(some, xy_m[:, here][:, which], model.noise_m)
+        update(some, xy_m[:, here][:, which], noise_m[here][which])
         now.mean[:, which], now.cov[:, which] = some
     return out

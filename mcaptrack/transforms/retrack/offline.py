@@ -30,7 +30,7 @@ from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_lo
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.linking import TrackEnds, chains, link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
 
@@ -327,53 +327,21 @@ class TrackRows(NamedTuple):
         return out
 
 
-class Moved(NamedTuple):
-    """Where smoothing moves rows (R,) to: positions (R, 2) in m, and what is added to x_px and y_px, (R, 2), if any."""
-
-    xy_m: Floats
-    shift_px: Floats | None
-
-    def take(self, which: Ints) -> Moved:
-        """The movements of some of the rows."""
-        return Moved(self.xy_m[which], None if self.shift_px is None else self.shift_px[which])
-
-
-def moved_to(xy_m: Floats, rows: TrackRows, samples: LogSamples, planes: Planes, t_ns: Ints) -> Moved:
-    """Move rows (R,) to positions (R, 2) in m, and their boxes with them if there is a ground plane at their times."""
-    if not planes:
-        return Moved(xy_m, None)
-    from_m, size = (
-        np.stack([rows.between(samples.column(name)) for name in names], axis=-1)
-        for names in (("x_m", "y_m"), ("w_px", "h_px"))
-    )
-    return Moved(xy_m, _shift(from_m, xy_m, size, planes, t_ns))
-
-
 def move_rows(rows: Rows, xy_m: Floats, planes: Planes, t_ns: Ints) -> Rows:
     """Move rows (R,) to other positions (R, 2), and their boxes with them if there is a ground plane at their times."""
     out = rows.copy()
-    if planes:
-        from_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
-        _add(out, _shift(from_m, xy_m, columns_to_boxes(rows)[:, 2:], planes, t_ns))
+    which = np.maximum(np.searchsorted([since_ns for since_ns, _ in planes], t_ns, side="right") - 1, 0)
+    for number in np.unique(which).tolist() if planes else ():
+        plane, here = planes[number][1], which == number
+        before, size_px = rows[here], columns_to_boxes(rows[here])[:, 2:]
+        from_m = np.stack([before["x_m"], before["y_m"]], axis=-1)
+        shift_px = plane.standing_boxes(xy_m[here], size_px) - plane.standing_boxes(from_m, size_px)
+        out["x_px"][here], out["y_px"][here] = (
+            before[name] + np.where(np.isfinite(shift_px).all(axis=1), shift_px[:, axis], 0.0)
+            for axis, name in enumerate(("x_px", "y_px"))
+        )
     out["x_m"], out["y_m"] = xy_m.T
     return out
-
-
-def _shift(from_m: Floats, to_m: Floats, size_px: Floats, planes: Planes, t_ns: Ints) -> Floats:
-    """The distance in px by which boxes of this size move between positions in m; all of them (R, 2)."""
-    out = np.zeros((len(from_m), 2))
-    which = np.maximum(np.searchsorted([since_ns for since_ns, _ in planes], t_ns, side="right") - 1, 0)
-    for number in np.unique(which).tolist():
-        plane, here = planes[number][1], which == number
-        size = size_px[here]
-        shift = plane.standing_boxes(to_m[here], size) - plane.standing_boxes(from_m[here], size)
-        out[here] = np.where(np.isfinite(shift), shift, 0.0)[:, :2]
-    return out
-
-
-def _add(rows: Rows, shift_px: Floats) -> None:
-    rows["x_px"] += shift_px[:, 0]
-    rows["y_px"] += shift_px[:, 1]
 
 
 # The class of a track, where its rows are of several: that of most of them.
@@ -428,22 +396,31 @@ def vote(rows: Rows) -> tuple[int, int]:
     return len(np.unique(track[changed])), len(ids)
 
 
-def rows_by_step(rows: TrackRows, samples: LogSamples, moved: Moved | None, steps: Sequence[int]) -> Iterator[Rows]:
-    """The rows of tracks at each of ``steps``, ordered by id; each track has the class of most of its rows."""
+def rows_by_step(
+    rows: TrackRows, samples: LogSamples, xy_m: Floats | None, planes: Planes, steps: Sequence[int], times_ns: Ints
+) -> Iterator[Rows]:
+    """The rows of tracks at each of ``steps``, at ``times_ns``, ordered by id; each track has the class of most of its
+    rows.
+
+    Rows are moved to ``xy_m`` (R, 2), if any; boxes in the picture move with those between samples, those of samples
+    stay.
+    """
     order = np.lexsort((rows.track, rows.step))
-    rows, moved = taken(rows, order), moved and moved.take(order)
+    rows = taken(rows, order)
     ends = np.append(0, np.searchsorted(rows.step, steps, "right"))
     votes = np.empty(len(order), [("track_id", np.int64), ("class_id", np.uint32)])
     votes["track_id"], votes["class_id"] = rows.track, samples.column("class_id")[rows.before]
     vote(votes)
     for low, high in spans_of(ends):
         here = slice(ends[low], ends[high])
-        part = _rows(taken(rows, here), samples)
+        those = taken(rows, here)
+        part = _rows(those, samples)
         part["class_id"] = votes["class_id"][here]
-        if moved is not None:
-            part["x_m"], part["y_m"] = moved.xy_m[here].T
-            if moved.shift_px is not None:
-                _add(part, moved.shift_px[here])
+        if xy_m is not None:
+            to_m, between = xy_m[order[here]], np.flatnonzero(~those.is_sample)
+            at_ns = times_ns[np.searchsorted(steps, those.step[between])]
+            part[between] = move_rows(part.take(between), to_m[between], planes, at_ns)
+            part["x_m"], part["y_m"] = to_m.T
         bounds = (ends[low : high + 1] - ends[low]).tolist()
         yield from (part[start:end] for start, end in pairwise(bounds))
 
@@ -497,7 +474,7 @@ def offline_tracks(
     tracks = taken(tracks, tracks.order)
     rows = TrackRows.of(tracks.step, tracks.track, tracks.sample)
     is_decided = DECISIONS in options.writes.values()
-    moved: Moved | None = None
+    moved_m: Floats | None = None
     ids, of = np.unique(tracks.track, return_inverse=True)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
     odds = np.full(len(ids), np.inf)
@@ -505,8 +482,7 @@ def offline_tracks(
         _, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
         _, _, smoothed = smooth(model, trajectories)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
-            when = times_ns[np.minimum(np.searchsorted(steps, rows.step), len(times_ns) - 1)]
-            moved = moved_to(smoothed.mean[:, :2] * movers.unit_m, rows, samples, options.ground_planes, when)
+            moved_m = movers.unit_m * smooth_in_log(model, trajectories, options.noise_m is not None, movers.unit_m)
         if movers.on_ground:
             odds = scored_log_odds(
                 smoothed.mean[:, :2] * movers.unit_m,
@@ -529,7 +505,8 @@ def offline_tracks(
         hypotheses = hypotheses_of(model, tracks, options.link_s / movers.unit_m, appearance)
         decided = Decided(tracks, np.where(is_fixed, np.inf, odds), keeps, hypotheses)
         decisions = decision_rows(decided, model, samples, steps)
-    by_step = rows_by_step(taken(rows, left), samples, moved and moved.take(left), steps)
+    shown_m = None if moved_m is None else moved_m[left]
+    by_step = rows_by_step(taken(rows, left), samples, shown_m, options.ground_planes, steps, times_ns)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
     if (stored := options.stored_looks) is not None:
         kept = taken(tracks, keeps[of] & (tracks.look >= 0))

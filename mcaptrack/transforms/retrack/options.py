@@ -130,10 +130,12 @@ class RetrackOptions:
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": float("inf"), "online": 0.0, "predictions": 0.0})
 
     # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture; whether
-    # ellipses of predictions follow the log; whether a sample that was assigned to two tracks stays with both; the
-    # descriptors of samples, if appearance is compared, and if it is stored.
+    # ellipses of predictions follow the log, and the unit of offline tracks its speed; whether a sample that was
+    # assigned to two tracks stays with both; the descriptors of samples, if appearance is compared, and if it is
+    # stored.
     links_in_picture: ClassVar[bool] = False
     follows_log: ClassVar[bool] = True
+    follows_speed: ClassVar[bool] = False
     shares_samples: ClassVar[bool] = False
     looks: ClassVar[Descriptors | None] = None
     stored_looks: ClassVar[Descriptors | None] = None
@@ -216,6 +218,8 @@ class LikelihoodOptions(RetrackOptions):
     @property
     def follows_log(self) -> bool:  # type: ignore[override]
         return self.adapt
+
+    follows_speed: ClassVar[bool] = True
 
     merge_distance_m: float = setting(1.0, least=0.0, theme=_ASSOCIATION)
     merge_timeout_s: float = setting(3.0, least=0.0, theme=_ASSOCIATION)
