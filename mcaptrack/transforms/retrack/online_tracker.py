@@ -489,32 +489,28 @@ def _squared(off: Floats) -> Floats:
 # Letters: F steps, R tracks alive at these steps, end to end; V values, E features, D directions.
 
 
-#: The features of a track at a step. Of itself: whether it was observed only once; the logarithm of its observations;
-#: the share of its steps without one; logarithms of the seconds since the last one, of how uncertain its position is,
-#: of its speed, of how far it is from where it began, and of how far its observations are from its filter, as a ratio
-#: to the noise; and the share of its observations that have another input id than the one before. Among others: how
-#: near the nearest older track is that was observed, and for which share of its steps there was one; whether it is
-#: outside of the area in which confirmed tracks were seen, and how far. Of this log so far, as logarithms: the share of
-#: steps at which lasting tracks were missed, the shares of new tracks that came back when they were lost, and that
-#: lasted, and how rare gaps are that are as long as this one.
+#: The features of a track at a step. Of itself: logarithms of the number of its observations, of the seconds since the
+#: last one, of how far it is from where it began, and of how far its observations are from its filter, as a ratio to
+#: the noise; and the share of them that have another input id than the one before. Among others: how near the nearest
+#: older track is that was observed; whether it is outside of the area in which confirmed tracks were seen, and how far.
+#: Of this log so far, as logarithms: the share of steps at which lasting tracks were missed; the share of other ones,
+#: here called new, that came back when they were lost; how many new ones were over inside of the area, and how many
+#: steps they had, as ratios to lasting ones; the odds that what begins is false; and how rare gaps are that are as long
+#: as this one.
 PRESENT_FEATURES: Final = (
-    "first",
     "log hits",
-    "missed share",
     "log missed",
-    "log spread",
-    "log speed",
     "log distance",
     "log roughness",
     "changes",
     "beside",
-    "beside share",
     "outside",
     "outside by",
-    "outside squared",
     "lasting missed",
     "new came back",
-    "new lasted",
+    "new over",
+    "new steps",
+    "log odds of false births",
     "rare gap",
 )
 #: The kinds of tracks that have weights of their own: observed before and after confirmation, and lost, before and
@@ -549,9 +545,10 @@ class PresentTracks:
         self._lasting = _LASTING * (confirm_hits - 1) + 1
         self._models = [Logistic.of(f"online {kind}", PRESENT_FEATURES) for kind in PRESENT_KINDS]
         # of the tracks alive at the last step: ids, rising, and totals of what is added up over their steps
-        self._ids, self._totals = np.empty(0, np.int64), np.empty((0, 4))
+        self._ids, self._totals = np.empty(0, np.int64), np.empty((0, 3))
         self._border = np.full(len(_DIRECTIONS.T), -np.inf)
-        self._counts = np.zeros(6 + min(max_age, _GAP_LEVELS))
+        self._levels = min(max_age, _GAP_LEVELS)
+        self._counts = np.zeros(8 + self._levels)
 
     def __call__(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Floats:
         """The log odds (R,) that each track alive at one of F steps is a person who is here now.
@@ -574,29 +571,22 @@ class PresentTracks:
 
     def features(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Floats:
         """The features of each track at each step, (R, E): see ``PRESENT_FEATURES``. The arguments are those above."""
-        hits, missed, steps = tracks[HITS], tracks[MISSED], tracks[STEPS]
-        beside = self._beside(tick, tracks, xy_m)
+        hits, missed = tracks[HITS], tracks[MISSED]
         off = _squared(xy_m - state.mean[:2]) / noise_m[tick] ** 2
-        totals = np.stack([off, beside > 0, *(xy_m * (steps == 1))])
-        rough, near, *birth_m = self._added_up(tick, tracks[IDS], totals)
+        begins = np.where(tracks[STEPS] == 1, xy_m, 0.0)
+        rough, *begin_m = self._added_up(tick, tracks[IDS], np.stack([off, *begins]))
         outside_m = self._outside(tick, hits >= self._confirm_hits, missed == 0, xy_m, len(noise_m))
         return np.stack(
             [
-                hits == 1,
                 np.log(hits),
-                1 - hits / steps,
                 np.log(missed * self._step_s + 0.1),
-                np.log(state.cov[0]) / 2,
-                np.log(np.hypot(*state.mean[2:]) + 0.15),
-                np.log(np.hypot(*(xy_m - birth_m)) + 0.3),
+                np.log(np.hypot(*(xy_m - begin_m)) + 0.3),
                 np.log(rough / np.maximum(hits - 1, 1) + 0.05),
                 tracks[CHANGES] / hits,
-                beside,
-                near / steps,
+                self._beside(tick, tracks, xy_m),
                 outside_m > 0,
                 outside_m,
-                outside_m**2,
-                *self._of_log(tick, tracks, len(noise_m)),
+                *self._of_log(tick, tracks, outside_m > 0, len(noise_m)),
             ],
             axis=-1,
         )
@@ -642,36 +632,44 @@ class PresentTracks:
         self._border = reached[:, -1]
         return np.clip(np.nan_to_num((along - reached[:, tick]).max(axis=0), nan=np.inf), -_BORDER_M, _BORDER_M)
 
-    def _of_log(self, tick: Ints, tracks: Ints, count: int) -> Floats:
-        """The features that say how tracks (R,) fared so far in this log, (4, R)."""
-        hits, missed, gap = tracks[HITS], tracks[MISSED], tracks[GAP]
-        has_lasted, is_lost = hits >= self._lasting, missed > 0
-        level, returned = (self._level(steps) for steps in (missed, gap * ~is_lost))
-        levels = min(self._max_age, _GAP_LEVELS)
+    def _of_log(self, tick: Ints, tracks: Ints, is_outside: Bools, count: int) -> Floats:
+        """The features that say how tracks (R,) fared so far in this log, (6, R)."""
+        hits, missed = tracks[HITS], tracks[MISSED]
+        lasts, is_lost = hits >= self._lasting, missed > 0
+        # the same as in ``OnlineTracker``: those that are not observed at the next step are over
+        longest = np.where(hits >= self._confirm_hits, self._max_age, min(self._confirm_hits, self._max_age))
+        is_over = (missed == longest) & ~is_outside
+        returned = np.where(is_lost, 0, self._level(tracks[GAP]))
         happened = [
-            has_lasted,
-            has_lasted & is_lost,
-            ~has_lasted & (missed == 1),
-            ~has_lasted & (returned > 0),
+            lasts,
+            lasts & is_lost,
+            ~lasts & (missed == 1),
+            ~lasts & (returned > 0),
+            lasts & is_over,
+            ~lasts & is_over,
+            ~lasts,
             tracks[STEPS] == 1,
-            (hits == self._lasting) & ~is_lost,
-            *(returned >= np.arange(1, levels + 1)[:, None]),
+            *(returned >= np.arange(1, self._levels + 1)[:, None]),
         ]
         counts = np.stack([np.bincount(tick[rows], minlength=count) for rows in happened])
         counts = self._counts[:, None] + counts.cumsum(axis=1)
         self._counts = counts[:, -1]
-        lasting, lasting_missed, lost, back, born, lasted, gaps, *_ = counts[:, tick]
-        as_long = counts[5 + np.maximum(level, 1), tick]
+        lasting, lasting_missed, lost, back, over, new_over, new, born, gaps, *_ = counts[:, tick]
+        # people are lost at any time: new tracks that are over more often than lasting ones were false
+        false = new_over - (over + 1) / (lasting + 50) * new
+        false_share = np.clip(np.maximum(false, 0.3) / (born + 1), 0.01, 0.97)
+        as_long = counts[7 + np.maximum(self._level(missed), 1), tick]
         return np.stack(
             [
                 np.log((lasting_missed + 1) / (lasting + 10)),
                 np.log((back + 1) / (lost + 1)),
-                np.log((lasted + 1) / (born + 1)),
+                np.log((new_over + 0.5) / (over + 0.5)),
+                np.log((new + 1) / (lasting + 10)),
+                np.log(false_share / (1 - false_share)),
                 np.where(is_lost, -np.log((as_long + 0.5) / (gaps + 3)), 0.0),
             ]
         )
 
     def _level(self, steps: Ints) -> Ints:
         """The level (R,) of gaps of so many steps (R,), from 1 on; 0 for none."""
-        levels = min(self._max_age, _GAP_LEVELS)
-        return -(-np.minimum(steps, self._max_age) * levels // self._max_age)
+        return -(-np.minimum(steps, self._max_age) * self._levels // self._max_age)
