@@ -272,7 +272,7 @@ def decisions_of(run: Run) -> tuple[Judged, Judged]:
 
 
 class Present(NamedTuple):
-    """Tracks at the steps of a scene (R,): features (R, F), kinds, whether each is a person who is there, and weights."""
+    """Tracks at the steps of a scene (R,): features (R, F), kinds, which are people who are there, and weights."""
 
     features: np.ndarray
     kind: np.ndarray
@@ -348,7 +348,10 @@ def fit_present(parts: list[Present]) -> dict[str, Any]:
     fitted = {}
     for number, name in enumerate(online_tracker.PRESENT_KINDS):
         here = kind == number
-        weights = logistic(features[here], is_right[here].astype(float), weight[here], ridge=PRESENT_RIDGE)
+        varies = np.append(features[here].std(axis=0) > 1e-6, True)  # what is observed now was not missed
+        chosen = features[here][:, varies[:-1]]
+        weights = np.zeros(len(varies))
+        weights[varies] = logistic(chosen, is_right[here].astype(float), weight[here], ridge=PRESENT_RIDGE)
         names = online_tracker.PRESENT_FEATURES
         fitted[f"online {name}"] = {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
     return fitted

@@ -323,7 +323,7 @@ class OnlineTracker:
         """Whether a track is written online."""
         o = self.options
         if o.adapt_online:
-            return odds >= 0
+            return odds >= 1.5 * (is_seen and person.hits < self.confirm)
         if is_seen:
             return person.hits >= self.confirm
         return person.hits >= 1.5 * self.confirm and person.missed <= round(o.coast_s * o.rate_hz)

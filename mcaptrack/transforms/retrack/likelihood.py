@@ -316,7 +316,7 @@ class LikelihoodPass(OnlinePass):
             is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
             is_shown = np.where(has, tracks[HITS] >= self._confirm_hits, (tracks[MISSED] <= self._coast) & is_old)
         else:
-            is_shown = self._present(tick, tracks, state, place, noise_m) >= 0
+            is_shown = self._present(tick, tracks, state, place, noise_m)
         self._write(_Read(t_ns, numbers, steps, samples), tick, row, tracks, state, is_shown)
 
     def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, state: StateRows, is_shown: Bools) -> None:

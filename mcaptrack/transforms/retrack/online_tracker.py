@@ -516,6 +516,9 @@ PRESENT_FEATURES: Final = (
 #: The kinds of tracks that have weights of their own: observed before and after confirmation, and lost, before and
 #: after they lasted.
 PRESENT_KINDS: Final = ("new", "confirmed", "lost", "lasting lost")
+#: The log odds from which each kind is written. A track that begins has to be surer than others, because it is written
+#: under an id that it may turn out not to be. (Chosen on synthetic crowds.)
+_LEAST_LOG_ODDS: Final = np.array([1.5, 0.0, 0.0, 0.0])
 #: A track has lasted once it was observed for so many times as long as its confirmation takes.
 _LASTING: Final = 3
 #: An older track is beside another one up to this distance; the border counts up to the other one.
@@ -528,7 +531,7 @@ _DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 class PresentTracks:
-    """How likely each track is a person who is here now: called with the steps of a log, some at a time.
+    """Which tracks are likely a person who is here now: called with the steps of a log, some at a time.
 
     Parameters
     ----------
@@ -550,19 +553,19 @@ class PresentTracks:
         self._levels = min(max_age, _GAP_LEVELS)
         self._counts = np.zeros(8 + self._levels)
 
-    def __call__(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Floats:
-        """The log odds (R,) that each track alive at one of F steps is a person who is here now.
+    def __call__(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Bools:
+        """Which of the tracks (R,) alive at F steps are written, because each is likely a person who is here now.
 
         ``noise_m`` (F,) is the noise of positions at each step, ``tick`` (R,) the index of the step of each track,
         rising; ``tracks`` (8, R) and ``state`` (R,) are as in ``Step``, and ``xy_m`` (2, R) the observations, or where
         the others are expected. Nothing is known at a step that was not known then.
         """
         values, kind = self.features(tick, tracks, state, xy_m, noise_m), self.kinds(tracks)
-        out = np.empty(len(tick))
+        log_odds = np.empty(len(tick))
         for number, model in enumerate(self._models):
             here = kind == number
-            out[here] = model.log_odds(values[here])
-        return out
+            log_odds[here] = model.log_odds(values[here])
+        return np.asarray(log_odds >= _LEAST_LOG_ODDS[kind])
 
     def kinds(self, tracks: Ints) -> Ints:
         """The kind of each track (R,), an index into ``PRESENT_KINDS``."""
