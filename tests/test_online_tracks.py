@@ -23,18 +23,18 @@ def corners(n: int) -> Positions:
 
 @pytest.mark.parametrize("flickers", [False, True])
 def test_a_new_track_is_written_at_once_unless_most_were_soon_over(flickers):
-    """One comes each 20 steps, and in the one log 50 more are seen for two steps before the last one comes."""
+    """One comes in each 20 steps, and in the one log 50 more are seen for two steps before the last one comes."""
 
     def path(n: int) -> Positions:
         out = corners(n)
         if n % 20 < 15:
-            out[n // 20] = (0.3 * (n % 20), 3.0 * (n // 20 % 4))
+            out[n // 20] = (0.3 * (n % 20) - 19.9, 3.0 * (n // 20 % 4))
         if flickers and n < 205:
             out[1000 + n // 4] = (10.0 + n % 7, 15.0 + n % 5) if n % 4 < 2 else (10.0, -12.0)
         return out
 
     frames = online(walk(path, 242))
-    is_written = [any(0 <= x < 5 and -1 < y < 10 for x, y in places(frames[n]).values()) for n in (240, 241)]
+    is_written = [any(-20 <= x < -15 and -1 < y < 10 for x, y in places(frames[n]).values()) for n in (240, 241)]
     assert all(is_written) is not flickers
 
 
