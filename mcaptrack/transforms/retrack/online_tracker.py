@@ -531,7 +531,7 @@ _DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 
 
 class PresentTracks:
-    """Which tracks are likely a person who is here now: called with the steps of a log, some at a time.
+    """Tells which tracks are likely a person who is here now: called with the steps of a log, some at a time.
 
     Parameters
     ----------
@@ -554,7 +554,7 @@ class PresentTracks:
         self._counts = np.zeros(8 + self._levels)
 
     def __call__(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Bools:
-        """Which of the tracks (R,) alive at F steps are written, because each is likely a person who is here now.
+        """Mask the tracks (R,) alive at F steps that are written, because each is likely a person who is here now.
 
         ``noise_m`` (F,) is the noise of positions at each step, ``tick`` (R,) the index of the step of each track,
         rising; ``tracks`` (8, R) and ``state`` (R,) are as in ``Step``, and ``xy_m`` (2, R) the observations, or where
@@ -614,7 +614,7 @@ class PresentTracks:
         return out.T
 
     def _beside(self, tick: Ints, tracks: Ints, xy_m: Floats) -> Floats:
-        """How near the nearest older track is that was observed, (R,): from 0 at ``_BESIDE_M`` on to 1."""
+        """The nearness of the nearest older track that was observed, (R,): from 0 at ``_BESIDE_M`` on to 1."""
         ids, is_seen = tracks[IDS], tracks[MISSED] == 0
         place = np.where(np.isfinite(xy_m), xy_m, np.inf).T
         pair = np.stack(near_pairs(tick, place, _BESIDE_M))
@@ -625,7 +625,7 @@ class PresentTracks:
         return out
 
     def _outside(self, tick: Ints, confirmed: Bools, is_seen: Bools, xy_m: Floats, count: int) -> Floats:
-        """How far tracks (R,) are outside of the area in which confirmed ones were seen at earlier steps; in metres."""
+        """The metres by which tracks (R,) are outside of the area in which confirmed ones were seen at earlier steps."""
         along = _DIRECTIONS.T @ xy_m
         counts = np.flatnonzero(confirmed & is_seen & np.isfinite(xy_m[0]))
         reached = np.full((len(self._border), count + 1), -np.inf)
