@@ -625,7 +625,7 @@ class PresentTracks:
         return out
 
     def _outside(self, tick: Ints, confirmed: Bools, is_seen: Bools, xy_m: Floats, count: int) -> Floats:
-        """The metres by which tracks (R,) are outside of the area in which confirmed ones were seen at earlier steps."""
+        """The metres by which tracks (R,) are outside of the area in which confirmed ones were seen before."""
         along = _DIRECTIONS.T @ xy_m
         counts = np.flatnonzero(confirmed & is_seen & np.isfinite(xy_m[0]))
         reached = np.full((len(self._border), count + 1), -np.inf)
