@@ -27,8 +27,6 @@ from mcaptrack.transforms.motion_limits import MotionLimits
 #: detection counts beside its score and place: how rarely false ones are in a square metre. (Chosen on drawn squares.)
 _BEGINS_AND_ENDS: Final = -9.7
 _DETECTED: Final = 2.0
-#: The log odds from which on a track is written.
-_SURE: Final = 10.0
 #: The share of people who are detected in a frame.
 _SEEN: Final = 0.85
 #: Scores count as probabilities from this one to 1 minus it.
@@ -121,8 +119,8 @@ class FixedLag:
     gap_s : float
         The longest time without a detection that a track bridges.
     confirm_score, birth_score : float
-        A track is written if the scores of its detections add up to the first, and one of them is as high as the
-        second.
+        A track is written if it is likelier one than not, the scores of its detections add up to the first, and one of
+        them is as high as the second.
     across_classes : bool
         Whether a track may continue with a detection of another class.
     limits : mapping of int to MotionLimits
@@ -265,7 +263,11 @@ class FixedLag:
         wait_s = self._time_s[second].max() - self._time_s[first]
         pairs = Pairing(seen.xy_m[first].T, seen.xy_m[second].T, self._reach[first] + 2 * self._speed[first] * wait_s)
         dt = pairs.of_second(self._time_s[second]) - pairs.of_first(self._time_s[first])
-        allowed = dt <= self._gap_s
+        x, y = (
+            pairs.of_second(seen.xy_m[second].T[axis]) - pairs.of_first(seen.xy_m[first].T[axis]) for axis in (0, 1)
+        )
+        near_m = pairs.of_first(self._reach[first]) + 2 * pairs.of_first(self._speed[first]) * dt
+        allowed = (dt <= self._gap_s) & (x * x + y * y <= near_m * near_m)
         if not self._across_classes:
             allowed &= pairs.of_first(seen.class_id[first]) == pairs.of_second(seen.class_id[second])
         i, j = pairs.chosen(allowed)
@@ -296,9 +298,9 @@ class FixedLag:
         while len(ahead := np.flatnonzero(self._next[last] >= 0)):
             last[ahead] = self._next[last[ahead]]
         worth = self._worth[last]
-        sure = (worth[:, 0] >= _SURE) & (worth[:, 1] >= self._confirm_score) & (worth[:, 2] >= self._birth_score)
+        sure = (worth[:, 0] > 0) & (worth[:, 1] >= self._confirm_score) & (worth[:, 2] >= self._birth_score)
         roots = np.concatenate([self._root[here], self._root[over]])
-        sure |= [root in self._ids for root in roots.tolist()]
+        sure |= np.array([root in self._ids for root in roots.tolist()], bool)
         for root in roots[sure].tolist():
             self._ids.setdefault(root, len(self._ids) + 1)
         rows = np.concatenate([self._rows(here), self._between(over, frame.t_ns / NS_PER_S)], axis=1)[:, sure]
