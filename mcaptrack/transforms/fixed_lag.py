@@ -336,7 +336,8 @@ class FixedLag:
             return
         new = np.append(np.cumsum(kept) - 1, -1)
         assert self._seen is not None
-        self._seen = Seen(self._seen.rows[:, kept], *(values[kept] for values in self._seen[1:]))
+        rows, xy_m, noise, score, class_id = self._seen
+        self._seen = Seen(rows[:, kept], xy_m[kept], noise[kept], score[kept], class_id[kept])
         self._prev, self._next = (
             np.where((links >= 0) & kept[links], new[links], -1)[kept] for links in (self._prev, self._next)
         )
