@@ -86,7 +86,7 @@ def _log_density(off: Floats, cov: Floats) -> Floats:
     return np.asarray(-(scaled**2).sum(axis=1) / 2 - area - off.shape[1] / 2 * np.log(2 * np.pi))
 
 
-class Seen(NamedTuple):
+class Measured(NamedTuple):
     """Detections (N,) of one frame: rows as in the tables of the tracker ``ground`` (rows, N), positions (N, 2),
     covariances (N, 2, 2) with the noise of their class, scores (N,) with 0.5 where none is known, and classes (N,).
     """
@@ -99,8 +99,8 @@ class Seen(NamedTuple):
 
 
 class Written(NamedTuple):
-    """A frame that is decided: rows (R,) of detections as in ``Seen``, with filtered positions and velocities, of rows
-    in gaps the mean of those before and after; whether they are detections, and their tracks.
+    """A frame that is decided: rows (R,) of detections as in ``Measured``, with filtered positions and velocities, of
+    rows in gaps the mean of those before and after; whether they are detections, and their tracks.
     """
 
     frame: Frame
@@ -110,7 +110,7 @@ class Written(NamedTuple):
 
 
 class FixedLag:
-    """The detections whose associations are open, and the ends of tracks that may go on.
+    """Detections whose associations are open, and the ends of tracks that may go on.
 
     Parameters
     ----------
@@ -147,12 +147,12 @@ class FixedLag:
         self._t_s = 0.0
         self._ids: dict[int, int] = {}
         self._serials = 0
-        self._seen: Seen | None = None
+        self._seen: Measured | None = None
 
-    def _begin(self, seen: Seen) -> None:
+    def _begin(self, seen: Measured) -> None:
         """Take what the first frame has for the shape of all tables."""
         none = np.empty(0, np.int64)
-        self._seen = Seen(seen.rows[:, :0], np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0), none)
+        self._seen = Measured(seen.rows[:, :0], np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0), none)
         self._frame, self._prev, self._next, self._serial, self._root = none, none, none, none, none
         self._time_s = np.empty(0)
         self._drift, self._speed, self._reach = np.empty((3, 0))
@@ -160,7 +160,7 @@ class FixedLag:
         self._worth = np.empty((0, 3))
         self._ahead = _States.of(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
-    def add(self, frame: Frame, seen: Seen) -> list[Written]:
+    def add(self, frame: Frame, seen: Measured) -> list[Written]:
         """Add a frame; returns the frames that are decided by now."""
         if self._seen is None:
             self._begin(seen)
@@ -181,13 +181,13 @@ class FixedLag:
             self._decide(list(range(max(self._now - len(self._frames) + 1, 1), self._now + 1)))
         return [self._release() for _ in range(len(self._frames))]
 
-    def _append(self, frame: Frame, seen: Seen) -> None:
+    def _append(self, frame: Frame, seen: Measured) -> None:
         assert self._seen is not None
         count = len(seen.score)
         self._now += 1
         self._t_s = frame.t_ns / NS_PER_S
         self._frames.append(frame)
-        self._seen = Seen(*(np.concatenate([a, b], axis=-1 if a is self._seen.rows else 0)
+        self._seen = Measured(*(np.concatenate([a, b], axis=-1 if a is self._seen.rows else 0)
                             for a, b in zip(self._seen, seen, strict=True)))  # fmt: skip
         self._frame = np.append(self._frame, np.full(count, self._now))
         self._time_s = np.append(self._time_s, np.full(count, self._t_s))
@@ -277,10 +277,10 @@ class FixedLag:
             return
         predicted = self._ahead.after(before, self._time_s[after] - self._time_s[before], self._drift)
         fits = _log_density(predicted.mean - behind.mean[after], predicted.cov + behind.cov[after])
-        anew = np.zeros((len(after), 2, 2))
-        anew[:, 0, 0] = anew[:, 1, 1] = self._speed[after] ** 2
-        alone = _log_density(behind.mean[after, 2:], behind.cov[after, 2:, 2:] + anew)
-        gain = fits - alone + self._missed(before, after) - _BEGINS_AND_ENDS
+        prior = np.zeros((len(after), 2, 2))
+        prior[:, 0, 0] = prior[:, 1, 1] = self._speed[after] ** 2
+        apart = _log_density(behind.mean[after, 2:], behind.cov[after, 2:, 2:] + prior)
+        gain = fits - apart + self._missed(before, after) - _BEGINS_AND_ENDS
         good = gain > 0
         if good.any():
             (i, j), _ = max_weight_matching((i[good], j[good]), np.round(gain[good], 6), pairs.shape)
@@ -337,7 +337,7 @@ class FixedLag:
         new = np.append(np.cumsum(kept) - 1, -1)
         assert self._seen is not None
         rows, xy_m, noise, score, class_id = self._seen
-        self._seen = Seen(rows[:, kept], xy_m[kept], noise[kept], score[kept], class_id[kept])
+        self._seen = Measured(rows[:, kept], xy_m[kept], noise[kept], score[kept], class_id[kept])
         self._prev, self._next = (
             np.where((links >= 0) & kept[links], new[links], -1)[kept] for links in (self._prev, self._next)
         )

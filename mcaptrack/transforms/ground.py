@@ -23,7 +23,7 @@ from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.notices import warn
 from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.framing import join_frames, split_rows
-from mcaptrack.transforms.fixed_lag import FixedLag, Seen, Written
+from mcaptrack.transforms.fixed_lag import FixedLag, Measured, Written
 from mcaptrack.transforms.motion_limits import (
     LIMITS_HELP,
     LIMITS_PATTERN,
@@ -980,12 +980,12 @@ class _Run:
             yield from _written(done)
         yield from _written(window.finish())
 
-    def _seen(self, boxes: Floats) -> Seen:
+    def _seen(self, boxes: Floats) -> Measured:
         noise_m = np.array([self._limits[int(number)].noise_m for number in boxes[CLASS].tolist()])
         xx, xy, yy = boxes[_COVARIANCE_ROWS]
         noise = np.stack([xx + noise_m**2, xy, xy, yy + noise_m**2], axis=-1).reshape(-1, 2, 2)
         rows = boxes[:DETECTION_ROWS]
-        return Seen(rows, rows[PLACE].T, noise, certainty(boxes), rows[CLASS].astype(np.int64))
+        return Measured(rows, rows[PLACE].T, noise, certainty(boxes), rows[CLASS].astype(np.int64))
 
     def warn(self) -> None:
         """Warn of detections without a position in metres."""
