@@ -38,7 +38,7 @@ _STEPS: Final = 8
 
 
 class _States(NamedTuple):
-    """What a filter knows at each detection: means (N, 4) of position and velocity, and covariances (N, 4, 4)."""
+    """The states of a filter at each detection: means (N, 4) of position and velocity, and covariances (N, 4, 4)."""
 
     mean: Floats
     cov: Floats
@@ -110,7 +110,7 @@ class Written(NamedTuple):
 
 
 class FixedLag:
-    """Detections whose associations are open, and the ends of tracks that may go on.
+    """Detections with associations that may still change, and the ends of tracks that may go on.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ class FixedLag:
         return np.asarray((self._frame[after] - self._frame[before] - 1) * np.log(1 - _SEEN))
 
     def _backwards(self, low: int) -> _States:
-        """What comes after each detection from frame ``low`` on, this one included."""
+        """Filter backwards: the states of each detection from frame ``low`` on, of it and what follows."""
         seen = self._seen
         assert seen is not None
         states = _States.of(seen.xy_m, seen.noise, np.full(len(self._frame), _ANY_SPEED))
