@@ -14,11 +14,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.testing import check_transform
 from mcaptrack.transforms import GroundTracker, Predict, Retrack, RetrackByConsistency, Sample
-from mcaptrack.transforms.ground import VX, VY, GroundTracks, X, Y
+from mcaptrack.transforms.ground import GroundTracks, X, Y
 from mcaptrack.transforms.motion_limits import LIMITS, limits_of, limits_row, read_limits
 from mcaptrack.transforms.to_video_rate import to_video_rate
 from tests.commands import call
-from tests.references.ground import transition
 from tests.tiers import one_in
 from tools.traffic import CLASSES, draw_traffic
 
@@ -72,36 +71,6 @@ def test_the_laws_hold_with_covariances_of_some_detections():
         frame.rows["cov_xx_m2"], frame.rows["cov_xy_m2"], frame.rows["cov_yy_m2"] = 0.3, 0.1, 0.2
         frame.rows["cov_xx_m2"][frame.rows["x_m"] > 0 if number > 3 else slice(None)] = np.nan
     check_transform(GroundTracker(class_names=NAMES), frames)
-
-
-def test_with_covariances_the_filter_is_that_of_matrices():
-    """One filter over both axes, from the textbook, with a noise of its own for each detection."""
-    limits, rng = LIMITS["person"], np.random.default_rng(5)
-    tracks, noise = GroundTracks(), limits.noise_m**2 * np.eye(2)
-    tracks.expect_covariances()
-    place = np.array([[1.0, 0, 0, 0, 0, 0], [0, 0, 0, 1.0, 0, 0]])  # position, velocity, acceleration along each axis
-    found, mean, cov = np.full((15, 1), np.nan), np.zeros(6), np.diag([0.0, limits.speed_m_per_s**2, 0.0] * 2)
-    for frame in range(10):
-        seconds, one = float(rng.uniform(0.1, 0.6)), rng.normal(0, 0.4, (2, 2))
-        own = one @ one.T + 0.01 * np.eye(2)
-        at = np.array([0.5 * frame, -0.2 * frame]) + rng.normal(0, 0.2, 2)
-        found[[X, Y], 0], found[9:12, 0], found[12:, 0] = at, (0.9, PEDESTRIAN, -1), own[[0, 0, 1], [0, 1, 1]]
-        if not frame:
-            tracks.initiate(1, found, {PEDESTRIAN: limits}, 0)
-            mean, cov = place.T @ at, cov + place.T @ (own + noise) @ place
-            continue
-        move, drift = np.kron(np.eye(2), transition(seconds)), np.zeros((3, 3))
-        drift[:2, :2] = [[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]]
-        mean, cov = move @ mean, move @ cov @ move.T + np.kron(np.eye(2), limits.drift_m_per_s**2 * drift)
-        gain = cov @ place.T @ np.linalg.inv(place @ cov @ place.T + own + noise)
-        mean, cov = mean + gain @ (at - place @ mean), cov - gain @ place @ cov
-        tracks.predict(seconds)
-        tracks.update(np.array([0]), found, np.array([True]), frame)
-        assert tracks.table[[X, VX, Y, VY], 0] == pytest.approx(mean[[0, 1, 3, 4]])
-        assert tracks.covariances is not None
-        assert tracks.covariances.values[0] == pytest.approx(cov)
-        assert tracks.covariances.places()[:, 0] == pytest.approx(cov[[0, 0, 3], [0, 3, 3]])
-        assert tracks.covariances.means()[:, 0] == pytest.approx(((cov[:3, :3] + cov[3:, 3:]) / 2)[np.triu_indices(3)])
 
 
 def seen(places: list[tuple[float, float, float]], cov: tuple[float, float, float] | None) -> Frame:
@@ -164,25 +133,22 @@ def test_fast_tracks_need_a_third_detection_where_the_velocity_says(second, thir
     assert sum(len(frame.rows) for frame in tracked(frames_of(track, count=8))) == count
 
 
-@pytest.mark.parametrize("has_covariances", [False, True])
-def test_any_speed_is_a_wider_filter_from_the_beginning(has_covariances: bool):
+def test_any_speed_is_a_wider_filter_from_the_beginning():
     """Widening later is the same as having begun with a wider distribution of velocities."""
     tables = []
     for is_late in (True, False):
         limits = LIMITS["car"]
         wide = float(np.hypot(limits.speed_m_per_s, limits.max_speed_m_per_s))
         tracks = GroundTracks()
-        if has_covariances:
-            tracks.expect_covariances()
-        found = np.full((15 if has_covariances else 12, 1), np.nan)
-        found[[X, Y]], found[9:12, 0], found[12:, 0] = 1.0, (0.5, CAR, -1), (0.1, 0.05, 0.2)[: len(found) - 12]
+        found = np.full((12, 1), np.nan)
+        found[[X, Y]], found[9:12, 0] = 1.0, (0.5, CAR, -1)
         limits = limits if is_late else limits._replace(speed_m_per_s=wide)
         tracks.initiate(1, found, {CAR: limits}, 0)
         for _ in range(3):
             tracks.predict(0.2)
         if is_late:
             tracks.allow_speed(np.array([0]))
-        tables.append(tracks.table[14:20, 0] if tracks.covariances is None else tracks.covariances.values[0])
+        tables.append(tracks.table[14:20, 0])
     assert tables[0] == pytest.approx(tables[1])
 
 

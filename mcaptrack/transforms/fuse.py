@@ -518,7 +518,7 @@ _CHANCE: Final = 0.1
 _LEAST, _MOST = 0.02, 0.98
 #: Limits of people's motion for a tracker of the result (see ``motion_limits``).
 _WALKS: Final = "person=:0.4::1.2"
-_TRACKED: Final = MappingProxyType({"birth_score": 0.8, "confirm_score": 2.0, "max_age_s": 1.0, "class_limits": _WALKS})
+_TRACKED: Final = MappingProxyType({"birth_score": 0.8, "confirm_score": 2.0, "delay_s": 4.0, "class_limits": _WALKS})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice, pairwise
 from types import MappingProxyType
 from typing import ClassVar, Final, Literal, NamedTuple
 
@@ -21,8 +21,9 @@ from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.notices import warn
-from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.framing import join_frames, split_rows
+from mcaptrack.transforms.fixed_lag import FixedLag, Measured, Written
 from mcaptrack.transforms.motion_limits import (
     LIMITS_HELP,
     LIMITS_PATTERN,
@@ -55,96 +56,11 @@ _BLOCK_FRAMES: Final = 64
 # Rows of detections.
 X, Y, Z, LENGTH, WIDTH, HEIGHT, HEADING, VX, VY, SCORE, CLASS, SOURCE = range(12)
 DETECTION_ROWS: Final = 12
-#: Detections that have covariances have three rows more: xx, xy, yy.
-COVARIANCE: Final = slice(DETECTION_ROWS, DETECTION_ROWS + 3)
+#: Then xx, xy and yy of the covariances of positions.
+_COVARIANCE_ROWS: Final = slice(DETECTION_ROWS, DETECTION_ROWS + 3)
 PLACE: Final = slice(X, Y + 1)
 #: Position, size and heading.
 BOX: Final = slice(X, HEADING + 1)
-
-
-# The filter of the ground tracker for detections that have covariances, such as those of several cameras.
-#
-# The noise of such a detection differs along the axes and from one to the next, so each track has a covariance of
-# its own over both axes: of position, velocity and acceleration along the first axis, then of those along the
-# second one.
-#
-# Letters: K tracks, N detections.
-
-
-#: Rows of a covariance that are positions, velocities and accelerations, one of each axis.
-_PLACE, _VELOCITIES, _ACCELERATIONS = [0, 3], [1, 4], [2, 5]
-_BOTH_AXES: Final = 6
-
-
-class Covariances:
-    """The covariances of tracks, ``values`` (K, 6, 6)."""
-
-    def __init__(self, along_one_axis: Floats) -> None:
-        """Begin with the same covariance (6, K) along both axes: pp, pv, pa, vv, va, aa."""
-        self.values: Floats = _of_axes(along_one_axis)
-
-    def add(self, along_one_axis: Floats, noise: Floats) -> None:
-        """Add tracks, as in the constructor, but with these covariances (N, 3) of their positions."""
-        new = _of_axes(along_one_axis)
-        new[:, _PLACE[0], _PLACE[0]], new[:, _PLACE[1], _PLACE[1]] = noise[:, 0], noise[:, 2]
-        new[:, _PLACE[0], _PLACE[1]] = new[:, _PLACE[1], _PLACE[0]] = noise[:, 1]
-        self.values = np.concatenate([self.values, new])
-
-    def places(self) -> Floats:
-        """The covariances of positions, (3, K): xx, xy, yy."""
-        p = self.values
-        return np.stack([p[:, 0, 0], p[:, 0, 3], p[:, 3, 3]])
-
-    def widen(self, track: Indices, more: Floats, passed_s: Floats) -> None:
-        """Add ``more`` (N,) to the variance that the velocities of tracks (N,) had ``passed_s`` seconds (N,) ago."""
-        for place, velocity in zip(_PLACE, _VELOCITIES, strict=True):
-            self.values[track, place, place] += more * passed_s**2
-            self.values[track, place, velocity] += more * passed_s
-            self.values[track, velocity, place] += more * passed_s
-            self.values[track, velocity, velocity] += more
-
-    def predict(self, transition: Floats, drift: Floats) -> None:
-        """Predict with the transition (3, 3) of one axis and what is added for each track, (K, 3, 3), to each axis."""
-        both = np.zeros((_BOTH_AXES, _BOTH_AXES))
-        both[:3, :3] = both[3:, 3:] = transition
-        self.values = both @ self.values @ both.T
-        self.values[:, :3, :3] += drift
-        self.values[:, 3:, 3:] += drift
-
-    def correct(self, track: Indices, noise: Floats) -> Floats:
-        """Correct tracks (N,) with a detection each, with these covariances (N, 3); returns the gains (N, 6, 2)."""
-        p = self.values[track]
-        cross = p[:, :, _PLACE]
-        xx, xy, yy = p[:, 0, 0] + noise[:, 0], p[:, 0, 3] + noise[:, 1], p[:, 3, 3] + noise[:, 2]
-        inverse = np.stack([yy, -xy, -xy, xx], axis=-1).reshape(-1, 2, 2) / (xx * yy - xy * xy)[:, None, None]
-        gain: Floats = cross @ inverse
-        p = p - gain @ np.swapaxes(cross, 1, 2)
-        self.values[track] = (p + np.swapaxes(p, 1, 2)) / 2
-        return gain
-
-    def means(self) -> Floats:
-        """The means over both axes, (6, K), as in the constructor."""
-        p = self.values
-        mean = (p[:, :3, :3] + p[:, 3:, 3:]) / 2
-        return np.stack([mean[:, i, j] for i in range(3) for j in range(i, 3)])
-
-
-def _of_axes(along_one_axis: Floats) -> Floats:
-    """Covariances (K, 6, 6) of independent axes with the same covariance (6, K)."""
-    count = along_one_axis.shape[1]
-    block = np.empty((count, 3, 3))
-    upper = [(i, j) for i in range(3) for j in range(i, 3)]
-    for (i, j), values in zip(upper, along_one_axis, strict=True):
-        block[:, i, j] = block[:, j, i] = values
-    out = np.zeros((count, _BOTH_AXES, _BOTH_AXES))
-    out[:, :3, :3] = out[:, 3:, 3:] = block
-    return out
-
-
-def along_axes(gain: Floats, off: Floats) -> tuple[Floats, Floats, Floats]:
-    """Corrections of positions, velocities and accelerations, (2, N) each: gains (N, 6, 2) times innovations (2, N)."""
-    by = np.einsum("nij,jn->in", gain, off)
-    return by[_PLACE], by[_VELOCITIES], by[_ACCELERATIONS]
 
 
 _SIZE: Final = slice(LENGTH, HEIGHT + 1)
@@ -191,14 +107,10 @@ def no_tracks() -> Floats:
 
 
 class GroundTracks:
-    """The tracks that are alive: ``table`` (rows, K), and the scores of the classes that each had, ``votes`` (C, K).
-
-    From the first detection with a covariance on, ``covariances`` are those of the tracks.
-    """
+    """The tracks that are alive: ``table`` (rows, K), and the scores of the classes that each had, ``votes`` (C, K)."""
 
     def __init__(self) -> None:
         self.table: Floats = no_tracks()
-        self.covariances: Covariances | None = None
         self.votes: Floats = np.zeros((0, 0))
         self._classes: dict[int, int] = {}
 
@@ -208,24 +120,13 @@ class GroundTracks:
     def keep(self, which: Bools) -> None:
         """Keep some of the tracks."""
         self.table, self.votes = self.table.compress(which, axis=1), self.votes.compress(which, axis=1)
-        if self.covariances:
-            self.covariances.values = self.covariances.values.compress(which, axis=0)
-
-    def expect_covariances(self) -> None:
-        """Begin to keep a covariance over both axes for each track."""
-        if self.covariances is None:
-            self.covariances = Covariances(self.table[_COVARIANCE])
 
     def predict(self, dt: float) -> None:
         """Predict all tracks by ``dt`` seconds."""
         t = self.table
         if dt <= 0 or not len(self):
             return
-        if self.covariances:
-            self.covariances.predict(*_transition(t[_DRIFT], t[TURNS], dt))
-            t[_COVARIANCE] = self.covariances.means()
-        else:
-            _predict_covariance(t[_COVARIANCE], t[_DRIFT], t[TURNS], dt)
+        _predict_covariance(t[_COVARIANCE], t[_DRIFT], t[TURNS], dt)
         fade = np.exp(-dt / _FADES_S)
         g, f = _FADES_S * (1 - fade), _FADES_S * (dt - _FADES_S * (1 - fade))
         vx, vy, ax, ay = t[VX], t[VY], t[_AX], t[_AY]
@@ -257,8 +158,6 @@ class GroundTracks:
         t[_PP, track] += more * passed_s**2
         t[_PV, track] += more * passed_s
         t[_VV, track] += more
-        if self.covariances:
-            self.covariances.widen(track, more, passed_s)
 
     @staticmethod
     def _rotate(t: Floats, cos: Floats, sin: Floats) -> None:
@@ -272,12 +171,7 @@ class GroundTracks:
         """Correct tracks (N,) with one detection each, (rows, N), at a frame; returns their table before and after."""
         before = self.table.take(track, axis=1)
         t = before.copy()
-        if self.covariances:
-            gain = self.covariances.correct(track, measured(t[NOISE], detections))
-            _move(t, *along_axes(gain, detections[PLACE] - t[PLACE]))
-            t[_COVARIANCE] = self.covariances.means()[:, track]
-        else:
-            _correct(t, detections)
+        _correct(t, detections)
         self._vote(track, detections)
         weight = is_same_class.astype(float)
         _follow_box(t, detections, weight)
@@ -319,8 +213,6 @@ class GroundTracks:
         t[HITS] = 1
         t[LAST_FRAME] = frame
         t[LAST], t[LAST_VELOCITY], t[LAST_SPREAD], t[FIRST] = t[BOX], t[_VELOCITY], t[_VV], t[PLACE]
-        if self.covariances:
-            self.covariances.add(t[_COVARIANCE], measured(t[NOISE], detections))
         self.table = np.concatenate([self.table, t], axis=1)
         self.votes = np.concatenate([self.votes, np.zeros((len(self.votes), count))], axis=1)
         self._vote(np.arange(len(self) - count, len(self)), detections)
@@ -348,24 +240,9 @@ class GroundTracks:
         return np.asarray(classes[self.votes.take(track, axis=1).argmax(axis=0)], float)
 
 
-def measured(noise_m: Floats, detections: Floats) -> Floats:
-    """The covariances (N, 3) of detections (rows, N) of tracks with this noise (N,).
-
-    Their own covariance says how well the cameras place them; people and boxes sway by the noise of their class, too.
-    """
-    out = np.stack([noise_m**2, np.zeros_like(noise_m), noise_m**2], axis=-1)
-    return out + own_covariances(detections) if detections.shape[0] > DETECTION_ROWS else out
-
-
 def certainty(detections: Floats) -> Floats:
     """The scores (N,) of detections (rows, N); 0.5 for those without a score."""
     return np.where(np.isnan(detections[SCORE]), 0.5, detections[SCORE])
-
-
-def own_covariances(detections: Floats) -> Floats:
-    """The covariances (N, 3) that detections (rows, N) came with; 0 where they have none."""
-    has = detections.shape[0] > DETECTION_ROWS
-    return np.asarray(np.nan_to_num(detections[COVARIANCE].T) if has else np.zeros((detections.shape[1], 3)))
 
 
 def variance(table: Floats) -> Floats:
@@ -386,17 +263,6 @@ def _predict_covariance(cov: Floats, drift: Floats, turns: Floats, dt: float) ->
     cov[3] = vv + dt * power + g * (2 * va + g * aa)
     cov[4] = fade * (va + g * aa)
     cov[5] = fade**2 * aa + (1 - fade**2) * lasting**2
-
-
-def _transition(drift: Floats, turns: Floats, dt: float) -> tuple[Floats, Floats]:
-    """The transition (3, 3) of one axis by ``dt`` seconds, and the covariance (K, 3, 3) that is added to each track."""
-    fade = np.exp(-dt / _FADES_S)
-    g, f = _FADES_S * (1 - fade), _FADES_S * (dt - _FADES_S * (1 - fade))
-    added = np.zeros((6, len(drift)))
-    _predict_covariance(added, drift, turns, dt)
-    pp, pv, pa, vv, va, aa = added
-    out = np.stack([pp, pv, pa, pv, vv, va, pa, va, aa], axis=-1).reshape(-1, 3, 3)
-    return np.array([[1.0, dt, f], [0.0, 1.0, g], [0.0, 0.0, fade]]), out
 
 
 def _correct(t: Floats, detections: Floats) -> None:
@@ -593,6 +459,18 @@ def _to_frames(frames: Sequence[Frame], table: Floats, number: Ints) -> list[Fra
     return split_rows([f.t_ns for f in frames], [f.index for f in frames], out, ends)
 
 
+def _written(done: Sequence[Written]) -> list[Frame]:
+    """The frames of Tracks of frames that are decided."""
+    if not done:
+        return []
+    number = group_index([len(part.track_id) for part in done])
+    observed = np.concatenate([part.observed for part in done])
+    table = np.concatenate([part.rows for part in done], axis=1)
+    table[SCORE], table[SOURCE] = np.where(observed, table[SCORE], np.nan), np.where(observed, table[SOURCE], -1.0)
+    ids = np.concatenate([part.track_id for part in done])
+    return _to_frames([part.frame for part in done], np.concatenate([table, observed[None], ids[None]]), number)
+
+
 #: Columns of detections in the order of their rows.
 _COLUMNS: Final = (
     "x_m",
@@ -627,8 +505,6 @@ _OTHER_GATE: Final = 9.0
 _OTHER_SHARE: Final = 0.4
 #: The gain of a pair without any distance.
 _GAIN: Final = 30.0
-#: Scores count as probabilities from this one to 1 minus it.
-_LEAST_SCORE: Final = 0.02
 #: Detections that a track of another class needs before.
 _OTHER_HITS: Final = 2
 
@@ -639,18 +515,14 @@ def associate(
     cost: Cost,
     min_iou: float,
     across_classes: bool,
-    covariances: Covariances | None = None,
 ) -> tuple[Indices, Indices, Bools]:
-    """Tracks and detections that belong together, (P,) each, and whether they have the same class.
-
-    With the ``covariances`` of the tracks, these and those of the detections count instead of usual ones.
-    """
+    """Tracks and detections that belong together, (P,) each, and whether they have the same class."""
     if not table.shape[1] or not detections.shape[1]:
         nothing = np.empty(0, np.intp)
         return nothing, nothing, np.empty(0, bool)
     reach = table[GATE_M] * (1 + table[MISSED_S])
     pairs = Pairing(table[[X, Y]], detections[[X, Y]], reach)
-    apart = _Apart(table, detections, covariances, pairs)
+    apart = _Apart(table, detections, pairs)
     same = pairs.of_first(table[CLASS]) == pairs.of_second(detections[CLASS])
     near = apart.within(_GATE, reach)
     if across_classes:
@@ -675,40 +547,21 @@ def associate(
 class _Apart:
     """Distances of detections (rows, N) from the predicted positions of tracks (rows, K), for each of their pairs."""
 
-    def __init__(self, table: Floats, detections: Floats, covariances: Covariances | None, pairs: Pairing) -> None:
+    def __init__(self, table: Floats, detections: Floats, pairs: Pairing) -> None:
         self.pairs = pairs
         x = pairs.of_second(detections[X]) - pairs.of_first(table[X])
         y = pairs.of_second(detections[Y]) - pairs.of_first(table[Y])
         self._squared = x * x + y * y
         self._spread = variance(table)
-        self._deviations: Floats | None = None
-        if covariances is not None:
-            place = pairs.of_first(covariances.places())
-            noise = pairs.of_first(measured(table[NOISE], detections[:0]).T) + pairs.of_second(
-                own_covariances(detections).T
-            )
-            xx, xy, yy = place + noise
-            #: Twice the log-odds that detections are true; their scores are probabilities.
-            share = np.clip(certainty(detections), _LEAST_SCORE, 1 - _LEAST_SCORE)
-            self._odds = 2 * np.log(share / (1 - share))
-            self._area = xx * yy - xy * xy
-            self._deviations = (yy * x * x - 2 * xy * x * y + xx * y * y) / self._area
 
     def within(self, gate: float, reach_m: Floats) -> Bools:
         """Whether pairs are within ``gate`` squared standard deviations, and ``reach_m`` of their track (K,)."""
-        if self._deviations is None:
-            return np.asarray(self._squared <= self.pairs.of_first(np.minimum(gate * self._spread, reach_m * reach_m)))
-        return np.asarray((self._deviations <= gate) & (self._squared <= self.pairs.of_first(reach_m * reach_m)))
+        return np.asarray(self._squared <= self.pairs.of_first(np.minimum(gate * self._spread, reach_m * reach_m)))
 
-    def gain(self, which: Bools, track: Indices, row: Indices) -> Floats:
-        """The gain of the chosen pairs (P,): twice the logarithm of their likelihood, but for a constant.
-
-        Where detections have covariances it is twice that of a ratio: to the detection being false.
-        """
-        if self._deviations is None:
-            s = self._spread[track]
-            return np.asarray(_GAIN - self._squared[which] / s - 2 * np.log(s))
-        return np.asarray(_GAIN - self._deviations[which] - np.log(self._area[which]) + self._odds[row])
+    def gain(self, which: Bools, track: Indices) -> Floats:
+        """The gain of the chosen pairs (P,): twice the logarithm of their likelihood, but for a constant."""
+        s = self._spread[track]
+        return np.asarray(_GAIN - self._squared[which] / s - 2 * np.log(s))
 
 
 def _assigned(
@@ -723,7 +576,7 @@ def _assigned(
         good = gain >= max(min_iou, 1e-6)
         track, row, gain = track[good], row[good], gain[good]
     else:
-        gain = apart.gain(allowed, track, row)
+        gain = apart.gain(allowed, track)
     if not len(track):
         return track, row
     (track, row), _ = max_weight_matching((track, row), np.round(gain, 6), apart.pairs.shape)
@@ -739,8 +592,9 @@ class GroundTracker:
     are assigned on the ground plane, a class at a time, to the positions that Kalman filters predict: at constant
     velocity, and on arcs for vehicles. Limits of their motion come from a table by class.
 
-    Detections of several cameras have covariances, by which they are gated, compared and weighted, and scores that are
-    probabilities; from the first such detection on each track has a covariance over both axes.
+    Detections of several cameras have covariances, and scores that are probabilities. If the first ones have, which
+    detection continues which is decided by what comes in ``delay_s``, too (see ``fixed_lag``): by a filter forwards and
+    one backwards in time, with these covariances. Tracks then bridge gaps up to ``link_s``.
 
     Rows are written ``delay_s`` late: a track is written from its first detection on if it is confirmed in that time,
     and gaps that end in it are interpolated.
@@ -823,10 +677,19 @@ class GroundTracker:
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         run = _Run(self)
-        coming = iter(frames)
-        while block := list(islice(coming, _BLOCK_FRAMES)):
+        coming, ahead = iter(frames), list[Frame]()
+        for frame in coming:  # the first detections say whether there are covariances
+            ahead.append(frame)
+            if np.isfinite(frame.rows["x_m"]).any():
+                break
+        blocks = _blocks(chain(ahead, coming))
+        if ahead and _has_covariance(ahead[-1].rows).any():
+            yield from ((frame,) for frame in run.looking_ahead(blocks))
+            run.warn()
+            return
+        for block in blocks:
             for frame, boxes in zip(block, run.detections(block), strict=True):
-                run.step(frame, boxes)
+                run.step(frame, boxes[:DETECTION_ROWS])
             yield from ((frame,) for frame in run.waiting.written())
         run.waiting.release(np.inf)
         yield from ((frame,) for frame in run.waiting.written())
@@ -836,6 +699,17 @@ class GroundTracker:
         """Why there are no tracks, for a warning."""
         count = sum(len(frame.rows) for frame in given)
         return f"no track of {count} detections is confirmed (confirm_score)"
+
+
+def _blocks(frames: Iterator[Frame]) -> Iterator[list[Frame]]:
+    while block := list(islice(frames, _BLOCK_FRAMES)):
+        yield block
+
+
+def _has_covariance(rows: Rows) -> Bools:
+    """Whether detections (N,) have a covariance."""
+    xx, xy, yy = covariances = np.stack([rows[name] for name in COVARIANCE_M2])
+    return np.asarray((xx > 0) & (yy > 0) & (xy * xy < xx * yy) & np.isfinite(covariances).all(axis=0))
 
 
 # New tracks of fast objects: second detections that are beyond the gate, because no velocity is known yet.
@@ -1001,15 +875,11 @@ class _Run:
         options, tracks = self._options, self.tracks
         dt = 0.0 if self._last_ns is None else (frame.t_ns - self._last_ns) / NS_PER_S
         self._last_ns = frame.t_ns
-        if len(detections) > DETECTION_ROWS:
-            tracks.expect_covariances()
         if dt > max(JUMP_S, options.max_age_s, options.link_s):
             tracks.keep(np.zeros(len(tracks), bool))
         tracks.predict(dt)
         self._lost.wait(dt)
-        track, row, is_same = associate(
-            tracks.table, detections, options.cost, options.min_iou, options.across_classes, tracks.covariances
-        )
+        track, row, is_same = associate(tracks.table, detections, options.cost, options.min_iou, options.across_classes)
         fast, at = fast_starts(tracks.table, detections, (track, row), options.across_classes)
         if len(fast):
             tracks.allow_speed(fast)
@@ -1068,21 +938,22 @@ class _Run:
         count = detections.shape[1]
         if not count:
             return
-        if new := {int(number) for number in np.unique(detections[CLASS])} - self._limits.keys():
-            self._limits |= limits_by_class(sorted(new), self._options.class_names, self._options.class_limits)
+        self._learn(detections)
         self.tracks.initiate(self._next_id, detections, self._limits, self._frame)
         self._next_id += count
 
+    def _learn(self, detections: Floats) -> None:
+        """Look up the limits of new classes."""
+        if new := {int(number) for number in np.unique(detections[CLASS])} - self._limits.keys():
+            self._limits |= limits_by_class(sorted(new), self._options.class_names, self._options.class_limits)
+
     def detections(self, frames: Sequence[Frame]) -> Iterator[Floats]:
-        """For each frame the detections that are used, in an order of their own: (rows, N)."""
+        """For each frame the detections that are used, in an order of their own: (rows, N), with covariances."""
         joined, options = join_frames(DETECTIONS, frames), self._options
         rows = joined.rows
         table = np.stack([rows[name] for name in _COLUMNS], dtype=float)
-        xx, xy, yy = covariances = np.stack([rows[name] for name in COVARIANCE_M2])
-        is_given = (xx > 0) & (yy > 0) & (xy * xy < xx * yy) & np.isfinite(covariances).all(axis=0)
-        has_any = np.bincount(joined.frame, is_given, len(frames)) > 0
-        if has_any.any():
-            table = np.concatenate([table, np.where(is_given, covariances, np.nan)])
+        covariances = np.stack([rows[name] for name in COVARIANCE_M2])
+        table = np.concatenate([table, np.where(_has_covariance(rows), covariances, 0.0)])
         used = np.isfinite(table[X]) & np.isfinite(table[Y])
         self._left_out += len(rows) - int(used.sum())
         if options.min_score is not None:
@@ -1093,8 +964,28 @@ class _Run:
         order = order[used[order]]
         table = table.take(order, axis=1)
         ends = np.append(0, np.cumsum(np.bincount(joined.frame[order], minlength=len(frames)))).tolist()
-        for low, high, has_covariances in zip(ends[:-1], ends[1:], has_any.tolist(), strict=True):
-            yield table[: None if has_covariances else DETECTION_ROWS, low:high]
+        yield from (table[:, low:high] for low, high in pairwise(ends))
+
+    def looking_ahead(self, blocks: Iterable[Sequence[Frame]]) -> Iterator[Frame]:
+        """The tracks of detections with covariances."""
+        options = self._options
+        gap_s = max(options.max_age_s, options.link_s)
+        scores = options.confirm_score, options.birth_score
+        window = FixedLag(options.delay_s, gap_s, *scores, options.across_classes, self._limits, (PLACE, _VELOCITY))
+        for block in blocks:
+            done: list[Written] = []
+            for frame, boxes in zip(block, self.detections(block), strict=True):
+                self._learn(boxes)
+                done += window.add(frame, self._seen(boxes))
+            yield from _written(done)
+        yield from _written(window.finish())
+
+    def _seen(self, boxes: Floats) -> Measured:
+        noise_m = np.array([self._limits[int(number)].noise_m for number in boxes[CLASS].tolist()])
+        xx, xy, yy = boxes[_COVARIANCE_ROWS]
+        noise = np.stack([xx + noise_m**2, xy, xy, yy + noise_m**2], axis=-1).reshape(-1, 2, 2)
+        rows = boxes[:DETECTION_ROWS]
+        return Measured(rows, rows[PLACE].T, noise, certainty(boxes), rows[CLASS].astype(np.int64))
 
     def warn(self) -> None:
         """Warn of detections without a position in metres."""
