@@ -199,8 +199,9 @@ _LEAST_VARIANCE_M2, _ROWS_AT_ONCE = 1e-6, 2**15
 
 
 class _Fits(NamedTuple):
-    """How filters at each level fit tracks: the number of ``positions`` (K,) after the first one, sums (K, G) of squared
-    misses in m^2 of noise, and sums (K, G) of the logarithms of the variances of misses, as multiples of noise's.
+    """How filters at each level fit tracks: the number of ``positions`` (K,) after the first one, sums (K, G) of
+    squared misses in m^2 of noise, and sums (K, G) of the logarithms of the variances of misses, as multiples of
+    noise's.
     """
 
     positions: Floats
