@@ -199,7 +199,7 @@ _LEAST_VARIANCE_M2, _ROWS_AT_ONCE = 1e-6, 2**15
 
 
 class _Fits(NamedTuple):
-    """How filters at each level fit tracks: the number of ``positions`` (K,) after the first one, sums (K, G) of
+    """The fit of filters at each level to tracks: the number of ``positions`` (K,) after the first one, sums (K, G) of
     squared misses in m^2 of noise, and sums (K, G) of the logarithms of the variances of misses, as multiples of
     noise's.
     """
@@ -238,7 +238,7 @@ def _usual_speed(trajectories: Trajectories, step_s: float) -> float:
 
 
 def _fits(model: MotionModel, trajectories: Trajectories, low: int, high: int) -> _Fits:
-    """How well filters expect the positions of some of the tracks, K from ``low`` to ``high``."""
+    """The fit of filters at each level to some of the tracks, K from ``low`` to ``high``."""
     first, levels = trajectories.first[low : high + 1], len(_LEVELS_M)
     steps = _Steps.of(first - first[0])
     model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
