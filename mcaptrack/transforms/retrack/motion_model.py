@@ -199,11 +199,12 @@ _LEAST_VARIANCE_M2, _ROWS_AT_ONCE = 1e-6, 2**15
 
 
 class _Fits(NamedTuple):
-    """How well filters expect positions at each level: how many each track has, (K,); sums of the squares of what they
-    are off, in m^2 of noise, (K, G); and sums of the logarithms of the variances of that, as multiples of noise's.
+    """The fit of filters at each level to tracks: the number of ``positions`` (K,) after the first one, sums (K, G) of
+    squared misses in m^2 of noise, and sums (K, G) of the logarithms of the variances of misses, as multiples of
+    noise's.
     """
 
-    count: Floats
+    positions: Floats
     squares_m2: Floats
     log_spread: Floats
 
@@ -237,7 +238,7 @@ def _usual_speed(trajectories: Trajectories, step_s: float) -> float:
 
 
 def _fits(model: MotionModel, trajectories: Trajectories, low: int, high: int) -> _Fits:
-    """How well filters expect the positions of some of the tracks, K from ``low`` to ``high``."""
+    """The fit of filters at each level to some of the tracks, K from ``low`` to ``high``."""
     first, levels = trajectories.first[low : high + 1], len(_LEVELS_M)
     steps = _Steps.of(first - first[0])
     model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
@@ -253,15 +254,16 @@ def _fits(model: MotionModel, trajectories: Trajectories, low: int, high: int) -
     spread = expected.cov[0, before] / noise_m[later] ** 2 + 1
     squares_m2 = ((xy_m[:, later] - expected.mean[:2, before]) ** 2).sum(axis=0) / spread
     of = np.repeat(group_index(np.diff(first))[steps.forward] * levels, levels)[later] + later % levels
-    shape, cells = (high - low, levels), (high - low) * levels
-    each = (np.bincount(of, weights, cells).reshape(shape) for weights in (None, squares_m2, np.log(spread)))
-    count, *sums = each
-    return _Fits(count[:, 0].astype(float), *sums)
+    sums = (
+        np.bincount(of, weights, (high - low) * levels) for weights in (np.ones(len(of)), squares_m2, np.log(spread))
+    )
+    positions, *others = (np.asarray(of_cells.reshape(high - low, levels), np.float64) for of_cells in sums)
+    return _Fits(positions[:, 0], *others)
 
 
 def _of_levels(fits: _Fits, noise_m: float | None) -> Floats:
     """The probability that each track is of each level, (K, G)."""
-    total = max(fits.count.sum(), 1.0)
+    total = max(fits.positions.sum(), 1.0)
     alone_m2 = np.maximum(fits.squares_m2.sum(axis=0) / (2 * total), _LEAST_VARIANCE_M2)  # if all are of this level
     best = (total * np.log(alone_m2) + fits.log_spread.sum(axis=0)).argmin()
     variance_m2 = alone_m2[best] if noise_m is None else max(noise_m**2, _LEAST_VARIANCE_M2)
