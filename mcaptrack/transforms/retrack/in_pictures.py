@@ -4,10 +4,10 @@ A camera that looks along the ground tells distances badly: a few pixels are met
 is measured well, and so is its height. Positions, speeds, noise and gates are therefore in heights of the box, in which
 people near and far move alike. A tracker associates boxes by their overlap at the rate of the video, which is right
 from picture to picture, and often wrong after people were hidden. So its tracks are cut wherever they have a gap, and
-which pieces are of one person is decided once for the whole log: an assignment by log odds. These are a logistic regression, of
-how well motion and size before a gap fit those after it, of the tracker's own decision, and of how far people nearer
-to the camera hide the way in between. A second one weighs each pair against the others that
-would take its place. What people wear counts, too, where the log has pictures that tell people apart.
+which pieces are of one person is decided once for the whole log: an assignment by log odds. These are a logistic
+regression, of how well motion and size before a gap fit those after it, of the tracker's own decision, and of how far
+people nearer to the camera hide the way in between. A second one weighs each pair against the others that would take
+its place. What people wear counts, too, where the log has pictures that tell people apart.
 
 Letters: K pieces of tracks, N rows, E candidate links.
 """
