@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import expon, multivariate_normal, norm
 
 from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.metrics import combine, score, summary
@@ -18,7 +17,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Retrack, Sample
 from mcaptrack.transforms.retrack.in_pictures import link_in_picture
-from mcaptrack.transforms.to_video_rate import linked_tracks
+from mcaptrack.transforms.to_video_rate import linked_tracks, steady_s
 from tests.worlds import assert_same_rows, ns
 
 #: Foot (x, y) and height of a box, in px.
@@ -82,23 +81,24 @@ def crowd(rng: np.random.Generator, count: int = 12, steps: int = 40) -> list[Fr
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_tracks_are_only_joined(seed):
-    """No row is lost, moved or split from its track; what is added lies in gaps; an id is at one place of a frame."""
+def test_tracks_are_only_cut_at_gaps_and_joined(seed):
+    """No row is lost or moved; what is added lies in gaps; an id is at one place of a frame."""
     frames = crowd(np.random.default_rng(seed))
     found = linked(frames)
-    roots: dict[int, set[int]] = {}
+    last: dict[int, tuple[int, int]] = {}  # of each input track its id after linking, and when it was seen last
     for before, after in zip(frames, found, strict=True):
         assert len(np.unique(after.rows["track_id"])) == len(after.rows)
         own = after.rows[after.rows["source_id"] >= 0]
         assert sorted(own["source_id"].tolist()) == sorted(before.rows["track_id"].tolist())
         for row in own:
-            roots.setdefault(int(row["source_id"]), set()).add(int(row["track_id"]))
+            track, seen = last.get(int(row["source_id"]), (row["track_id"], 0))
+            assert row["track_id"] == track or seen < before.index - 1
+            last[int(row["source_id"])] = int(row["track_id"]), before.index
             same = before.rows[before.rows["track_id"] == row["source_id"]]
             assert [row[name] for name in ("x_px", "h_px", "x_m")] == [
                 same[0][name] for name in ("x_px", "h_px", "x_m")
             ]
         assert not after.rows[after.rows["source_id"] < 0]["observed"].any()
-    assert all(len(one) == 1 for one in roots.values())
     assert len(ids_of(found)) < len(ids_of(frames))
 
 
@@ -180,7 +180,8 @@ def test_cameras_at_the_height_of_people_gain_and_none_loses():
         assert is_poor(tracks)
         plane = assumed_plane(np.concatenate([one.rows["h_px"] for one in tracks]), 640, 480)
         samples = [one for (one,) in Sample(start_ns=0, ground_planes=((0, plane),))(tracks)]
-        full = linked_tracks(tracks, linked(samples), ((0, plane),))
+        retrack = replace(PICTURES, boxes=collect(TRACKS, tracks))
+        full = linked_tracks(tracks, linked(samples, retrack), ((0, plane),), retrack.filled_s)
         before.append(score(make_matchup(truth, tracks, "iou", 0.5), "trackeval"))
         after.append(score(make_matchup(truth, full, "iou", 0.5), "trackeval"))
         had, has = summary(before[-1]), summary(after[-1])
@@ -190,78 +191,103 @@ def test_cameras_at_the_height_of_people_gain_and_none_loses():
     assert has["IDF1"] > had["IDF1"] + 0.025
 
 
-def odds_by_the_model(boxes: dict[int, list[tuple[float, ...]]]) -> float:
-    """The log odds that the second of two tracks continues the first, as the room explains it, by general means.
-
-    ``boxes`` has for each track rows of time, middle (x, y) and height; those after the second only count as births.
-    The state at an end is that of a Bayesian linear regression in heights of the box.
-    """
-    ends = []
-    for rows, last in ((np.array(boxes[1]), -1), (np.array(boxes[2]), 0)):
-        near = rows[np.abs(rows[:, 0] - rows[last, 0]) <= 1.3]
-        line = np.column_stack([np.ones(len(near)), near[:, 0] - rows[last, 0]])
-        height = near[:, 3].mean()
-        cov = np.linalg.inv(line.T @ line / 0.06**2 + np.diag([0, 1 / 0.6**2]))
-        place, speed = cov @ line.T @ (near[:, 1:3] / height) / 0.06**2
-        tall = np.linalg.inv(line.T @ line / 0.06**2 + np.diag([0, 1 / 0.2**2])) @ line.T @ np.log(near[:, 3]) / 0.06**2
-        ends.append((rows[last, 0], place * height, speed * height, height, tall[0], cov[0, 0], cov[1, 1]))
-    (t0, xy0, v0, h0, tall0, at0, way0), (t1, xy1, v1, h1, tall1, at1, way1) = ends
-    gap = t1 - t0
-    off = (xy1 - xy0 - (v0 + v1) / 2 * gap) / np.sqrt(h0 * h1)
-    spread = at0 + at1 + 0.08**2 + 0.25**2 * gap**3 / 12 + (gap / 2) ** 2 * (way0 + way1)
-    moved = multivariate_normal.logpdf(off, cov=spread * np.eye(2))
-    grown = norm.logpdf(tall1 - tall0, scale=np.hypot(0.12, 0.15 * gap)) - norm.logpdf(0, scale=0.5)
-    rows = np.concatenate([np.array(one) for one in boxes.values()])
-    corners = [rows[:, 1:3] + sign * rows[:, 3:] * [0.2, 0.5] for sign in (-1, 1)]
-    heights = (corners[1].max(axis=0) - corners[0].min(axis=0)).prod() / np.median(rows[:, 3]) ** 2
-    births = len(boxes) / (max(np.ptp(rows[:, 0]), 1.0) * max(heights, 1.0))
-    return float(moved + grown + expon.logpdf(gap) + np.log(0.5 / births))
+def ids_in_picture(frames: list[Frame], max_gap_s: float, least: float, *options: object) -> set[int]:
+    rows = link_in_picture(collect(TRACKS, frames), max_gap_s, least, False, *options).frames
+    return ids_of(list(rows))
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_links_are_as_probable_as_the_model_says(seed):
-    """A link is made up to its probability, and not beyond it."""
-    rng = np.random.default_rng(seed)
-    lengths, gap = rng.integers(1, 7, 2), int(rng.integers(1, 9))
-    boxes: dict[int, list[tuple[float, ...]]] = {1: [], 2: []}
-    if seed % 2:  # somebody else is there all the time
-        boxes[3] = [(n / 2.5, 900.0, 700.0, 60.0) for n in range(lengths.sum() + gap - 1)]
-    speed = rng.normal(0, 30, 2)
-    for which, begin, count in ((1, 0, lengths[0]), (2, lengths[0] + gap - 1, lengths[1])):
-        for n in range(begin, begin + count):
-            x, y = (300, 400) + speed * n / 2.5 + rng.normal(0, 5, 2)
-            boxes[which].append((n / 2.5, x, y, 100 * np.exp(rng.normal(0, 0.08))))
-    odds = odds_by_the_model(boxes)
-    frames = collect(
-        TRACKS,
-        (
-            frame(n, {i: (x, y + h / 2, h) for i, rows in boxes.items() for t, x, y, h in rows if round(t * 2.5) == n})
-            for n in range(lengths.sum() + gap - 1)
-        ),
+@pytest.mark.parametrize("tall", [40.0, 200.0])
+def test_links_are_less_likely_the_less_both_sides_fit(tall):
+    """One person goes on in time, as tall, and where expected; sizes are in heights of the box."""
+
+    def least_likely(frames: list[Frame]) -> float:
+        asked = 1 / (1 + np.exp(-np.linspace(-8, 8, 33)))
+        return max((least for least in asked.tolist() if len(ids_in_picture(frames, 4.0, least)) == 1), default=0.0)
+
+    best = least_likely(with_gap(tall, range(8, 10)))
+    assert best > 0.5
+    assert best > least_likely(with_gap(tall, range(8, 14)))
+    assert best > least_likely(with_gap(tall, range(8, 10), then=1.5 * tall))
+    assert (
+        best
+        > least_likely(with_gap(tall, range(8, 10), aside=0.5))
+        > least_likely(with_gap(tall, range(8, 10), aside=1.5))
     )
-    made = []
-    for nudge in (-1e-5, 1e-5):
-        least = 1 / (1 + np.exp(-odds - nudge))
-        found = np.concatenate(list(link_in_picture(frames, 9.0, least, False).rows))
-        made.append(2 not in found["track_id"])
-    assert made == [True, False]
+
+
+def test_a_way_that_is_hidden_throughout_is_likelier_than_one_that_is_hidden_in_part():
+    """Somebody nearer to the camera stands before the whole way or before its middle, while track 1 is missed."""
+
+    def least_likely(tall: float) -> float:
+        frames = with_gap(100.0, range(8, 12))
+        x = walking(10, 100.0)[0]
+        hiding = {n: frame(n, {5: (x, 450.0, tall)}).rows for n in range(7, 13)}
+        both = [np.concatenate([one.rows, hiding.get(one.index, one.rows[:0])]) for one in frames]
+        frames = [one._replace(rows=rows) for one, rows in zip(frames, both, strict=True)]
+        asked = 1 / (1 + np.exp(-np.linspace(-8, 8, 65)))
+        return max((least for least in asked.tolist() if ids_in_picture(frames, 4.0, least) == {1, 5}), default=0.0)
+
+    assert least_likely(600.0) > least_likely(200.0) > 0
+
+
+def test_a_track_is_cut_where_another_one_goes_on_there():
+    """The tracker continues track 1 with somebody much smaller far away, and begins track 2 where the person is."""
+
+    def boxes(n: int) -> dict[int, Box]:
+        own = walking(n, 100.0)
+        return {1: own} if n < 8 else {} if n < 10 else {1: (900.0, 200.0, 30.0), 2: own}
+
+    frames = [frame(n, boxes(n)) for n in range(20)]
+    found = linked(frames)
+    assert [one.rows["track_id"].tolist() for one in found] == [[1]] * 10 + [[1, 3]] * 10
+    assert [one.rows["source_id"].tolist() for one in found] == [[1]] * 8 + [[-1]] * 2 + [[2, 1]] * 10
+
+
+def test_at_the_rate_of_the_video_pieces_without_a_sample_count_too():
+    """With boxes of the video beside samples, gaps between samples are seen."""
+
+    def boxes(n: int) -> dict[int, Box]:
+        x = 10.0 * n
+        return {1: (x, 300, 90)} if n < 17 else {2: (x, 300, 90)} if n >= 22 else {}
+
+    tracks = [frame(n, boxes(n), 10.0) for n in range(40)]
+    samples = [frame for (frame,) in Sample(start_ns=0)(tracks)]
+    full = linked_tracks(tracks, linked(samples, replace(PICTURES, boxes=collect(TRACKS, tracks))), (), 4.0)
+    assert [one.rows["track_id"].tolist() for one in full] == [[1]] * 40
+    assert [one.rows["observed"].tolist() for one in full] == [[not 17 <= n < 22] for n in range(40)]
+
+
+def test_gaps_are_filled_only_as_long_as_a_straight_line_is_right():
+    """Of people who walk straight on all gaps are filled, of those who turn every second short ones."""
+
+    def turning(n: int) -> float:
+        return 100.0 * float(np.sin(2 * np.pi * n / 20))
+
+    straight = [frame(n, {1: (10.0 * n, 300, 90)}, 10.0) for n in range(100)]
+    zigzag = [frame(n, {1: (300 + turning(n), 300, 90)}, 10.0) for n in range(100)]
+    assert steady_s(straight, 4.0) == 4.0
+    assert steady_s(zigzag, 4.0) < 1.0
+    assert steady_s([], 4.0) == 4.0
 
 
 def test_the_longest_gaps_are_linked_and_no_longer_ones():
     for missed, joined in ((10, True), (11, False)):  # 4.0 and 4.4 s between the samples before and after
-        frames = collect(TRACKS, with_gap(100.0, range(4, 3 + missed)))
-        found = np.concatenate(list(link_in_picture(frames, 9.0, 1e-9, False).rows))
-        assert (2 not in found["track_id"]) == joined
-        found = np.concatenate(list(link_in_picture(frames, (missed - 1) * 0.4, 1e-9, False).rows))
-        assert 2 in found["track_id"]
+        frames = with_gap(100.0, range(4, 3 + missed))
+        assert (ids_in_picture(frames, 4.0, 1e-9) == {1}) == joined
+        assert ids_in_picture(frames, (missed - 1) * 0.4, 1e-9) == {1, 2}
+        assert (ids_of(linked(frames, replace(PICTURES, link_confidence=0.01))) == {1}) == joined
 
 
-def test_tracks_of_people_who_said_so_are_not_joined():
-    frames = collect(TRACKS, with_gap(100.0, range(8, 10)))
+def test_tracks_of_people_who_said_so_are_neither_cut_nor_joined():
+    frames = with_gap(100.0, range(8, 10))
     for fixed, count in (((), 1), ((1,), 1), ((2,), 1), ((1, 2), 2)):
-        found = np.concatenate(list(link_in_picture(frames, 4.0, 0.5, False, fixed).rows))
-        assert len(np.unique(found["track_id"])) == count
-    assert list(link_in_picture(collect(TRACKS, []), 4.0, 0.5, False).rows) == []
+        assert len(ids_in_picture(frames, 4.0, 0.5, fixed)) == count
+    assert ids_in_picture([], 4.0, 0.5) == set()
+    apart = [
+        frame(n, {1: walking(n, 100.0)} if n < 8 else {1: (900.0, 200.0, 30.0)} if n > 9 else {}) for n in range(20)
+    ]
+    assert ids_in_picture(apart, 4.0, 0.5) == {1, 2}
+    assert ids_in_picture(apart, 4.0, 0.5, (1,)) == {1}
 
 
 def test_a_track_of_three_parts_has_one_id_also_in_its_gaps_and_rows_are_in_order_of_ids():
@@ -275,7 +301,8 @@ def test_a_track_of_three_parts_has_one_id_also_in_its_gaps_and_rows_are_in_orde
     frames = [frame(n, boxes(n)) for n in range(20)]
     both = [np.concatenate([one.rows, nowhere]) for one in frames]
     frames = [one._replace(rows=rows[np.argsort(rows["track_id"])]) for one, rows in zip(frames, both, strict=True)]
-    for n, rows in enumerate(link_in_picture(collect(TRACKS, frames), 4.0, 0.5, False).rows):
+    for n, one in enumerate(linked(frames)):
+        rows = one.rows
         assert rows["track_id"].tolist() == [4, 7, 9]
         assert rows["x_px"][2] == pytest.approx(walking(n, 100.0)[0] - 20)
         source = -1 if n in (6, 7, 13, 14) else 9 if n < 6 else 2 if n < 13 else 3

@@ -280,6 +280,7 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
                 "ground_planes": (),
                 "poor_scale": False,
                 "descriptors": None,
+                "boxes": None,
                 **people,
             }
             assert [frame.t_ns for frame in frames] == [frame.t_ns for frame in paced(rate_hz)]

@@ -26,6 +26,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+import fit_pictures
 from corruptions import CORRUPTIONS, crowds, with_people
 from crowds import drawn, faults
 from regression import Chosen, logistic, multinomial, shift, show_reliability
@@ -511,7 +512,8 @@ def main() -> None:
         "licence": "Apache-2.0",
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }
-    fitted = {"card": card, "links": links, "choices": choices, "people": people} | judged | online
+    pictures = fit_pictures.fitted(fit_pictures.read(fit_pictures.SEEDS))
+    fitted = {"card": card, "links": links, "choices": choices, "people": people} | judged | online | pictures
     text = json.dumps(fitted, indent=1) + "\n"
     if given.check:
         print("the same" if WEIGHTS.read_text(encoding="utf-8") == text else text)

@@ -30,6 +30,7 @@ from mcaptrack.pipeline.staleness import digest_of, takes_corrections
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import frame_times, row_ends
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.cameras import camera_at
@@ -335,6 +336,27 @@ def _fixed_ids(work: Work) -> SideInput | None:
     return SideInput(fixed_ids(state.frames(how.input), state.opened.frame_columns(topic, TRACKS)))
 
 
+def _sampled_tracks(work: Work) -> tuple[Sequence[Frame], Sequence[Frame] | None]:
+    """The tracks of which the input has samples, in the reference picture, and corrections of them, if any."""
+    state = work.state
+    samples = state.provenance(work.job.source)
+    source = samples.input if samples else ""
+    tracks = state.frames(source)
+    topic = corrections_of(state.opened, state.prefix, source)
+    corrections = state.opened.frame_columns(topic, TRACKS) if topic is not None else None
+    if len(tracks) and corrections is not None:
+        tracks = with_corrections(tracks, corrections)
+    return to_scene(tracks, work.path), corrections
+
+
+def _boxes(work: Work) -> SideInput | None:
+    """Take the tracks of which the input has samples, where these are poor; their digests are those of the samples."""
+    if not (is_assumed(work.planes) and is_poor(work.source.frames)) or work.is_led:
+        return None
+    tracks = collect(TRACKS, _sampled_tracks(work)[0])
+    return SideInput(tracks) if len(tracks) else None
+
+
 CONTEXT: Final[Mapping[str, Callable[[Work], SideInput | None]]] = MappingProxyType(
     {
         "camera_path": lambda work: motion_input(work.state, work.transform),
@@ -345,6 +367,7 @@ CONTEXT: Final[Mapping[str, Callable[[Work], SideInput | None]]] = MappingProxyT
         "rate_hz": _rate_hz,
         "poor_scale": lambda work: SideInput(is_poor(work.source.frames)) if is_assumed(work.planes) else None,
         "fixed_ids": _fixed_ids,
+        "boxes": _boxes,
     }
 )
 
@@ -370,18 +393,16 @@ def _without_lead(work: Work) -> None:
 
 def _at_video_rate(work: Work) -> None:
     """Add the tracks at the rate of those that were sampled, if there are any."""
-    state, job = work.state, work.job
+    job = work.job
     if job.target + FULL not in job.kept():
         return
-    samples = state.provenance(job.source)
-    source = samples.input if samples else ""
-    tracks = state.frames(source)
-    topic = corrections_of(state.opened, state.prefix, source)
-    corrections = state.opened.frame_columns(topic, TRACKS) if topic is not None else None
-    if len(tracks) and corrections is not None:
-        tracks = with_corrections(tracks, corrections)
-    carry = linked_tracks if traits_of(work.transform).leaves_unchanged else to_video_rate
-    carried: Sequence[Frame] = carry(to_scene(tracks, work.path), work.main(), work.planes or ())
+    tracks, corrections = _sampled_tracks(work)
+    if traits_of(work.transform).leaves_unchanged:
+        carried: Sequence[Frame] = linked_tracks(
+            tracks, work.main(), work.planes or (), getattr(work.transform, "filled_s", 0.0)
+        )
+    else:
+        carried = to_video_rate(tracks, work.main(), work.planes or ())
     if corrections is not None:
         carried = without_filled(carried, corrections)
     if carried:

@@ -139,8 +139,8 @@ class Traits:
     keeps_unseen : bool
         Whether rows that are not observed and lie outside of the picture stay in the log.
     leaves_unchanged : bool
-        Whether a re-tracker passes its input on as it is, but that a track may continue another one; then all boxes
-        stay at the rate of the video.
+        Whether a re-tracker passes its input on as it is, but that tracks may be cut, or continue others; then all
+        boxes stay at the rate of the video.
     """
 
     colour: Colour = "grey"

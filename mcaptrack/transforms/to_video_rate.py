@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.geometry.boxes import columns_to_boxes, iou_of_pairs
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.geometry.ragged import find_rows, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows
@@ -34,6 +34,14 @@ from mcaptrack.schema.resampling import interval_ns, resample, resample_parts
 _FROM_TRACKER: Final = ("x_px", "y_px", "w_px", "h_px", "score", "observed")
 #: Columns of tracks that a tracker made in metres, with velocities.
 _IN_METRES: Final = ("x_m", "y_m", "z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s")
+
+
+#: Lengths of gaps in s for which it is asked whether interpolated boxes are right: if they overlap so much with what
+#: is there, of at least so many boxes so large a share.
+_GAPS_S: Final = (0.25, 0.5, 1.0, 2.0, 3.0, 4.0)
+_RIGHT_IOU: Final = 0.5
+_LEAST_BOXES: Final = 20
+_LEAST_RIGHT: Final = 2 / 3
 
 
 # Where tracks of boxes in space begin and end, decided over a whole log.
@@ -242,7 +250,7 @@ def _part(
     base["source_id"][place[inside]] = boxes["track_id"][inside]
     outside = boxes[~inside]
     outside["source_id"], outside["track_id"] = outside["track_id"], ids[~inside]
-    _to_metres(outside, frame_ns[at[~inside]], planes)
+    to_metres(outside, frame_ns[at[~inside]], planes)
     rows = TRACKS.joined([base, outside])
     rows_at = np.concatenate([base_at, at[~inside]])
     track_ids, class_id = classes
@@ -259,27 +267,60 @@ def _have_sizes(frames: Sequence[Frame]) -> bool:
     return has_size and not has_any(TRACKS, frames, lambda rows: np.isfinite(rows["w_px"]))
 
 
-def linked_tracks(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> FrameColumns:
+def steady_s(tracks: Sequence[Frame], most_s: float) -> float:
+    """The longest gap in s, up to ``most_s``, in which interpolated boxes would be right.
+
+    The log tells it: boxes in the middle of stretches without a gap are compared with what would be interpolated there.
+    People who turn and cameras that shake move away from a straight line; then long gaps are better left open.
+    """
+    parts = [
+        (joined.rows["track_id"], joined.frame + low, columns_to_boxes(joined.rows))
+        for low, _, joined in joined_parts(TRACKS, tracks)
+    ]
+    if not parts:
+        return most_s
+    track, frame, boxes = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.lexsort((frame, track))
+    order = order[np.isfinite(boxes[order]).all(axis=1)]
+    track, frame, boxes = track[order], frame[order], boxes[order]
+    usual_s, longest_s = interval_ns(frame_times(tracks)) / NS_PER_S, most_s
+    for gap_s in [gap_s for gap_s in _GAPS_S if gap_s <= most_s] if usual_s else ():
+        half = max(round(gap_s / usual_s / 2), 1)
+        if len(track) <= 2 * half:
+            return most_s
+        before, middle, after = (slice(low, len(track) - 2 * half + low) for low in (0, half, 2 * half))
+        whole = (track[before] == track[after]) & (frame[after] - frame[before] == 2 * half)
+        share = iou_of_pairs((boxes[before] + boxes[after])[whole] / 2, boxes[middle][whole])
+        if len(share) >= _LEAST_BOXES and (share >= _RIGHT_IOU).mean() < _LEAST_RIGHT:
+            return longest_s
+        longest_s = gap_s
+    return most_s
+
+
+def linked_tracks(
+    tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes, filled_s: float = 0.0
+) -> FrameColumns:
     """The frames of ``tracks``, of which some continue others in ``retracks``.
 
-    The arguments are those of ``to_video_rate``, but here a track has one id in ``retracks`` from its beginning to its
-    end. All boxes stay, but for the second of two that would have one id in a frame: that of the track that began
-    later. The gaps of linked tracks are interpolated between boxes.
+    The arguments are those of ``to_video_rate``. All boxes stay, but for the second of two that would have one id in a
+    frame: that of the track that began later. Gaps of up to ``filled_s`` are interpolated between boxes, as far as this
+    log tells that these are right; without it, all gaps of tracks that are linked.
     """
-    roots: dict[int, int] = {}
-    for _, _, joined in joined_parts(TRACKS, retracks):
-        rows = joined.rows[joined.rows["source_id"] >= 0]
-        roots |= dict(zip(rows["source_id"].tolist(), rows["track_id"].tolist(), strict=True))
     spans_ns: dict[int, tuple[int, int]] = {}
     for _, _, joined in joined_parts(TRACKS, tracks):
         for track, t_ns in zip(joined.rows["track_id"].tolist(), joined.row_ns.tolist(), strict=True):
             spans_ns[track] = spans_ns.get(track, (t_ns, t_ns))[0], t_ns
+    sources: dict[int, set[int]] = {}
 
     def renamed(joined: JoinedFrames) -> Rows:
         rows = joined.rows
         rows["source_id"] = rows["track_id"]
-        rows["track_id"] = [roots.get(track, track) for track in rows["track_id"].tolist()]
-        _to_metres(rows, joined.row_ns, planes)
+        ids, _ = _retracked_ids(rows["track_id"], joined.row_ns, retracks)
+        rows["track_id"] = np.where(ids >= 0, ids, rows["track_id"])
+        pairs = np.unique(np.stack([rows["track_id"].astype(np.int64), rows["source_id"].astype(np.int64)]), axis=1)
+        for track, source in pairs.T.tolist():
+            sources.setdefault(track, set()).add(source)
+        to_metres(rows, joined.row_ns, planes)
         return rows
 
     def is_first(joined: JoinedFrames) -> Bools:
@@ -290,14 +331,13 @@ def linked_tracks(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Pl
         return kept
 
     frames = mapped_rows(TRACKS, tracks, renamed)
-    parts: dict[int, list[tuple[int, int]]] = {}
-    for track, span in spans_ns.items():
-        parts.setdefault(roots.get(track, track), []).append(span)
-    linked = {root: sorted(spans) for root, spans in parts.items() if len(spans) > 1}
-    if not linked:
+    linked = {track: sorted(spans_ns[source] for source in own) for track, own in sources.items() if len(own) > 1}
+    if not linked and not filled_s:
         return frames
-    gap_ns = max(later[0] - before[1] for spans in linked.values() for before, later in pairwise(spans))
-    return _filled(filtered_rows(TRACKS, frames, is_first), np.array(sorted(linked)), max(gap_ns, 0))
+    filled_s = steady_s(tracks, filled_s)
+    gaps_ns = [later[0] - before[1] for spans in linked.values() for before, later in pairwise(spans)]
+    gap_ns, ids = (seconds_to_ns(filled_s), sources) if filled_s else (max([0, *gaps_ns]), linked)
+    return _filled(filtered_rows(TRACKS, frames, is_first), np.array(sorted(ids)), gap_ns)
 
 
 def _filled(frames: FrameColumns, ids: Ints, gap_ns: int) -> FrameColumns:
@@ -355,7 +395,7 @@ def _classes_of(retracks: Sequence[Frame]) -> tuple[Ints, Ints]:
     return track_ids, classes
 
 
-def _to_metres(rows: Rows, t_ns: Ints, planes: Planes) -> None:
+def to_metres(rows: Rows, t_ns: Ints, planes: Planes) -> None:
     """Fill in missing positions in metres, in place, where there is a ground plane."""
     missing = np.flatnonzero(np.isnan(rows["x_m"]))
     missing = missing[np.argsort(t_ns[missing], kind="stable")]

@@ -159,7 +159,8 @@ class ReferenceSort:
         pairs = self.pairs(boxes)
         for at, track in pairs:
             self.update(self.tracks[track], boxes[at], steps)
-            self.tracks[track].streak += hit
+            is_sure = o.min_hits_frames is None and boxes[at].score >= 0.5
+            self.tracks[track].streak += max(hit, 1e8) if is_sure else hit
         for track in self.tracks:
             track.streak = 0.0 if track.missed else track.streak
         for at, box in enumerate(boxes):

@@ -4,8 +4,8 @@ Two methods associate observations online: ``Retrack``, by likelihood (``likelih
 Algorithm 1 of the paper (``consistency``). Both leave assignments of samples to tracks, from which ``offline`` makes
 the tracks of the whole log: it decides about identities (``hypotheses``), resolves identity swaps
 (``identity_swaps``), leaves out false tracks (``false_tracks``) and smooths (``motion_model``). All of this is in
-metres: where their scale is guessed and can't be right (``poor_scale``), tracks keep their ids, and ``in_pictures``
-links them over gaps by their boxes.
+metres: where their scale is guessed and can't be right (``poor_scale``), ``in_pictures`` cuts tracks at gaps and
+links them over these by their boxes.
 """
 
 from __future__ import annotations

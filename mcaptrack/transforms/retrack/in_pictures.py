@@ -1,18 +1,20 @@
-"""Re-tracking in the picture, where positions in metres are too wrong: tracks keep their ids and are linked over gaps.
+"""Re-tracking in the picture, where positions in metres are too wrong: what trackers were sure of is linked over gaps.
 
 A camera that looks along the ground tells distances badly: a few pixels are metres. The place of a box in the picture
 is measured well, and so is its height. Positions, speeds, noise and gates are therefore in heights of the box, in which
-people near and far move alike. A tracker associates boxes by their overlap at the rate of the video, which samples
-can't improve: only ends and beginnings of its tracks are decided here. A link is as likely as the motion and the height
-before a gap fit those after it, compared with how often a new track would begin there in this log by chance; and as
-likely as what people wear before and after it is one person's, where the log has pictures that tell people apart.
+people near and far move alike. A tracker associates boxes by their overlap at the rate of the video, which is right
+from picture to picture, and often wrong after people were hidden. So its tracks are cut wherever they have a gap, and
+which pieces are of one person is decided once for the whole log: an assignment by log odds. These are a logistic
+regression, of how well motion and size before a gap fit those after it, of the tracker's own decision, and of how far
+people nearer to the camera hide the way in between. A second one weighs each pair against the others that would take
+its place. What people wear counts, too, where the log has pictures that tell people apart.
 
-Letters: K tracks, N rows of samples, E candidate links.
+Letters: K pieces of tracks, N rows, E candidate links.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,47 +23,93 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ragged import group_index, ragged_range
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
-from mcaptrack.schema.framing import joined_parts
-from mcaptrack.schema.resampling import LINEAR
+from mcaptrack.schema.framing import JoinedFrames, filtered_rows, joined_parts, mapped_rows
+from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence
 from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.weights import Logistic, probability
 
-#: The longest gap of a link, and the mean one: how often gaps are as long falls off exponentially. In seconds.
-MAX_GAP_S: Final = 4.0
-_GAP_S: Final = 1.0
-#: The motion at an end is that of so many seconds.
-_WINDOW_S: Final = 1.3
+#: Tracks are cut at gaps of more seconds than that, and more than a missing frame.
+CUT_S: Final = 0.2
+_MISSING_FRAMES: Final = 1.5
+#: The motion at an end is that of so many seconds, in which errors of boxes are independent so often.
+_WINDOW_S: Final = 1.0
+_ERRORS_PER_S: Final = 10.0
 # In heights of the box: the noise of positions, that of ends in addition (a box shrinks where its person is occluded),
 # the speed in a second, and how much it changes within a second, per axis.
 _NOISE, _END_NOISE, _SPEED, _DRIFT = 0.06, 0.08, 0.6, 0.25
-# The same of the logarithm of the height; it differs by so much between any two people.
-_HEIGHT_NOISE, _HEIGHT_END_NOISE, _GROWTH, _HEIGHT_DRIFT, _HEIGHTS = 0.06, 0.12, 0.2, 0.15, 0.5
-#: The share of ends that are followed by a beginning of the same person.
-_RETURNS: Final = 0.5
+# The same of the logarithm of the height.
+_HEIGHT_NOISE, _HEIGHT_END_NOISE, _GROWTH, _HEIGHT_DRIFT = 0.06, 0.12, 0.2, 0.15
+#: Pairs are no candidates if their motion, or height, is less likely than the best by more units of log likelihood.
+_MOST_MISSED: Final = 10.0
+#: Links are made from this share of the odds on that are asked for: a wrong link costs less than a missed one, because
+#: the track of one of the two people is often soon over.
+_SHARE_OF_ODDS: Final = 0.5
+#: Log odds count for no more than that in those of others.
+_MOST: Final = 30.0
+#: So many times within a gap it is asked whether the way is hidden.
+_TIMES: Final = 6
+#: A box hides those behind it: its lower edge is at most so many of their heights above theirs.
+_BEHIND: Final = 0.05
+#: Pairs at once, for what is hidden.
+_AT_ONCE: Final = 4096
 #: The height of a person, for how far people may have walked between two places in the picture: as if all were as far
 #: away as the usual box.
 _PERSON_M: Final = 1.7
 
+#: What tells right links from wrong ones.
+FEATURES: Final = (
+    "log miss",
+    "log growth",
+    "change of width",
+    "log gap",
+    "gap",
+    "same track",
+    "hidden after",
+    "hidden",
+    "least hidden",
+    "log rarity",
+    "short before",
+    "short after",
+)
+#: What tells them among others: their log odds by themselves, and how likely one of the others is that would take the
+#: place before or after the gap, as a logarithm.
+AMONG_OTHERS: Final = ("alone", "others after", "others before")
+_PAIRS, _LINKS = Logistic.of("pairs in pictures", FEATURES), Logistic.of("links in pictures", AMONG_OTHERS)
+
 
 class Linked(NamedTuple):
-    """The rows of each frame; the id of each input track after linking, ``track`` (K,) by ``ids`` (K,) in ascending
-    order; and how appearance tells people apart, None if nothing was seen of them.
+    """Tracks after linking, and which piece of an input track has which id.
+
+    Attributes
+    ----------
+    frames : FrameColumns
+        The observed rows under their new ids; ``source_id`` is the id in the input. Gaps are not filled.
+    source, begin_ns, track : (K,) of int
+        Of each piece the id of its input track and when it begins, by which they are ordered, and its id after linking.
+    calibration : AppearanceCalibration or None
+        How appearance tells people apart; None if nothing was seen of them.
     """
 
-    rows: Iterator[Rows]
-    ids: Ints
+    frames: FrameColumns
+    source: Ints
+    begin_ns: Ints
     track: Ints
     calibration: AppearanceCalibration | None
 
-    def track_of(self, ids: Ints) -> Ints:
-        """The ids (N,) of input tracks after linking; -1 for those that have no box."""
-        if len(self.ids) == 0:
-            return np.full(len(ids), -1)
-        place = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        return np.where(self.ids[place] == ids, self.track[place], -1)
+    def track_of(self, source: Ints, t_ns: Ints) -> Ints:
+        """The ids (N,) of rows of input tracks at these times; -1 for tracks that have no box until then."""
+        ids, times = (np.unique(np.concatenate(both)) for both in ((self.source, source), (self.begin_ns, t_ns)))
+        have, wanted = (
+            np.searchsorted(ids, of) * len(times) + np.searchsorted(times, at)
+            for of, at in ((self.source, self.begin_ns), (source, t_ns))
+        )
+        place = np.searchsorted(have, wanted, "right") - 1
+        is_own = (place >= 0) & (np.append(self.source, -1)[place] == source)
+        return np.where(is_own, np.append(self.track, -1)[place], -1)
 
 
 def link_in_picture(
@@ -73,113 +121,121 @@ def link_in_picture(
     looks: Descriptors | None = None,
     rate_hz: float = 2.5,
 ) -> Linked:
-    """The rows of each frame, with tracks linked over gaps of up to ``max_gap_s``, and the gaps interpolated.
+    """Cut tracks at their gaps, and link what is of one person over gaps of up to ``max_gap_s``.
 
-    A link is made if it is right with a probability of at least ``min_confidence``. A track that continues another has
-    the id of that one. No link joins two of the tracks ``fixed``. Where nothing is linked, rows are those of the input.
-    ``looks`` are compared if they tell tracks apart; samples come at ``rate_hz``.
+    A link is made if it is right with a probability of at least ``min_confidence``. What continues a track has the id
+    of that one; what was cut off and continues none has a new id. No link joins two of the tracks ``fixed``, and these
+    are not cut. ``looks`` are compared if they tell tracks apart; their samples come at ``rate_hz``.
     """
-    if not len(frames):
-        return Linked(iter(()), np.empty(0, np.int64), np.empty(0, np.int64), None)
-    tracks = _tracks(frames)
-    calibration, seen = _appearance(tracks, looks, frames.t_ns, rate_hz)
-    before, after = _links(tracks, min(max_gap_s, MAX_GAP_S), min_confidence, across_classes, seen)
-    root = np.arange(len(tracks.ids))
-    holds = np.isin(tracks.ids, np.array(sorted(fixed), np.int64))
-    is_allowed = np.ones(len(before), bool)
-    for link in np.argsort(tracks.t_s[tracks.first[after]], kind="stable").tolist():  # a continuation begins later
-        first = root[before[link]]
-        is_allowed[link] = not (holds[first] and holds[after[link]])
-        if is_allowed[link]:
-            root[after[link]] = first
-            holds[first] |= holds[after[link]]
-    before, after = before[is_allowed], after[is_allowed]
-    name = dict(zip(tracks.ids.tolist(), tracks.ids[root].tolist(), strict=True))
-    last = tracks.first[1:] - 1
-    ends = {int(tracks.ids[i]): int(tracks.ids[j]) for i, j in zip(before, after, strict=True)}
-    lost = dict(zip(tracks.ids[before].tolist(), tracks.frame[last[before]].tolist(), strict=True))
-    begin_of = dict(zip(tracks.ids[after].tolist(), tracks.frame[tracks.first[after]].tolist(), strict=True))
-    gaps = _Gaps(frames, {end: (lost[end], other, begin_of[other]) for end, other in ends.items()})
-    return Linked(_renamed(frames, name, gaps), tracks.ids, tracks.ids[root], calibration)
+    observed = filtered_rows(TRACKS, frames, lambda joined: joined.rows["observed"])
+    pieces = find_pieces(observed, fixed)
+    calibration, seen = _appearance(pieces, looks, observed.t_ns, rate_hz)
+    root = np.arange(len(pieces.source))
+    holds = np.isin(pieces.source, np.array(sorted(fixed), np.int64))
+    before, after = _links(pieces, max_gap_s, min_confidence, across_classes, seen)
+    for link in np.argsort(pieces.t_s[pieces.first[after]], kind="stable").tolist():  # a continuation begins later
+        first, other = root[before[link]], after[link]
+        if not (holds[first] and holds[other]):
+            root[other] = first
+            holds[first] |= holds[other]
+    is_cut = np.append(False, pieces.source[1:] == pieces.source[:-1])[: len(root)]
+    names = pieces.source.copy()
+    names[is_cut] = pieces.source.max(initial=0) + 1 + np.arange(is_cut.sum())
+    begin_ns = observed.t_ns[pieces.frame[pieces.first[:-1]]] if len(root) else root
+    linked = Linked(observed, pieces.source, begin_ns, names[root], calibration)
+
+    def renamed(joined: JoinedFrames) -> Rows:
+        rows = joined.rows
+        track = linked.track_of(rows["track_id"], joined.row_ns)
+        rows["source_id"] = rows["track_id"]
+        rows["track_id"] = np.where(track >= 0, track, rows["track_id"])
+        order = np.lexsort((rows["track_id"], joined.frame))
+        return rows[order]
+
+    return linked._replace(frames=mapped_rows(TRACKS, observed, renamed))
 
 
-def _renamed(frames: FrameColumns, name: Mapping[int, int], gaps: _Gaps) -> Iterator[Rows]:
-    """The rows of each frame and those of gaps there, under the new name of each id."""
-    for number, frame in enumerate(frames):
-        rows = frame.rows.copy()
-        ids = np.array([name.get(track, track) for track in rows["track_id"].tolist()], rows["track_id"].dtype)
-        filled = gaps.rows_at(number)
-        if len(filled):
-            filled["track_id"] = [name[track] for track in filled["track_id"].tolist()]
-        renamed = ids != rows["track_id"]
-        rows["source_id"][renamed] = rows["track_id"][renamed]
-        rows["track_id"] = ids
-        if len(filled) or renamed.any():
-            rows = np.concatenate([rows, filled])
-            rows = rows[np.argsort(rows["track_id"], kind="stable")]
-        yield rows
+class BoxPieces(NamedTuple):
+    """The boxes of what trackers were sure of: those of piece k are ``first[k]`` to ``first[k + 1]`` of N, by time.
 
+    ``source`` (K,) are the ids of their tracks and ``classes`` (K,) their classes; pieces are ordered by track, then
+    by time. ``usual_s`` is the usual time from frame to frame, ``frame_s`` (F,) the times of all frames.
+    """
 
-class _Tracks(NamedTuple):
-    """The boxes of all tracks: those of track k are ``first[k]`` to ``first[k + 1]`` of N, ordered by time."""
-
-    ids: Ints
+    source: Ints
     first: Ints
     boxes: Floats
     t_s: Floats
     frame: Ints
     classes: Ints
+    frame_s: Floats
+    usual_s: float
+
+    @property
+    def piece(self) -> Ints:
+        """The piece of each box (N,)."""
+        return group_index(np.diff(self.first))
 
 
-def _tracks(frames: FrameColumns) -> _Tracks:
-    """The boxes of tracks in pixels; rows without one are left out."""
+def find_pieces(frames: FrameColumns, fixed: Collection[int]) -> BoxPieces:
+    """The boxes of tracks in pixels, cut at gaps; rows without one are left out."""
     parts: list[tuple[Ints, Floats, Ints, Ints]] = []
     for low, _, joined in joined_parts(TRACKS, frames):
         rows = joined.rows
         parts.append((rows["track_id"], columns_to_boxes(rows), joined.frame + low, rows["class_id"]))
+    parts = parts or [(np.empty(0, np.int64), np.empty((0, 4)), np.empty(0, np.int64), np.empty(0, np.int64))]
     track, boxes, frame, classes = (np.concatenate(part) for part in zip(*parts, strict=True))
     kept = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > 0).all(axis=1)
     order = np.flatnonzero(kept)[np.lexsort((frame[kept], track[kept]))]
-    ids, count = np.unique(track[order], return_counts=True)
-    first = np.concatenate([[0], np.cumsum(count)])
-    t_s = (frames.t_ns - frames.t_ns[0])[frame[order]] / NS_PER_S
-    return _Tracks(ids, first, boxes[order], t_s, frame[order], classes[order][first[:-1]])
+    track, boxes, frame = track[order], boxes[order], frame[order]
+    usual_s = interval_ns(frames.t_ns) / NS_PER_S
+    frame_s = (frames.t_ns - frames.t_ns[:1]) / NS_PER_S
+    t_s = frame_s[frame]
+    is_first = run_starts(track)
+    gap_s = np.diff(t_s, prepend=t_s[:1])
+    is_first |= (gap_s > max(CUT_S, _MISSING_FRAMES * usual_s)) & ~np.isin(track, np.array(sorted(fixed), np.int64))
+    first = np.append(np.flatnonzero(is_first), len(track))
+    return BoxPieces(track[first[:-1]], first, boxes, t_s, frame, classes[order][first[:-1]], frame_s, usual_s)
 
 
 class _Ends(NamedTuple):
-    """The ends or the beginnings of K tracks.
+    """The ends or the beginnings of K pieces.
 
-    Times (K,) in s; positions (K, 2) in px and velocities (K, 2) in px/s; heights (K,) in px and their logarithms (K,);
-    variances of positions and of velocities (K,), in squared heights.
+    Times (K,) in s and frames (K,); boxes (K, 4); positions (K, 2) in px and velocities (K, 2) in px/s; heights (K,) in
+    px and their logarithms (K,) there; variances of positions and of velocities (K,), in squared heights; durations
+    (K,) in s, of which these are known.
     """
 
     t_s: Floats
+    frame: Ints
+    boxes: Floats
     xy_px: Floats
     v_px_per_s: Floats
     height_px: Floats
     log_height: Floats
     variance: Floats
     speed_variance: Floats
+    known_s: Floats
 
 
-def _ends(tracks: _Tracks, at: Ints) -> _Ends:
-    """The motion of tracks at one of their rows (K,), the first or the last: of the samples within ``_WINDOW_S``."""
-    track = group_index(np.diff(tracks.first))
-    since = tracks.t_s - tracks.t_s[at][track]
+def _ends(pieces: BoxPieces, at: Ints) -> _Ends:
+    """The motion of pieces at one of their rows (K,), the first or the last: of the boxes within ``_WINDOW_S``."""
+    since = pieces.t_s - pieces.t_s[at][pieces.piece]
     near = np.abs(since) <= _WINDOW_S
-    track, since, boxes = track[near], since[near], tracks.boxes[near]
-    count = len(at)
+    piece, since, boxes = pieces.piece[near], since[near], pieces.boxes[near]
+    weight = min(1.0, _ERRORS_PER_S * pieces.usual_s) if pieces.usual_s > 0 else 1.0
 
     def total(values: Floats) -> Floats:
-        return np.bincount(track, values, minlength=count).astype(np.float64)
+        return np.bincount(piece, values, minlength=len(at)).astype(np.float64)
 
-    height_px = total(boxes[:, 3]) / total(np.ones(len(track)))
-    zero, first, two = total(np.ones(len(track))), total(since), total(since**2)
+    count = total(np.ones(len(piece)))
+    height_px = total(boxes[:, 3]) / count
+    zero, first, two = weight * count, weight * total(since), weight * total(since**2)
 
     def fitted(values: Floats, noise: float, speed: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Value and slope at the end, and their variances: a line, with slopes of about ``speed``."""
         low, mixed, high = zero / noise**2, first / noise**2, two / noise**2 + 1 / speed**2
-        a, b = total(values) / noise**2, total(values * since) / noise**2
+        a, b = weight * total(values) / noise**2, weight * total(values * since) / noise**2
         determinant = low * high - mixed**2
         return (
             (high * a - mixed * b) / determinant,
@@ -188,24 +244,45 @@ def _ends(tracks: _Tracks, at: Ints) -> _Ends:
             low / determinant,
         )
 
-    middle = (boxes[:, :2] + boxes[:, 2:] / 2) / height_px[track, None]
+    middle = (boxes[:, :2] + boxes[:, 2:] / 2) / height_px[piece, None]
     fits = [fitted(middle[:, axis], _NOISE, _SPEED) for axis in (0, 1)]
     place, speed = (np.stack([fit[k] for fit in fits], axis=-1) * height_px[:, None] for k in (0, 1))
     log_height, *_ = fitted(np.log(boxes[:, 3]), _HEIGHT_NOISE, _GROWTH)
-    return _Ends(tracks.t_s[at], place, speed, height_px, log_height, fits[0][2], fits[0][3])
+    known_s = count * pieces.usual_s
+    return _Ends(
+        pieces.t_s[at],
+        pieces.frame[at],
+        pieces.boxes[at],
+        place,
+        speed,
+        height_px,
+        log_height,
+        fits[0][2],
+        fits[0][3],
+        known_s,
+    )
 
 
 def _appearance(
-    tracks: _Tracks, looks: Descriptors | None, times_ns: Ints, rate_hz: float
+    pieces: BoxPieces, looks: Descriptors | None, times_ns: Ints, rate_hz: float
 ) -> tuple[AppearanceCalibration | None, Evidence | None]:
-    """The calibration of appearance, and its evidence for links where it tells tracks apart."""
-    step = np.rint(tracks.t_s * rate_hz).astype(np.int64)
-    source = np.repeat(tracks.ids, np.diff(tracks.first))
-    middle_px = tracks.boxes[:, :2] + tracks.boxes[:, 2:] / 2
-    xy_m = middle_px * (_PERSON_M / np.median(tracks.boxes[:, 3])) if len(step) else middle_px
-    boxes = np.arange(len(step))
-    look = np.full(len(step), -1) if looks is None else looks.find(times_ns[tracks.frame], source)
-    samples = Tracks(step, source, source, boxes, xy_m, look, source)
+    """The calibration of appearance, and its evidence for links where it tells tracks apart.
+
+    Of each piece those boxes count that have been looked at, and one where there is none.
+    """
+    if looks is None:
+        return None, None
+    source = pieces.source[pieces.piece]
+    look = looks.find(times_ns[pieces.frame], source)
+    counts = look >= 0
+    is_unseen = np.bincount(pieces.piece, counts, minlength=len(pieces.source)) == 0
+    counts[pieces.first[:-1][is_unseen]] = True
+    step = np.rint(pieces.t_s * rate_hz).astype(np.int64)[counts]
+    middle_px = (pieces.boxes[:, :2] + pieces.boxes[:, 2:] / 2)[counts]
+    xy_m = middle_px * (_PERSON_M / np.median(pieces.boxes[:, 3])) if len(step) else middle_px
+    samples = Tracks(
+        step, pieces.piece[counts], source[counts], np.flatnonzero(counts), xy_m, look[counts], source[counts]
+    )
     seen = Appearance.of(looks, samples, 1 / rate_hz)
     if seen is None or not seen.calibration.tells_apart:
         return seen and seen.calibration, None
@@ -213,82 +290,133 @@ def _appearance(
 
 
 def _links(
-    tracks: _Tracks, max_gap_s: float, min_confidence: float, across_classes: bool, seen: Evidence | None
+    pieces: BoxPieces, max_gap_s: float, min_confidence: float, across_classes: bool, seen: Evidence | None
 ) -> tuple[Ints, Ints]:
-    """The links: tracks (E,) and the ones that continue them (E,)."""
-    nothing = np.empty(0, np.int64), np.empty(0, np.int64)
-    count = len(tracks.ids)
-    if count < 2 or max_gap_s <= 0:
-        return nothing
-    lost, begun = _ends(tracks, tracks.first[1:] - 1), _ends(tracks, tracks.first[:-1])
+    """The links: pieces (E,) and the ones that continue them (E,).
+
+    Links over short pieces have to be likely as a whole: a piece of two frames says little of who is on its other side.
+    """
+    i, j, features = find_candidates(pieces, max_gap_s, across_classes)
+    odds = _PAIRS.log_odds(features) + (0.0 if seen is None else seen(i, j))
+    least = min_confidence / (1 - min_confidence) * _SHARE_OF_ODDS
+    gain = _LINKS.log_odds(among_others(i, j, odds)) - np.log(least)
+    good = gain > 0
+    if not good.any():
+        return i[:0], j[:0]
+    count = len(pieces.source)
+    (i, j), gain = max_weight_matching((i[good], j[good]), np.round(gain[good], 6), (count, count))
+    likely = probability(gain + np.log(least))
+    is_short = np.diff(pieces.first) * pieces.usual_s < CUT_S
+    as_a_whole, made = np.ones(count), np.zeros(len(i), bool)
+    for link in np.argsort(pieces.t_s[pieces.first[j]], kind="stable").tolist():
+        chance = likely[link] * as_a_whole[i[link]]
+        made[link] = chance > least / (1 + least)
+        if made[link] and is_short[j[link]]:
+            as_a_whole[j[link]] = chance
+    return i[made], j[made]
+
+
+def among_others(i: Ints, j: Ints, odds: Floats) -> Floats:
+    """The features (E, 3) of links among others, of pairs (E,) with these log odds by themselves."""
+    likely = np.exp(np.minimum(odds, _MOST))
+    others = (np.maximum(np.bincount(side, likely)[side] - likely, 0) if len(odds) else odds for side in (i, j))
+    return np.column_stack([odds, *map(np.log1p, others)])
+
+
+def find_candidates(pieces: BoxPieces, max_gap_s: float, across_classes: bool = False) -> tuple[Ints, Ints, Floats]:
+    """The pairs of pieces that may be one person: pieces (E,), those that may continue them (E,), features (E, F)."""
+    last, first = pieces.first[1:] - 1, pieces.first[:-1]
+    lost, begun = _ends(pieces, last), _ends(pieces, first)
     order = np.argsort(begun.t_s, kind="stable")
     low = np.searchsorted(begun.t_s[order], lost.t_s, "right")
     high = np.searchsorted(begun.t_s[order], lost.t_s + max_gap_s, "right")
     i, j = group_index(high - low), order[ragged_range(low, high - low)]
     if not across_classes:
-        same = tracks.classes[i] == tracks.classes[j]
+        same = pieces.classes[i] == pieces.classes[j]
         i, j = i[same], j[same]
-    gain = _log_odds(lost, begun, i, j, _births(tracks)) - np.log(min_confidence / (1 - min_confidence))
-    gain += 0.0 if seen is None else seen(i, j)
-    good = gain > 0
-    if not good.any():
-        return nothing
-    (i, j), _ = max_weight_matching((i[good], j[good]), np.round(gain[good], 6), (count, count))
-    return i, j
-
-
-def _births(tracks: _Tracks) -> float:
-    """The number of tracks that begin in a second and in a square of the height of the usual box."""
-    boxes = tracks.boxes
-    usual_px = float(np.median(boxes[:, 3]))
-    far = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
-    seconds = max(float(np.ptp(tracks.t_s)), _GAP_S)
-    return len(tracks.ids) / (seconds * max(float(far.prod()) / usual_px**2, 1.0))
-
-
-def _log_odds(lost: _Ends, begun: _Ends, i: Ints, j: Ints, births: float) -> Floats:
-    """The log odds that the beginnings ``j`` (E,) continue the ends ``i`` (E,), and are not those of other people.
-
-    The misfit is the distance from where the mean of both velocities leads.
-    """
     gap_s = begun.t_s[j] - lost.t_s[i]
     height_px = np.sqrt(lost.height_px[i] * begun.height_px[j])
-    way = begun.xy_px[j] - lost.xy_px[i] - (lost.v_px_per_s[i] + begun.v_px_per_s[j]) / 2 * gap_s[:, None]
+    moved = (lost.v_px_per_s[i] + begun.v_px_per_s[j]) / 2 * gap_s[:, None]
     spread = lost.variance[i] + begun.variance[j] + _END_NOISE**2 + _DRIFT**2 * gap_s**3 / 12
     spread += gap_s**2 / 4 * (lost.speed_variance[i] + begun.speed_variance[j])
-    moved = -((way / height_px[:, None]) ** 2).sum(axis=1) / spread / 2 - np.log(2 * np.pi * spread)
+
+    def miss_at(edge: float) -> Floats:
+        """Half of the squared distance in standard deviations of middles (0), upper (-1) or lower edges (1)."""
+        off = begun.xy_px[j] - lost.xy_px[i] - moved
+        off[:, 1] += edge / 2 * (np.exp(begun.log_height[j]) - np.exp(lost.log_height[i]))
+        return np.asarray(((off / height_px[:, None]) ** 2).sum(axis=1) / spread / 2)
+
+    miss, edge = miss_at(0.0), np.minimum(miss_at(-1.0), miss_at(1.0))  # a box shrinks at one end, where it is hidden
+    wider = np.abs(np.log(begun.boxes[j, 2] / lost.boxes[i, 2]))
     tall = _HEIGHT_END_NOISE**2 + (_HEIGHT_DRIFT * gap_s) ** 2
-    grown = -((begun.log_height[j] - lost.log_height[i]) ** 2) / tall / 2 - np.log(tall / _HEIGHTS**2) / 2
-    lasted = -gap_s / _GAP_S + np.log(_RETURNS / _GAP_S)
-    return np.asarray(moved + grown + lasted - np.log(births))
+    growth = (begun.log_height[j] - lost.log_height[i]) ** 2 / tall / 2
+    near = np.flatnonzero((miss < _MOST_MISSED) & (growth < _MOST_MISSED))
+    i, j, gap_s = i[near], j[near], gap_s[near]
+    rarity = -np.log(2 * np.pi * spread[near]) - np.log(tall[near]) / 2 - np.log(_births(pieces))
+    hidden = np.concatenate(
+        [
+            np.empty((0, _TIMES)),
+            *(
+                _hidden_between(pieces, lost, begun, i[low : low + _AT_ONCE], j[low : low + _AT_ONCE])
+                for low in range(0, len(i), _AT_ONCE)
+            ),
+        ]
+    )
+    every = np.arange(len(pieces.source))
+    hidden_after = np.maximum(
+        _hidden(pieces, begun.frame, begun.boxes, every, every),
+        _hidden(pieces, np.maximum(begun.frame - 1, 0), begun.boxes, every, every),
+    )
+    features = (
+        np.log1p(edge[near]),
+        np.log1p(growth[near]),
+        wider[near],
+        np.log(gap_s),
+        gap_s,
+        (pieces.source[i] == pieces.source[j]) & (j == i + 1),
+        hidden_after[j],
+        hidden.mean(axis=1),
+        hidden.min(axis=1, initial=1.0),
+        rarity,
+        1 / np.sqrt(_ERRORS_PER_S * lost.known_s[i] + 0.1),
+        1 / np.sqrt(_ERRORS_PER_S * begun.known_s[j] + 0.1),
+    )
+    return i, j, np.column_stack(features).astype(np.float64)
 
 
-class _Gaps:
-    """Interpolated rows of linked tracks: ``links`` has for each id its last frame, the next id and its first frame."""
+def _births(pieces: BoxPieces) -> float:
+    """The number of pieces that begin in a second and in a square of the height of the usual box."""
+    boxes = pieces.boxes
+    if not len(boxes):
+        return 1.0
+    usual_px = float(np.median(boxes[:, 3]))
+    far = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
+    seconds = max(float(np.ptp(pieces.t_s)), 1.0)
+    return len(pieces.source) / (seconds * max(float(far.prod()) / usual_px**2, 1.0))
 
-    def __init__(self, frames: FrameColumns, links: dict[int, tuple[int, int, int]]) -> None:
-        self._t_ns = frames.t_ns
-        wanted = [(low, ended) for ended, (low, _, _) in links.items()]
-        wanted += [(high, other) for _, other, high in links.values()]
-        rows: dict[tuple[int, int], Rows] = {}
-        for number, own in sorted(wanted):
-            tracked = frames[number].rows
-            rows[number, own] = tracked[tracked["track_id"] == own].copy()
-        self._ends = [(low, high, rows[low, ended], rows[high, other]) for ended, (low, other, high) in links.items()]
-        self._open: dict[int, list[int]] = {}
-        for link, (low, high, _, _) in enumerate(self._ends):
-            for number in range(low + 1, high):
-                self._open.setdefault(number, []).append(link)
 
-    def rows_at(self, number: int) -> Rows:
-        """The rows of gaps at a frame, with the ids of the tracks before."""
-        out = []
-        for link in self._open.get(number, ()):
-            low, high, before, after = self._ends[link]
-            share = (self._t_ns[number] - self._t_ns[low]) / (self._t_ns[high] - self._t_ns[low])
-            row = before.copy()
-            for name in LINEAR:
-                row[name] += share * (after[name] - before[name])
-            row["observed"], row["source_id"] = False, -1
-            out.append(row)
-        return TRACKS.joined(out)
+def _hidden_between(pieces: BoxPieces, lost: _Ends, begun: _Ends, i: Ints, j: Ints) -> Floats:
+    """The hidden share of the way between ends ``i`` (E,) and beginnings ``j`` (E,), at ``_TIMES`` times, (E, T)."""
+    out = np.empty((len(i), _TIMES))
+    for number in range(_TIMES):
+        share = (number + 1) / (_TIMES + 1)
+        when = lost.t_s[i] + share * (begun.t_s[j] - lost.t_s[i])
+        frame = np.minimum(np.searchsorted(pieces.frame_s, when), len(pieces.frame_s) - 1)
+        boxes = lost.boxes[i] + share * (begun.boxes[j] - lost.boxes[i])
+        out[:, number] = _hidden(pieces, frame, boxes, i, j)
+    return out
+
+
+def _hidden(pieces: BoxPieces, frame: Ints, boxes: Floats, own: Ints, other: Ints) -> Floats:
+    """The share of boxes (E, 4) at frames (E,) that one box of a third piece hides, which is nearer to the camera."""
+    order = np.argsort(pieces.frame, kind="stable")
+    low, high = (np.searchsorted(pieces.frame[order], frame, side) for side in ("left", "right"))
+    which, row = group_index(high - low), order[ragged_range(low, high - low)]
+    hiding, hidden, piece = pieces.boxes[row], boxes[which], pieces.piece[row]
+    corner = np.minimum(hiding[:, :2] + hiding[:, 2:], hidden[:, :2] + hidden[:, 2:])
+    overlap = np.clip(corner - np.maximum(hiding[:, :2], hidden[:, :2]), 0, None).prod(axis=1)
+    is_nearer = hiding[:, 1] + hiding[:, 3] > hidden[:, 1] + (1 - _BEHIND) * hidden[:, 3]
+    counts = is_nearer & (piece != own[which]) & (piece != other[which])
+    share = np.zeros(len(frame))
+    np.maximum.at(share, which, np.where(counts, overlap / hidden[:, 2:].prod(axis=1), 0.0))
+    return share

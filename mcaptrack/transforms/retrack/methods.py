@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
+from itertools import pairwise, repeat
 from types import MappingProxyType
 from typing import ClassVar, Final, TypeAlias, TypeVar
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.plane import Planes
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
 from mcaptrack.transforms.retrack.appearance import AppearanceCalibration
@@ -34,6 +36,7 @@ from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
 from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
+from mcaptrack.transforms.to_video_rate import steady_s, to_metres
 
 Options = TypeVar("Options", bound=RetrackOptions)
 
@@ -188,18 +191,28 @@ def _keep_ids(
     stored: Iterator[Rows] = repeat(APPEARANCE.empty())
     if options.links_in_picture:
         frames = collect(TRACKS, frames)
-        limits = options.link_s, options.link_confidence, options.across_classes
-        result = link_in_picture(frames, *limits, options.fixed_ids, options.looks, options.rate_hz)
+        limits = options.filled_s, options.link_confidence, options.across_classes
+        boxes = frames if options.boxes is None else options.boxes
+        result = link_in_picture(boxes, *limits, options.fixed_ids, options.looks, options.rate_hz)
         seen.extend([] if result.calibration is None else [result.calibration])
-        linked = result.rows
+        linked = _sampled(result.frames, frames.t_ns, steady_s(boxes, options.filled_s), options.ground_planes)
         if (looks := options.stored_looks) is not None:
-            stored = appearance_rows(looks, result.track_of(looks.track_id), frames.t_ns)
+            stored = appearance_rows(looks, result.track_of(looks.track_id, looks.t_ns), frames.t_ns)
     for frame in frames:
         online = frame.rows[frame.rows["observed"]]
         offline = frame.rows if linked is None else next(linked)
         rows = offline, online, forecaster.predict(frame), DECISIONS.empty(), next(stored)
         yield tuple(frame._replace(rows=row) for row in rows[: len(options.writes)])
     forecaster.warn()
+
+
+def _sampled(tracks: FrameColumns, at_ns: Ints, gap_s: float, planes: Planes) -> Iterator[Rows]:
+    """The rows of linked tracks at each of the times ``at_ns``, with gaps of up to ``gap_s`` interpolated."""
+    for first, last, rows, at in resample_parts(tracks, at_ns, seconds_to_ns(gap_s)):
+        rows["source_id"][~rows["observed"]] = -1
+        to_metres(rows, at_ns[at], planes)
+        ends = np.searchsorted(at, np.arange(first, last + 1)).tolist()
+        yield from (rows[low:high] for low, high in pairwise(ends))
 
 
 def _retracked(

@@ -19,6 +19,7 @@ from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.predictors import Forecast, PredictorName
 from mcaptrack.schema import APPEARANCE, DECISIONS, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.transforms.forecasts import ADAPT_HELP
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
@@ -33,6 +34,8 @@ _LIFE: Final = "Begin and end of tracks"
 _OFFLINE: Final = "With the whole log known (offline)"
 #: The output that is written on request.
 APPEARANCE_OUTPUT: Final = "appearance"
+#: The longest gap of a link where tracks are only linked in the picture, in seconds.
+MAX_LINK_IN_PICTURE_S: Final = 4.0
 
 
 # Durations of tracks.
@@ -122,6 +125,7 @@ class RetrackOptions:
     class_names: ClassNames = context(tuple, is_recorded=False)
     poor_scale: bool = context(lambda: False)
     fixed_ids: tuple[int, ...] = context(tuple, is_recorded=False)
+    boxes: FrameColumns | None = context(lambda: None, is_recorded=False)
 
     reads: ClassVar[Schema] = TRACKS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType(
@@ -129,11 +133,12 @@ class RetrackOptions:
     )
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": float("inf"), "online": 0.0, "predictions": 0.0})
 
-    # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture; whether
-    # ellipses of predictions follow the log, and the unit of offline tracks its speed; whether a sample that was
+    # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture, and
+    # how long ones are filled; whether ellipses of predictions follow the log, and the unit of offline tracks its speed; whether a sample that was
     # assigned to two tracks stays with both; the descriptors of samples, if appearance is compared, and if it is
     # stored.
     links_in_picture: ClassVar[bool] = False
+    filled_s: ClassVar[float] = 0.0
     follows_log: ClassVar[bool] = True
     follows_speed: ClassVar[bool] = False
     shares_samples: ClassVar[bool] = False
@@ -213,6 +218,11 @@ class LikelihoodOptions(RetrackOptions):
     @property
     def links_in_picture(self) -> bool:  # type: ignore[override]
         return self.link_s > 0 or self.store_appearance
+
+    @property
+    def filled_s(self) -> float:  # type: ignore[override]
+        """The longest gap that is filled where tracks are only linked in the picture; the longest link."""
+        return min(self.link_s, MAX_LINK_IN_PICTURE_S)
 
     @property
     def follows_log(self) -> bool:  # type: ignore[override]

@@ -150,7 +150,9 @@ class OcSort(Sort):
         new = np.arange(len(tracks) - len(detections), len(tracks))
         self._store(tracks, new, detections)
 
-    def _update(self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+    def _update(
+        self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: Floats | float, frames: int
+    ) -> None:
         frames_since = tracks.table[_FRAMES_SINCE, at]
         lost = np.flatnonzero(frames_since > frames) if self.reupdate else at[:0]
         if len(lost):

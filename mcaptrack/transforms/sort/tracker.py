@@ -35,6 +35,9 @@ from mcaptrack.transforms.protocol import context, option, parameters, setting
 
 #: Number of frames that are converted at once.
 _BLOCK_FRAMES = 64
+#: A detection with such a score says as much of whether a track is real as others in so many nanoseconds.
+_SURE_SCORE: Final = 0.5
+_SURE_NS: Final = NS_PER_S // 10
 #: Number of classes that a warning lists at most.
 _MAX_LISTED = 20
 
@@ -145,8 +148,8 @@ class BoxTracks:
         new[SHARED_ROWS:] = np.nan
         self.table = np.concatenate([self.table, new], axis=1)
 
-    def update(self, at: Indices, detections: Measurements, hit: float) -> None:
-        """Correct track ``at[i]`` with detection i (N,); its hit streak grows by ``hit``."""
+    def update(self, at: Indices, detections: Measurements, hit: Floats | float) -> None:
+        """Correct track ``at[i]`` with detection i (N,); its hit streak grows by ``hit``, (N,) or for all."""
         table = self.table.take(at, axis=1)
         kalman.correct(table[: kalman.STATE_ROWS], detections.measured)
         table[SCORE : CLASS + 1] = detections.columns[8:]
@@ -308,7 +311,8 @@ class Sort:
     max_age_frames : int or None
         A track ends after this many frames without a detection, instead of --max-age-s.
     min_hits_s : float
-        A track is written once it was detected without a break for this many seconds.
+        A track is written once it was detected without a break for this many seconds; a detection with a score of
+        0.5 or more counts for 0.1 s at least.
     min_hits_frames : int or None
         A track is written once it was detected in this many frames in a row, instead of --min-hits-s.
     cost : str
@@ -395,7 +399,8 @@ class Sort:
         step = AssociationInput(detections, tracks, predicted, run.age, passed_frames, plane, run.one_class)
         matched, track = self._associate(step)
         if len(matched):
-            self._update(tracks, track, detections.take(matched), run.hit, passed_frames)
+            hits = detections.take(matched)
+            self._update(tracks, track, hits, run.hit_of(hits), passed_frames)
         detected = len(matched)
         if detected < len(detections):
             starts = self._can_start(detections)
@@ -477,7 +482,9 @@ class Sort:
         """Start a track at each of these detections."""
         tracks.initiate(first_id, detections)
 
-    def _update(self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: float, frames: int) -> None:
+    def _update(
+        self, tracks: BoxTracks, at: Indices, detections: Measurements, hit: Floats | float, frames: int
+    ) -> None:
         """Correct track ``at[i]`` with detection i, ``frames`` after the previous frame."""
         tracks.update(at, detections, hit)
 
@@ -544,6 +551,12 @@ class _Run:
         if len(class_id) and self.one_class:
             self._class_id = class_id[0] if self._class_id is None else self._class_id
             self.one_class = bool((class_id == self._class_id).all())
+
+    def hit_of(self, detections: Measurements) -> Floats | float:
+        """The part (N,) of a streak that each detection adds, or that all add."""
+        if self._options.min_hits_frames is not None or self.hit >= _SURE_NS:
+            return self.hit
+        return np.where(detections.score >= _SURE_SCORE, _SURE_NS, self.hit)  # NaN is not sure
 
     def tick(self, t_ns: int) -> int:
         """Take the time of the next frame; returns the number of frames since the previous one."""
