@@ -231,7 +231,7 @@ class LogReader:
             if str(name) in tables.TABLES:
                 whole = self._contents.table(name)
             elif (channel := opened.find(str(name))) in opened.channels:
-                whole = self._contents.messages(channel)[0]
+                whole = self._contents.messages(channel)
             else:
                 raise McaptrackError(
                     f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"

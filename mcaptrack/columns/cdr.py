@@ -10,7 +10,7 @@ size. Otherwise (messages with strings or lists in them) the first elements of a
 the second ones, and so on; where few messages have that many, element by element.
 
 Alignment (XCDR1) is relative to the end of the 4-byte head of a message, so the bodies of CDR messages are first copied
-to multiples of 8, or, if they are long, read in groups. ROS 1 has neither heads nor alignment, and is read in place.
+to multiples of 8, unless they are as far from such already; long ones are read in groups. ROS 1 has neither heads nor alignment, and is read in place.
 
 Nothing is read, nor room made for it, before it is certain to be within its message: other messages raise Malformed.
 
@@ -26,6 +26,8 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+
+from mcaptrack.geometry.ragged import gather_bytes
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -169,21 +171,11 @@ class Cursor:
         if int(ends[-1]) > _MAX_BYTES:
             raise Unsupported("more than 2 GiB of a field in a batch")
         out = np.empty(int(ends[-1]), np.uint8)
-        if _are_equal(sizes) and len(sizes):
-            width = int(sizes[0])
-            if width and self.step and len(out) == len(sizes) * width:
-                begin, shape = int(self.base[0]) + self.offset, (len(sizes), width)
-                out.reshape(shape)[:] = np.ndarray(shape, np.uint8, self.data, begin, (self.step, 1))
-            elif width:
-                windows(out, f"V{width}")[ends[:-1]] = windows(self.data, f"V{width}")[self.at]
-            return out
-        at, width = self.at, 1
-        while width <= int(sizes.max(initial=0)):  # a piece for each bit of a size, the small ones first
-            rows = np.flatnonzero(sizes & width)
-            if len(rows):
-                before = sizes[rows] & (width - 1)
-                windows(out, f"V{width}")[ends[rows] + before] = windows(self.data, f"V{width}")[at[rows] + before]
-            width *= 2
+        if self.step and len(sizes) and _are_equal(sizes) and len(out) == len(sizes) * int(sizes[0]):
+            begin, shape = int(self.base[0]) + self.offset, (len(sizes), int(sizes[0]))
+            out.reshape(shape)[:] = np.ndarray(shape, np.uint8, self.data, begin, (self.step, 1))
+        else:
+            gather_bytes(self.data, self.at, sizes, ends[:-1], out)
         return out
 
 
@@ -533,7 +525,7 @@ class RosColumns:
         if (order > 1).any():  # parameter lists, and the encodings of XCDR2
             raise Unsupported(f"messages in the encapsulation {order.max():04x} are not read")
         body = start + 4
-        is_in_place = int((end - start).sum()) > _COPIED * len(start)
+        is_in_place = _are_equal(body % _GRID) or int((end - start).sum()) > _COPIED * len(start)
         group = order * _GRID + (body % _GRID if is_in_place else 0)
         if _are_equal(group):
             return self._read(data, body, end, "<" if not len(order) or order[0] else ">", is_in_place)

@@ -6,11 +6,12 @@ Letters: M messages.
 from __future__ import annotations
 
 import hashlib
+import heapq
 import zlib
 from array import array
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from itertools import islice, repeat
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from mcap.records import Message as MessageRecord
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import gather_bytes, group_index, ragged_range, run_starts
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import GAP_BYTES, ByteSource
 from mcaptrack.log.checksums import crc_of
@@ -50,6 +51,8 @@ _KEPT_BYTES: Final = 8 * 2**20
 _MAX_GAP_BYTES: Final = 16 * 2**10
 #: Payloads come in batches of this many bytes at least: fewer make each step for few messages, more exceed the caches.
 _BATCH_BYTES: Final = 4 * 2**20
+#: Payloads of all topics together wait for others of their batch in so many bytes at most.
+_WAITING_BYTES: Final = 64 * 2**20
 #: Chunks in a store that are smaller together are read with their indexes, others after them. Indexes that are nearer
 #: to each other come in one request.
 _READ_AT_ONCE_BYTES: Final = 16 * 2**20
@@ -75,12 +78,16 @@ class ChannelRows(NamedTuple):
 
 
 class Payloads(NamedTuple):
-    """Messages in time order, (M,): their times in ns, and their bytes: ``data`` from ``start`` to before ``end``."""
+    """Messages in time order, (M,): their times in ns, their bytes: ``data`` from ``start`` to before ``end``, and their
+    locations as in ``MessageLocations``. ``start`` is -1 for messages in damaged chunks.
+    """
 
     t_ns: Ints
     data: NDArray[np.uint8]
     start: Ints
     end: Ints
+    chunk_offset: Ints
+    offset: Ints
 
 
 class MessageLocations(NamedTuple):
@@ -186,6 +193,7 @@ def _in_order_of_time(channel: ChannelRows) -> ChannelRows:
 
 Times = NDArray[np.uint64]
 Span = tuple[int | None, int | None]
+Lose = Callable[[int, int, Damaged], None]
 
 _NO_ENTRIES: Final[Entries] = np.empty((0, 2), "<u8")
 _OUTSIDE: Final = -1
@@ -212,6 +220,11 @@ class MessageBatch(NamedTuple):
     is_direct: bool
     t_ns: Times
     offset: Ints
+
+    @property
+    def place(self) -> int:
+        """Where it is read in the file."""
+        return int(self.offset[0]) if self.chunk is None else int(self.chunk.chunk_start_offset)
 
     @property
     def size(self) -> int:
@@ -327,9 +340,16 @@ class MessageBatches:
         offsets = np.append(self._index.chunks.offsets.astype(np.int64), -1)  # the last one is that of _OUTSIDE
         return np.repeat(offsets[rows], np.diff(self.edges))
 
-    def in_order(self) -> Iterator[list[MessageBatch]]:
-        """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
+    def of(self, channels: Sequence[int]) -> Ints:
+        """The numbers of the batches of some of the channels."""
+        return np.flatnonzero(np.isin(np.frombuffer(self._channel, np.uint16), channels))
+
+    def in_order(self, some: Ints | None = None) -> Iterator[list[MessageBatch]]:
+        """Batches, all or ``some``, in groups that follow one another in time; batches of one group overlap, and keep
+        their order.
+        """
         numbers = np.flatnonzero(np.diff(self.edges))
+        numbers = numbers if some is None else some[np.diff(self.edges)[some] > 0]
         first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
         order = np.argsort(first_ns, kind="stable")
         group: list[int] = []
@@ -384,13 +404,25 @@ def _joined_payloads(parts: Sequence[Payloads]) -> Payloads:
     """Payloads behind each other, in one buffer."""
     if len(parts) == 1:
         return parts[0]
-    before = np.cumsum([0, *(len(part.data) for part in parts)]).tolist()
-    start, end = (
-        np.concatenate([places + size for places, size in zip(columns, before, strict=False)])
-        for columns in ([part.start for part in parts], [part.end for part in parts])
-    )
-    t_ns = np.concatenate([part.t_ns for part in parts])
-    return Payloads(t_ns, np.concatenate([part.data for part in parts]), start, end)
+    joined = Payloads(*map(np.concatenate, zip(*parts, strict=True)))
+    before = np.cumsum([0, *(len(part.data) for part in parts[:-1])])
+    before = np.repeat(before, [len(part.t_ns) for part in parts])
+    return joined._replace(start=np.where(joined.start < 0, -1, joined.start + before), end=joined.end + before)
+
+
+def _compacted(part: Payloads) -> Payloads:
+    """Payloads without the bytes of other channels, if these are more: then payloads that wait hold no whole chunks.
+
+    Messages begin 4 bytes behind multiples of 8, so that the numbers behind the head of a CDR message are aligned.
+    """
+    sizes = np.where(part.start < 0, 0, part.end - part.start)
+    if 2 * int(sizes.sum()) >= len(part.data):
+        return part
+    slots = (sizes + 4 + 7) // 8 * 8
+    start = np.cumsum(slots) - slots + 4
+    data = np.zeros(int(slots.sum()), np.uint8)
+    gather_bytes(part.data, np.maximum(part.start, 0), sizes, start, data)
+    return part._replace(data=data, start=np.where(part.start < 0, -1, start), end=start + sizes)
 
 
 def overlaps(chunk: ChunkIndex, span: Span) -> bool:
@@ -519,23 +551,52 @@ class Messages:
                 del opened[number]
                 size -= batch.size
 
-    def payloads(self, channels: Sequence[int], span: Span = (None, None)) -> Iterator[Payloads]:
-        """The bytes of messages in time order, in batches of whole chunks."""
-        waiting: list[Payloads] = []
-        for group in self._located(channels, span).in_order():
-            joined = _joined_payloads([self._payloads(batch) for batch in group])
-            order = np.argsort(joined.t_ns, kind="stable")
-            waiting.append(Payloads(joined.t_ns[order], joined.data, joined.start[order], joined.end[order]))
-            if sum(len(part.data) for part in waiting) >= _BATCH_BYTES:
-                yield _joined_payloads(waiting)
-                waiting = []
-        if waiting:
-            yield _joined_payloads(waiting)
+    def payloads(
+        self, topics: Sequence[Sequence[int]], span: Span = (None, None), lose: Lose | None = None
+    ) -> Iterator[tuple[int, Payloads]]:
+        """The bytes of messages of several topics in batches, with the number of the topic; ``topics`` are the ids of
+        their channels. The batches of each topic are in time order.
 
-    def _payloads(self, batch: MessageBatch) -> Payloads:
-        content, offset = self._open(batch)
-        heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
-        return Payloads(to_int64(batch.t_ns), np.frombuffer(content, np.uint8), heads.start, heads.end)
+        Each chunk is opened once for all topics, if chunks hardly overlap. ``lose`` is called for messages that are
+        lost with a damaged chunk, with the number of the topic, that of messages, and the damage; without it, Damaged
+        is raised.
+        """
+        located = self._located([channel for channels in topics for channel in channels], span)
+        streams = [
+            zip(repeat(number), located.in_order(located.of(channels)), strict=False)
+            for number, channels in enumerate(topics)
+        ]
+        waiting: dict[int, list[Payloads]] = {}
+        held: Counter[int] = Counter()
+        total = 0
+        for number, group in heapq.merge(*streams, key=lambda numbered: numbered[1][0].place):
+            joined = _joined_payloads([self._payloads(batch, number, lose) for batch in group])
+            order = np.argsort(joined.t_ns, kind="stable")
+            data = joined.data
+            ordered = Payloads(*(values if values is data else values[order] for values in joined))
+            waiting.setdefault(number, []).append(_compacted(ordered))
+            held[number] += len(waiting[number][-1].data)
+            total += len(waiting[number][-1].data)
+            while total >= _WAITING_BYTES or held[number] >= _BATCH_BYTES:
+                largest = number if held[number] >= _BATCH_BYTES else max(held, key=held.__getitem__)
+                yield largest, _joined_payloads(waiting.pop(largest))
+                total -= held.pop(largest)
+        for number, parts in waiting.items():
+            yield number, _joined_payloads(parts)
+
+    def _payloads(self, batch: MessageBatch, number: int, lose: Lose | None) -> Payloads:
+        t_ns = to_int64(batch.t_ns)
+        chunk_offset = np.full(len(t_ns), batch.chunk.chunk_start_offset if batch.chunk else _OUTSIDE)
+        try:
+            content, offset = self._open(batch)
+            heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
+        except Damaged as error:
+            if lose is None:
+                raise
+            lose(number, len(t_ns), error)
+            nothing, nowhere = np.empty(0, np.uint8), np.zeros(len(t_ns), np.int64)
+            return Payloads(t_ns, nothing, nowhere - 1, nowhere, chunk_offset, batch.offset)
+        return Payloads(t_ns, np.frombuffer(content, np.uint8), heads.start, heads.end, chunk_offset, batch.offset)
 
     def columns(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> ChannelRows | None:
         """Rows without a loop over messages; None if a message has another layout than the reader's."""

@@ -1,4 +1,4 @@
-"""Tables as files, published when they are complete and were read back identically.
+"""Tables as files, published when they are complete and were read back.
 
 Parquet: floats are split by byte and whole numbers stored as differences, which makes files smaller and writing faster
 than the defaults; pages have checksums and an index. The metadata hold ``source``, which identifies the input, and
@@ -8,8 +8,11 @@ than the defaults; pages have checksums and an index. The metadata hold ``source
 from __future__ import annotations
 
 import hashlib
+import io
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -23,15 +26,10 @@ from mcaptrack.tables.build import PIECE_ROWS, pieces_of
 from mcaptrack.tables.fields import TABLE_VERSION
 
 FORMATS: Final[tuple[TableFormat, ...]] = get_args(TableFormat)
-#: Formats with metadata, by which a file can be found up to date.
-_DESCRIBED: Final = ("parquet", "arrow")
-
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
-#: Rows that are read back at once; fewer if they are larger.
+#: Rows that are read back at once, and of which all values are compared; fewer if they are larger.
 _ROWS_READ: Final = 16 * 1024
 _BYTES_READ: Final = 16 * 2**20
-#: Below this, starting a thread takes longer than what it would do.
-_ROWS_WORTH_A_THREAD: Final = 8 * 1024
 #: Smaller files leave so little memory behind that looking for it takes longer than they did.
 _BYTES_WORTH_RELEASING: Final = 64 * 1024
 _PREFIX: Final = "mcaptrack."
@@ -45,46 +43,68 @@ def write(
     form: TableFormat = "parquet",
     force: bool = False,
 ) -> bool:
-    """Write a table; the file appears when it is complete and reads back identically. Returns whether it was written.
+    """Write a table; the file appears when it is complete and was read back. Returns whether it was written.
 
     ``table`` is an Arrow table or ``TablePieces``; these are written piece by piece. ``provenance`` goes into the
     metadata, ``order`` names the columns by which rows are sorted. A file with the same content and metadata is left as
     it is, unless ``force``. Raises McaptrackError if the file can't be written.
     """
-    metadata = {"table_version": TABLE_VERSION} | dict(provenance)
-    if form in _DESCRIBED and not force:
-        old_metadata = file_metadata(path, form)
-        may_stay = old_metadata is not None and _describes(old_metadata, metadata)
-        if may_stay and digest(table.schema, pieces_of(table)) == (old_metadata or {}).get("digest"):
+    if form == "parquet":
+        file = ParquetTable(path, table.schema, provenance, order, force)
+        with file.published():
+            for piece in pieces_of(table):
+                file.add(piece)
+                del piece  # else it would stay while the next one is made
+        return file.is_new
+    metadata = _stated(provenance)
+    if form == "arrow":
+        metadata["digest"] = digest(table.schema, pieces_of(table))
+        if not force and _without_source(file_metadata(path, form) or {}) == _without_source(metadata):
             return False
+    with _publishing(path) as part:
+        if form == "arrow":
+            _write_arrow(part, table, metadata)
+            if verify(part, form) != table.num_rows:
+                raise _Different
+        else:
+            from mcaptrack.tables import text
+
+            text.write(part, pieces_of(table), form)
+    return True
+
+
+class _Different(Exception):
+    """A file does not hold what was written to it."""
+
+
+class _Unchanged(Exception):
+    """The file at its place has the same content already."""
+
+
+def _stated(provenance: Mapping[str, str]) -> dict[str, str]:
+    return {"table_version": TABLE_VERSION} | dict(provenance)
+
+
+@contextmanager
+def _publishing(path: Path) -> Iterator[Path]:
+    """A path to write a file to, which is published then. Raises McaptrackError if it can't be written."""
+    is_large = False
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with publish(path) as part:
-            if form == "parquet":
-                _write_parquet(part, table, metadata, order)
-            elif form == "arrow":
-                _write_arrow(part, table, metadata | {"digest": digest(table.schema, pieces_of(table))})
-            else:
-                from mcaptrack.tables import text
-
-                text.write(part, pieces_of(table), form)
+            yield part
             is_large = part.stat().st_size >= _BYTES_WORTH_RELEASING
-            if is_large:
-                _release()
-            try:
-                rows_read = verify(part, form) if form in _DESCRIBED else table.num_rows
-            except McaptrackError:
-                rows_read = -1
-            if rows_read != table.num_rows:
-                raise McaptrackError(
-                    f"{path} can't be written: what was written does not read back the same; the disk or the "
-                    "memory of this machine may be at fault"
-                )
+    except _Unchanged:
+        pass
+    except _Different:
+        raise McaptrackError(
+            f"{path} can't be written: what was written does not read back the same; the disk or the memory of this "
+            "machine may be at fault"
+        ) from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
     if is_large:
         _release()
-    return True
 
 
 def _release() -> None:
@@ -95,47 +115,106 @@ def _release() -> None:
     release_memory()
 
 
-def _describes(old: Mapping[str, str], new: Mapping[str, str]) -> bool:
-    """Whether metadata are equal apart from source and digest: the source may change while the content does not."""
-    apart = {"source": "", "digest": ""}
-    return {**old, **apart} == {**new, **apart}
+class _Stream(io.BufferedWriter):
+    """A new file, and the checksum of what is written to it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path, "xb"))
+        self.checksum = 0
+
+    def write(self, data: Any) -> int:
+        """Write bytes."""
+        self.checksum = zlib.crc32(data, self.checksum)
+        return super().write(data)
 
 
-def _write_parquet(part: Path, table: Any, texts: Mapping[str, str], order: Sequence[str]) -> None:
-    import pyarrow.parquet as pq
+class ParquetTable:
+    """A Parquet file that is written piece by piece, and published when it is complete; arguments are as of ``write``.
 
-    content = _TableDigest(table.schema)
+    What was written is read back: all bytes by their checksum, and the values of the first rows.
+    """
 
-    metadata = {_PREFIX + key: value for key, value in texts.items()}
-    ways = [(name, "ascending") for name in order]
-    with part.open("xb") as stream:
-        writer = pq.ParquetWriter(
+    def __init__(
+        self, path: Path, schema: Any, provenance: Mapping[str, str], order: Sequence[str] = (), force: bool = False
+    ) -> None:
+        self.path, self.is_new = path, True
+        self._schema, self._order, self._force = schema, order, force
+        self._metadata = _stated(provenance)
+        self._content, self._first = _TableDigest(schema), (0, "")
+        self._writer: Any = None
+
+    @contextmanager
+    def published(self) -> Iterator[None]:
+        """Publish the file when the block ends, unless there is one of the same content, or the block fails."""
+        with _publishing(self.path) as part:
+            self.is_new = False
+            with _Stream(part) as stream:
+                self._open(stream)
+                try:
+                    yield
+                    self._metadata["digest"] = self._content.hexdigest()
+                    self._writer.add_key_value_metadata({_PREFIX + "digest": self._metadata["digest"]})
+                    self._writer.close()
+                except BaseException:
+                    # Closing it, also when it is deleted, would make half a table look complete.
+                    self._writer.is_open = False
+                    raise
+            old = file_metadata(self.path, "parquet") or {}
+            if not self._force and _without_source(old) == _without_source(self._metadata):
+                raise _Unchanged
+            self._check(part, stream.checksum)
+            self.is_new = True
+
+    def _open(self, stream: Any) -> None:
+        import pyarrow.parquet as pq
+
+        ways = [(name, "ascending") for name in self._order]
+        self._writer = pq.ParquetWriter(
             stream,
-            table.schema.with_metadata(metadata),
+            self._schema.with_metadata({_PREFIX + key: value for key, value in self._metadata.items()}),
             compression="zstd",
             compression_level=_ZSTD_LEVEL,
-            sorting_columns=pq.SortingColumn.from_ordering(table.schema, ways) if ways else None,
+            sorting_columns=pq.SortingColumn.from_ordering(self._schema, ways) if ways else None,
             write_page_index=True,
             write_page_checksum=True,
             store_schema=True,
-            **_encodings(table.schema),
+            **_encodings(self._schema),
         )
-        try:
-            with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
-                for piece in pieces_of(table):
-                    is_large = piece.num_rows >= _ROWS_WORTH_A_THREAD
-                    added = worker.submit(content.add, piece) if is_large else None
-                    writer.write_table(piece, row_group_size=PIECE_ROWS)
-                    if added:
-                        added.result()
-                    else:
-                        content.add(piece)
-                    del piece  # else it would stay while the next one is made
-            writer.add_key_value_metadata({_PREFIX + "digest": content.hexdigest()})
-            writer.close()
-        except BaseException:
-            writer.is_open = False  # closing it, also when it is deleted, would make half a table look complete
-            raise
+
+    def add(self, piece: Any) -> None:
+        """Write the next rows, an Arrow table, as a row group."""
+        if not self._content.rows:
+            count = max(1, min(_ROWS_READ, piece.num_rows * _BYTES_READ // max(piece.nbytes, 1)))
+            first = piece.slice(0, count)
+            self._first = first.num_rows, digest(self._schema, [first])
+        self._writer.write_table(piece, row_group_size=PIECE_ROWS)
+        self._content.add(piece)
+
+    def _check(self, part: Path, checksum: int) -> None:
+        """Raise _Different if a file does not hold what was written."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        with part.open("rb") as stream:
+            read = 0
+            while block := stream.read(_BYTES_READ):
+                read = zlib.crc32(block, read)
+            stream.seek(0)
+            try:
+                with pq.ParquetFile(stream, page_checksum_verification=True) as file:
+                    count, first = self._first
+                    batches = file.iter_batches(count) if count else iter(())
+                    rows = pa.Table.from_batches([*islice(batches, 1)], file.schema_arrow)
+                    is_same = file.metadata.num_rows == self._content.rows and digest(self._schema, [rows]) == first
+            except pa.ArrowException:
+                raise _Different from None
+        if read != checksum or not is_same:
+            raise _Different
+
+
+def _without_source(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Metadata of a content: its source may change while it does not."""
+    return {name: text for name, text in metadata.items() if name != "source"}
 
 
 def _encodings(schema: Any) -> dict[str, Any]:
@@ -143,14 +222,27 @@ def _encodings(schema: Any) -> dict[str, Any]:
     import pyarrow as pa
 
     encodings, dictionaries = {}, []
-    for field in schema:
-        if pa.types.is_floating(field.type):
-            encodings[field.name] = "BYTE_STREAM_SPLIT"
-        elif (pa.types.is_integer(field.type) and field.type.bit_width >= 32) or pa.types.is_timestamp(field.type):
-            encodings[field.name] = "DELTA_BINARY_PACKED"
-        elif pa.types.is_string(field.type) or pa.types.is_dictionary(field.type):
-            dictionaries.append(field.name)
+    for name, kind in (leaf for field in schema for leaf in _leaves(field.name, field.type)):
+        if pa.types.is_floating(kind):
+            encodings[name] = "BYTE_STREAM_SPLIT"
+        elif (pa.types.is_integer(kind) and kind.bit_width >= 32) or pa.types.is_timestamp(kind):
+            encodings[name] = "DELTA_BINARY_PACKED"
+        elif pa.types.is_string(kind) or pa.types.is_dictionary(kind):
+            dictionaries.append(name)
     return {"use_dictionary": dictionaries, "column_encoding": encodings}
+
+
+def _leaves(name: str, kind: Any) -> Iterator[tuple[str, Any]]:
+    """The columns of a Parquet file that hold a column, also those in lists and structs, and their types."""
+    import pyarrow as pa
+
+    if pa.types.is_list(kind):
+        yield from _leaves(f"{name}.list.element", kind.value_type)
+    elif pa.types.is_struct(kind):
+        for field in kind:
+            yield from _leaves(f"{name}.{field.name}", field.type)
+    else:
+        yield name, kind
 
 
 def _write_arrow(part: Path, table: Any, texts: Mapping[str, str]) -> None:
@@ -241,18 +333,18 @@ class _TableDigest:
     """The digest of a table: ``add`` its pieces."""
 
     def __init__(self, schema: Any) -> None:
-        self._schema, self._columns, self._rows = schema, [_ColumnDigest() for _ in schema], 0
+        self._schema, self._columns, self.rows = schema, [_ColumnDigest() for _ in schema], 0
 
     def add(self, piece: Any) -> None:
         """Add the next rows, an Arrow table."""
         for column, values in zip(self._columns, piece.columns, strict=True):
             for chunk in values.chunks:
                 column.add(chunk)
-        self._rows += piece.num_rows
+        self.rows += piece.num_rows
 
     def hexdigest(self) -> str:
         """The digest of all added rows."""
-        total = hashlib.sha256(self._rows.to_bytes(8, "little"))
+        total = hashlib.sha256(self.rows.to_bytes(8, "little"))
         for field, column in zip(self._schema, self._columns, strict=True):
             total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
         return total.hexdigest()
