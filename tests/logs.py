@@ -18,7 +18,7 @@ from mcaptrack.pipeline.views import make_views
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.tables import Pointers, TablePieces, messages
+from mcaptrack.tables import TablePieces, messages
 from tests.commands import zones_file
 from tests.worlds import boxes_at, ns, tracks_at
 

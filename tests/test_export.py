@@ -248,7 +248,7 @@ def test_other_formats_hold_the_same(tmp_path, form):
     }[form]
     with log.read(path) as opened:
         wanted = LogTables(opened).table("tracks")
-        imu = LogTables(opened).messages("/imu")[0]
+        imu = LogTables(opened).messages("/imu")
     found = read(tmp_path / "t" / "tracks" / "recording=a" / f"part-0.{form}")
     for name in ("topic", "t_ns", "track_id", "x_m", "observed"):
         assert found[name].to_list() == wanted.column(name).to_pylist()

@@ -10,7 +10,8 @@ size. Otherwise (messages with strings or lists in them) the first elements of a
 the second ones, and so on; where few messages have that many, element by element.
 
 Alignment (XCDR1) is relative to the end of the 4-byte head of a message, so the bodies of CDR messages are first copied
-to multiples of 8, unless they are as far from such already; long ones are read in groups. ROS 1 has neither heads nor alignment, and is read in place.
+to multiples of 8, unless all are as far from these already, or, if they are long, read in groups. ROS 1 has neither
+heads nor alignment, and is read in place.
 
 Nothing is read, nor room made for it, before it is certain to be within its message: other messages raise Malformed.
 
@@ -163,7 +164,7 @@ class Cursor:
         else:
             out = windows(self.data, kind)[self.at]
         self.offset += kind.itemsize
-        return out.astype(kind.newbyteorder("="), copy=False)
+        return out
 
     def joined(self, sizes: Ints, to: Ints | None = None) -> Bytes:
         """So many bytes at each position, end to end, or at ``to`` (N + 1,), of which the last is the end of all."""
@@ -215,8 +216,11 @@ class _Number(_Type):
         self.is_byte = self.size == 1 and not self.is_flag
 
     def read(self, cursor: Cursor) -> pa.Array:
-        values = cursor.take(self.kind, self.align)
-        return pa.array(values != 0 if self.is_flag else values)
+        return self.column(cursor.take(self.kind, self.align))
+
+    def column(self, values: NDArray[Any]) -> pa.Array:
+        """Numbers in any byte order as Arrow."""
+        return pa.array(values != 0 if self.is_flag else values.astype(self.kind.newbyteorder("="), copy=False))
 
 
 class _Counted(_Type):
@@ -319,6 +323,8 @@ class _List(_Counted):
         if self.is_bytes:
             buffers = [None, limits.buffers()[1], pa.py_buffer(data)]
             return pa.Array.from_buffers(pa.binary(), len(counts), buffers)
+        if isinstance(self.of, _Number):
+            return pa.ListArray.from_arrays(limits, self.of.column(data.view(self.of.kind)))
         start = np.arange(ends[-1]) * self.stride
         inner = Cursor(data, start, start + self.stride, self.of.align, self.stride)
         return pa.ListArray.from_arrays(limits, self.of.read(inner))

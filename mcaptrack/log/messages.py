@@ -78,8 +78,8 @@ class ChannelRows(NamedTuple):
 
 
 class Payloads(NamedTuple):
-    """Messages in time order, (M,): their times in ns, their bytes: ``data`` from ``start`` to before ``end``, and their
-    locations as in ``MessageLocations``. ``start`` is -1 for messages in damaged chunks.
+    """Messages in time order, (M,): times in ns, bytes (``data`` from ``start`` to before ``end``), and locations as in
+    ``MessageLocations``. ``start`` is -1 for messages in damaged chunks.
     """
 
     t_ns: Ints
@@ -400,29 +400,29 @@ def joined_by_chunk(batches: Sequence[MessageBatch], *, reverse: bool) -> tuple[
     ], of
 
 
-def _joined_payloads(parts: Sequence[Payloads]) -> Payloads:
-    """Payloads behind each other, in one buffer."""
-    if len(parts) == 1:
-        return parts[0]
-    joined = Payloads(*map(np.concatenate, zip(*parts, strict=True)))
-    before = np.cumsum([0, *(len(part.data) for part in parts[:-1])])
-    before = np.repeat(before, [len(part.t_ns) for part in parts])
-    return joined._replace(start=np.where(joined.start < 0, -1, joined.start + before), end=joined.end + before)
-
-
-def _compacted(part: Payloads) -> Payloads:
-    """Payloads without the bytes of other channels, if these are more: then payloads that wait hold no whole chunks.
+def _packed(parts: Sequence[Payloads]) -> Payloads:
+    """Payloads behind each other in a buffer of their own, without the bytes of other channels.
 
     Messages begin 4 bytes behind multiples of 8, so that the numbers behind the head of a CDR message are aligned.
     """
-    sizes = np.where(part.start < 0, 0, part.end - part.start)
-    if 2 * int(sizes.sum()) >= len(part.data):
-        return part
+    joined = Payloads(*map(np.concatenate, zip(*(part._replace(data=part.t_ns) for part in parts), strict=True)))
+    sizes = np.where(joined.start < 0, 0, joined.end - joined.start)
     slots = (sizes + 4 + 7) // 8 * 8
     start = np.cumsum(slots) - slots + 4
-    data = np.zeros(int(slots.sum()), np.uint8)
-    gather_bytes(part.data, np.maximum(part.start, 0), sizes, start, data)
-    return part._replace(data=data, start=np.where(part.start < 0, -1, start), end=start + sizes)
+    data, low = np.empty(int(slots.sum()), np.uint8), 0
+    for part in parts:
+        high = low + len(part.t_ns)
+        place = int(start[low]) - 4 if high > low else 0
+        if high > low and np.array_equal(part.start, start[low:high] - place):  # it is packed
+            data[place : place + len(part.data)] = part.data
+        else:
+            gather_bytes(part.data, np.maximum(part.start, 0), sizes[low:high], start[low:high], data)
+        low = high
+    return joined._replace(data=data, start=np.where(joined.start < 0, -1, start), end=start + sizes)
+
+
+def _batch(parts: Sequence[Payloads]) -> Payloads:
+    return parts[0] if len(parts) == 1 else _packed(parts)
 
 
 def overlaps(chunk: ChunkIndex, span: Span) -> bool:
@@ -570,19 +570,21 @@ class Messages:
         held: Counter[int] = Counter()
         total = 0
         for number, group in heapq.merge(*streams, key=lambda numbered: numbered[1][0].place):
-            joined = _joined_payloads([self._payloads(batch, number, lose) for batch in group])
-            order = np.argsort(joined.t_ns, kind="stable")
-            data = joined.data
-            ordered = Payloads(*(values if values is data else values[order] for values in joined))
-            waiting.setdefault(number, []).append(_compacted(ordered))
-            held[number] += len(waiting[number][-1].data)
-            total += len(waiting[number][-1].data)
+            parts = [self._payloads(batch, number, lose) for batch in group]
+            part = _batch(parts)
+            order = np.argsort(part.t_ns, kind="stable")
+            part = Payloads(*(values if values is part.data else values[order] for values in part))
+            if 2 * int((part.end - part.start).sum()) < len(part.data):  # what waits holds no bytes of others
+                part = _packed([part])
+            waiting.setdefault(number, []).append(part)
+            held[number] += len(part.data)
+            total += len(part.data)
             while total >= _WAITING_BYTES or held[number] >= _BATCH_BYTES:
                 largest = number if held[number] >= _BATCH_BYTES else max(held, key=held.__getitem__)
-                yield largest, _joined_payloads(waiting.pop(largest))
+                yield largest, _batch(waiting.pop(largest))
                 total -= held.pop(largest)
         for number, parts in waiting.items():
-            yield number, _joined_payloads(parts)
+            yield number, _batch(parts)
 
     def _payloads(self, batch: MessageBatch, number: int, lose: Lose | None) -> Payloads:
         t_ns = to_int64(batch.t_ns)

@@ -2,19 +2,18 @@
 
 Parquet: floats are split by byte and whole numbers stored as differences, which makes files smaller and writing faster
 than the defaults; pages have checksums and an index. The metadata hold ``source``, which identifies the input, and
-``digest``, that of the content; a file that would not change is not touched.
+``digest``, that of the pages or of the content; a file that would not change is not touched.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import IO, Any, Final, get_args
 
 import numpy as np
 
@@ -27,9 +26,9 @@ from mcaptrack.tables.fields import TABLE_VERSION
 
 FORMATS: Final[tuple[TableFormat, ...]] = get_args(TableFormat)
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
-#: Rows that are read back at once, and of which all values are compared; fewer if they are larger.
-_ROWS_READ: Final = 16 * 1024
-_BYTES_READ: Final = 16 * 2**20
+#: Rows of each file whose values are compared when it was written; fewer if they are larger.
+_ROWS_COMPARED: Final = 1024
+_BYTES_READ: Final = 4 * 2**20
 #: Smaller files leave so little memory behind that looking for it takes longer than they did.
 _BYTES_WORTH_RELEASING: Final = 64 * 1024
 _PREFIX: Final = "mcaptrack."
@@ -116,43 +115,43 @@ def _release() -> None:
 
 
 class _Stream(io.BufferedWriter):
-    """A new file, and the checksum of what is written to it."""
+    """A new file, and the digest of what was written to it so far."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path, "xb"))
-        self.checksum = 0
+        self.size, self.content = 0, hashlib.sha256()
 
     def write(self, data: Any) -> int:
         """Write bytes."""
-        self.checksum = zlib.crc32(data, self.checksum)
+        self.size += len(data)
+        self.content.update(data)
         return super().write(data)
 
 
 class ParquetTable:
     """A Parquet file that is written piece by piece, and published when it is complete; arguments are as of ``write``.
 
-    What was written is read back: all bytes by their checksum, and the values of the first rows.
+    What was written is read back: all pages by their digest, and the values of the first rows.
     """
 
     def __init__(
         self, path: Path, schema: Any, provenance: Mapping[str, str], order: Sequence[str] = (), force: bool = False
     ) -> None:
-        self.path, self.is_new = path, True
+        self.path, self.is_new = path, False
         self._schema, self._order, self._force = schema, order, force
         self._metadata = _stated(provenance)
-        self._content, self._first = _TableDigest(schema), (0, "")
+        self._rows, self._first = 0, schema.empty_table()
         self._writer: Any = None
 
     @contextmanager
     def published(self) -> Iterator[None]:
         """Publish the file when the block ends, unless there is one of the same content, or the block fails."""
         with _publishing(self.path) as part:
-            self.is_new = False
             with _Stream(part) as stream:
                 self._open(stream)
                 try:
                     yield
-                    self._metadata["digest"] = self._content.hexdigest()
+                    self._metadata["digest"] = stream.content.hexdigest()
                     self._writer.add_key_value_metadata({_PREFIX + "digest": self._metadata["digest"]})
                     self._writer.close()
                 except BaseException:
@@ -162,7 +161,8 @@ class ParquetTable:
             old = file_metadata(self.path, "parquet") or {}
             if not self._force and _without_source(old) == _without_source(self._metadata):
                 raise _Unchanged
-            self._check(part, stream.checksum)
+            if not self._is_in(part):
+                raise _Different
             self.is_new = True
 
     def _open(self, stream: Any) -> None:
@@ -183,33 +183,44 @@ class ParquetTable:
 
     def add(self, piece: Any) -> None:
         """Write the next rows, an Arrow table, as a row group."""
-        if not self._content.rows:
-            count = max(1, min(_ROWS_READ, piece.num_rows * _BYTES_READ // max(piece.nbytes, 1)))
-            first = piece.slice(0, count)
-            self._first = first.num_rows, digest(self._schema, [first])
+        if not self._rows:
+            self._first = piece.slice(
+                0, max(1, min(_ROWS_COMPARED, piece.num_rows * _BYTES_READ // max(piece.nbytes, 1)))
+            )
         self._writer.write_table(piece, row_group_size=PIECE_ROWS)
-        self._content.add(piece)
+        self._rows += piece.num_rows
 
-    def _check(self, part: Path, checksum: int) -> None:
-        """Raise _Different if a file does not hold what was written."""
+    def _is_in(self, part: Path) -> bool:
+        """Whether a file holds what was written, as far as that is compared."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        with part.open("rb") as stream:
-            read = 0
-            while block := stream.read(_BYTES_READ):
-                read = zlib.crc32(block, read)
-            stream.seek(0)
-            try:
-                with pq.ParquetFile(stream, page_checksum_verification=True) as file:
-                    count, first = self._first
-                    batches = file.iter_batches(count) if count else iter(())
-                    rows = pa.Table.from_batches([*islice(batches, 1)], file.schema_arrow)
-                    is_same = file.metadata.num_rows == self._content.rows and digest(self._schema, [rows]) == first
-            except pa.ArrowException:
-                raise _Different from None
-        if read != checksum or not is_same:
-            raise _Different
+        try:
+            with part.open("rb") as stream, pq.ParquetFile(stream, page_checksum_verification=True) as file:
+                if _pages_digest(stream, file.metadata) != self._metadata["digest"]:
+                    return False
+                count = self._first.num_rows
+                batches = file.iter_batches(count, [0], use_threads=False) if count else iter(())
+                rows = pa.Table.from_batches([*islice(batches, 1)], file.schema_arrow)
+                is_same = digest(self._schema, [rows]) == digest(self._schema, [self._first])
+                return is_same and bool(file.metadata.num_rows == self._rows)
+        except pa.ArrowException:
+            return False
+
+
+def _pages_digest(stream: IO[bytes], about: Any) -> str:
+    """The digest of a Parquet file up to the end of its last page; ``about`` are its metadata."""
+    end = 4
+    if about.num_row_groups:
+        group = about.row_group(about.num_row_groups - 1)
+        for column in map(group.column, range(group.num_columns)):
+            begin = column.dictionary_page_offset or column.data_page_offset
+            end = max(end, begin + column.total_compressed_size)
+    content = hashlib.sha256()
+    stream.seek(0)
+    while block := stream.read(min(_BYTES_READ, end - stream.tell())):
+        content.update(block)
+    return content.hexdigest()
 
 
 def _without_source(metadata: Mapping[str, str]) -> dict[str, str]:
@@ -283,42 +294,23 @@ def verify(path: Path, form: TableFormat = "parquet") -> int:
     stored = (file_metadata(path, form) or {}).get("digest")
     if stored is None:
         raise McaptrackError(f"{path} is no exported table: it has no digest")
-    rows = [0]
-
-    def counted(pieces: Iterable[Any]) -> Iterator[Any]:
-        for piece in pieces:
-            rows[0] += piece.num_rows
-            yield piece
-
     try:
-        if form == "parquet":
-            with path.open("rb") as stream, pq.ParquetFile(stream, page_checksum_verification=True) as file:
-                rows_read, groups = _rows_at_once(file.metadata), range(file.num_row_groups)
-                # One group after the other, because iterating over all of them keeps what was read.
-                batches = (
-                    pa.Table.from_batches([batch])
-                    for group in groups
-                    for batch in file.iter_batches(rows_read, row_groups=[group])
-                )
-                content = digest(file.schema_arrow, counted(batches))
-        else:
-            with path.open("rb") as stream:
+        with path.open("rb") as stream:
+            if form == "parquet":
+                about = pq.read_metadata(stream)
+                rows, content = about.num_rows, _pages_digest(stream, about)
+            else:
                 reader = pa.ipc.open_file(stream)
                 batches = (reader.get_batch(number) for number in range(reader.num_record_batches))
-                tables = (pa.Table.from_batches([batch]) for batch in batches)
-                content = digest(reader.schema, counted(tables))
+                total = _TableDigest(reader.schema)
+                for batch in batches:
+                    total.add(pa.Table.from_batches([batch]))
+                rows, content = total.rows, total.hexdigest()
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read back: {str(error).splitlines()[0]}") from None
     if content != stored:
         raise McaptrackError(f"{path} does not hold what was written to it; export it again")
-    return rows[0]
-
-
-def _rows_at_once(about: Any) -> int:
-    """The number of rows of a Parquet file to read at once: pictures take more memory than numbers."""
-    size = sum(about.row_group(number).total_byte_size for number in range(about.num_row_groups))
-    rows: int = about.num_rows * _BYTES_READ // max(size, 1)
-    return max(1, min(_ROWS_READ, rows))
+    return int(rows)
 
 
 def digest(schema: Any, pieces: Iterable[Any]) -> str:

@@ -9,7 +9,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -30,9 +30,6 @@ from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of, payload_decoder
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
-
-if TYPE_CHECKING:
-    from mcaptrack.columns import ProtobufColumns, RosColumns
 
 #: Tables about the places of messages, or about the whole log.
 _OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
