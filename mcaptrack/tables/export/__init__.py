@@ -2,6 +2,7 @@
 
     <folder>/<table>/recording=<name of the log>/part-0.parquet
     <folder>/topics/<channel>/recording=<name of the log>/part-0.parquet     foreign channels, on request
+    <folder>/manifest/recording=<name of the log>/part-0.json                what these channels are
 
 Files that have not changed since the last export are not touched. ``recordings`` is written last: if its digest is that
 of the log, all tables are up to date.
@@ -23,7 +24,7 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import __version__, log, tables
 from mcaptrack.choices import TableFormat
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import place_of, sweep
+from mcaptrack.files import place_of, publish_bytes, sweep
 from mcaptrack.location import Location, Url, is_remote, local_name, parse
 from mcaptrack.log.messages import Span
 from mcaptrack.schema.provenance import INGEST, Provenance
@@ -45,6 +46,8 @@ from mcaptrack.tables.files import FORMATS
 
 #: The folder of the tables of single channels.
 TOPICS: Final = "topics"
+#: The folder of what these tables are.
+MANIFEST: Final = "manifest"
 
 
 @dataclass
@@ -297,11 +300,12 @@ def _write_all(
         if not are_all:
             raise error
         job.done.notes.append(f"{error}; it has no table")
+        job.reasons[topic] = str(error)
         job.remove([topic])
 
     passes: dict[Span, list[ChannelFile]] = {}
-    for topic in wanted:
-        of_topic = part if topic in topics else topics_before.get(topic, WHOLE)
+    parts = {topic: part if topic in topics else topics_before.get(topic, WHOLE) for topic in wanted}
+    for topic, of_topic in parts.items():
         channel = None
         try:
             channel = job.messages(topic, of_topic)
@@ -320,6 +324,7 @@ def _write_all(
         for channel in channels:
             job.finish(channel)
     job.remove([topic for topic in topics_before if topic not in wanted])
+    job.manifest(parts)
     job.table(last)
     progress("export", total, total)
 
@@ -331,6 +336,8 @@ class _Job:
     form: TableFormat
     force: bool
     done: Exported
+    #: Why channels have no table.
+    reasons: dict[str, str] = field(default_factory=dict)
 
     def path(self, *names: str) -> Path:
         return self.folder.joinpath(*names, f"recording={self.contents.recording}", f"part-0.{self.form}")
@@ -436,8 +443,36 @@ class _Job:
         """Remove tables of channels that are gone, and folders that are empty then."""
         for topic in topics:
             path = self.path(TOPICS, topic_folder(topic))
-            path.unlink(missing_ok=True)
-            with suppress(OSError):
-                path.parent.rmdir()
-                path.parent.parent.rmdir()
-            self.done.removed.append(f"{TOPICS}/{topic_folder(topic)}")
+            if path.exists():
+                _remove(path)
+                self.done.removed.append(f"{TOPICS}/{topic_folder(topic)}")
+
+    def manifest(self, parts: Mapping[str, MessagesPart]) -> None:
+        """Write what channels with tables of their own are, and those of other software without, and why."""
+        path = self.path(MANIFEST).with_suffix(".json")
+        if not parts:
+            _remove(path)
+            return
+        rows = []
+        for topic in sorted({*parts, *self.contents.other_topics()}):
+            name = f"{TOPICS}/{topic_folder(topic)}"
+            file = self.path(*name.split("/"))
+            why = self.reasons.get(topic) or (None if topic in parts else "it was not asked for")
+            about = {} if why else tables.file_metadata(file, self.form) or {}
+            rows.append(
+                self.contents.manifest(topic, parts.get(topic, WHOLE))
+                | {"file": None if why else file.relative_to(self.folder).as_posix(), "rows": self.done.rows.get(name)}
+                | {"bytes": None if why else file.stat().st_size, "left_out": about.get("left_out"), "reason": why}
+            )
+        text = json.dumps(rows, indent=1, ensure_ascii=False).encode("utf-8", "backslashreplace")
+        if not path.is_file() or path.read_bytes() != text:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            publish_bytes(path, text)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, and its folders if they are empty then."""
+    path.unlink(missing_ok=True)
+    with suppress(OSError):
+        path.parent.rmdir()
+        path.parent.parent.rmdir()

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import ExitStack, nullcontext
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, nullcontext, suppress
 from itertools import islice
 from typing import Any, Final
 
@@ -33,7 +33,7 @@ class ChannelFile:
         self.topic, self.total = messages.source.topic, messages.source.total
         self.messages, self.file = messages, file
         self.waiting, self.is_done = Waiting(messages.schema, PIECE_BYTES), False
-        self._stack, self._is_open = ExitStack(), False
+        self.is_open, self._stack = False, ExitStack()
         self._writing: Future[None] | None = None
 
     def add(self, batch: Payloads) -> Iterator[Any]:
@@ -43,14 +43,20 @@ class ChannelFile:
     def write(self, piece: Any, threads: Executor | None) -> Future[None] | None:
         """Write a piece, behind those before it."""
         self._finish_writing()
-        if not self._is_open:
+        if not self.is_open:
             self._stack.enter_context(self.file.published())
-            self._is_open = True
+            self.is_open = True
         if threads is None:
-            self.file.add(piece)
+            self._add(piece)
         else:
-            self._writing = threads.submit(self.file.add, piece)
+            self._writing = threads.submit(self._add, piece)
         return self._writing
+
+    def _add(self, piece: Any) -> None:
+        try:
+            self.file.add(piece)
+        except OSError as error:
+            raise McaptrackError(f"{self.file.path} can't be written: {error.strerror or error}") from error
 
     def _finish_writing(self) -> None:
         if self._writing is not None:
@@ -67,9 +73,9 @@ class ChannelFile:
     def discard(self, error: BaseException) -> None:
         """Remove what was written, because of an error."""
         if self._writing is not None:
-            self._writing.cancel()
-            self._writing.exception() if not self._writing.cancelled() else None
-        self._stack.__exit__(type(error), error, error.__traceback__)
+            wait([self._writing])
+        with suppress(type(error), McaptrackError):  # which the file that failed has raised already
+            self._stack.__exit__(type(error), error, error.__traceback__)
 
 
 def write_in_one_pass(
@@ -113,7 +119,7 @@ class _Pass:
                 done += len(batch.t_ns)
                 progress(done / max(messages, 1))
             for channel in self._by_topic.values():
-                if channel.waiting.rows or not channel.total:
+                if channel.waiting.rows or not channel.is_open:
                     self._write(channel, channel.waiting.rest(), threads)
             for channel in self._by_topic.values():
                 channel.publish()

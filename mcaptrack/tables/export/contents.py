@@ -8,6 +8,7 @@ import os
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -17,7 +18,7 @@ from mcaptrack import __version__, evaluation, log, tables
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
-from mcaptrack.geometry.clocks import LAST_NS
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.location import Location, shortened
 from mcaptrack.log.messages import Payloads
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
@@ -177,6 +178,19 @@ class MessagesPart(NamedTuple):
         return next(unknown, "")
 
 
+class Timing(NamedTuple):
+    """The times of messages: the number of those before, and theirs; times of the first and the last in ns, the largest
+    gap, and the rate by the usual step. None where there are too few.
+    """
+
+    first: int
+    messages: int
+    first_t_ns: int | None
+    last_t_ns: int | None
+    largest_gap_s: float | None
+    rate_hz: float | None
+
+
 #: All messages, and all fields but bytes.
 WHOLE: Final = MessagesPart()
 
@@ -196,6 +210,7 @@ class LogTables:
         self.recording = recording_name(opened.path)
         self._kept: dict[str, FrameColumns] = {}
         self._class_names: dict[str, dict[int, str]] = {}
+        self._timings: dict[tuple[str, int | None, int | None], Timing] = {}
         #: Notes about tables, by name.
         self.notes: dict[str, str] = {}
 
@@ -347,10 +362,7 @@ class LogTables:
 
     def _source(self, topic: str, part: MessagesPart) -> tables.MessageSource:
         """The messages of a channel of other software that a table holds. Raises McaptrackError for bad times."""
-        span = (part.start_ns, part.end_ns)
-        times = self.opened.times(topic)
-        first = 0 if part.start_ns is None else int(np.searchsorted(times, part.start_ns))
-        last = len(times) if part.end_ns is None else int(np.searchsorted(times, part.end_ns))
+        span, timing = (part.start_ns, part.end_ns), self.timing(topic, part)
 
         def payloads(lose: Callable[[int, str], None]) -> Iterator[Payloads]:
             batches = self.opened.payloads_of([topic], *span, lambda _, count, why: lose(count, why))
@@ -360,12 +372,46 @@ class LogTables:
             topic,
             message_type_of(self.opened, topic).name,
             file_name(self.opened.part(topic).path),
-            first,
-            max(last - first, 0),
+            timing.first,
+            timing.messages,
             f"{self.opened.path}: {topic}",
             payloads,
             payload_decoder(self.opened, topic, flattener),
         )
+
+    def timing(self, topic: str, part: MessagesPart) -> Timing:
+        """The times of the messages of a channel that a table holds. Raises McaptrackError for bad times."""
+        key = (topic, part.start_ns, part.end_ns)
+        if key not in self._timings:
+            times = self.opened.times(topic)
+            first = 0 if part.start_ns is None else int(np.searchsorted(times, part.start_ns))
+            last = len(times) if part.end_ns is None else int(np.searchsorted(times, part.end_ns))
+            times = times[first:last]
+            steps_ns = np.diff(times)
+            usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
+            self._timings[key] = Timing(
+                first,
+                len(times),
+                int(times[0]) if len(times) else None,
+                int(times[-1]) if len(times) else None,
+                float(steps_ns.max()) / NS_PER_S if len(steps_ns) else None,
+                NS_PER_S / usual_ns if usual_ns else None,
+            )
+        return self._timings[key]
+
+    def manifest(self, topic: str, part: MessagesPart) -> dict[str, Any]:
+        """What a channel is, and when its messages are that a table holds."""
+        channel, timing = self.opened.channel(topic), dict.fromkeys(Timing._fields)
+        with suppress(McaptrackError):  # messages later than 2262
+            timing = self.timing(topic, part)._asdict()
+        del timing["first"]
+        return {
+            "topic": topic,
+            "schema": channel.schema_name or None,
+            "encoding": channel.message_encoding or None,
+            **timing,
+            "columns": list(part.columns) or None,
+        }
 
     # Parts of tables
 
