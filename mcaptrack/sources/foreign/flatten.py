@@ -107,7 +107,7 @@ class UnreadMessages:
             warn(f"{self._where}{self}; {so}", "lost")
         if self._lost:
             where = f"{self._lost} of {self._total} messages are in damaged chunks ({self._damage})"
-            warn(f"{self._where}: {where}; {so}; `mcaptrack recover` saves the others", "lost")
+            warn(f"{self._where}: {where}; {so}", "lost")
 
     def __str__(self) -> str:
         many = f"; {self._unread} of {self._seen} messages are like this" if self._unread > 1 else ""

@@ -401,8 +401,9 @@ class LogTables:
 
     def manifest(self, topic: str, part: MessagesPart) -> dict[str, Any]:
         """What a channel is, and when its messages are that a table holds."""
-        channel, timing = self.opened.channel(topic), dict.fromkeys(Timing._fields)
-        with suppress(McaptrackError):  # messages later than 2262
+        channel = self.opened.channel(topic)
+        timing: dict[str, Any] = dict.fromkeys(Timing._fields) | {"messages": channel.messages}
+        with suppress(McaptrackError):  # messages later than 2262, or of several types
             timing = self.timing(topic, part)._asdict()
         del timing["first"]
         return {
