@@ -196,7 +196,7 @@ def times(t_ns: Ints) -> Any:
 PIECE_ROWS: Final = 128 * 1024
 
 
-class Waiting:
+class PendingRows:
     """Rows that wait for others, until they are a piece of ``PIECE_ROWS`` rows, or of at least ``most_bytes``."""
 
     def __init__(self, schema: Any, most_bytes: int | None = None) -> None:
@@ -253,7 +253,7 @@ class TablePieces:
 
     def __iter__(self) -> Iterator[Any]:
         """The pieces; at least one, which may be empty."""
-        waiting, is_first = Waiting(self.schema, self._most_bytes), True
+        waiting, is_first = PendingRows(self.schema, self._most_bytes), True
         for table in self._make():
             for piece in waiting.add(table):
                 yield piece

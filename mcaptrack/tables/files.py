@@ -26,7 +26,7 @@ from mcaptrack.tables.fields import TABLE_VERSION
 
 FORMATS: Final[tuple[TableFormat, ...]] = get_args(TableFormat)
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
-#: Rows of each file whose values are compared when it was written; fewer if they are larger.
+#: The values of so many rows of each file are compared when it was written; of fewer if they are larger.
 _ROWS_COMPARED: Final = 1024
 _BYTES_READ: Final = 4 * 2**20
 #: Smaller files leave so little memory behind that looking for it takes longer than they did.

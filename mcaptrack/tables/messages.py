@@ -210,7 +210,7 @@ def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: UnreadMessages)
 
 
 def inferred_table(source: MessageSource, wanted: Callable[[Path], bool], blobs: bool) -> MessagesTable:
-    """The table of messages whose fields have the types of their values."""
+    """The table of messages without types: fields have those of their values."""
     stored, unread = _Stored(wanted, blobs), UnreadMessages(source.where, source.total)
     heads = [_NO_MESSAGES]
     for batch in source.payloads(unread.lose):

@@ -17,7 +17,7 @@ from mcaptrack import environment, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log.messages import Payloads, Span
 from mcaptrack.tables import ParquetTable, TypedMessages
-from mcaptrack.tables.build import Waiting
+from mcaptrack.tables.build import PendingRows
 from mcaptrack.tables.messages import PIECE_BYTES
 
 #: Tables that are written at once, each to an open file.
@@ -32,7 +32,7 @@ class ChannelFile:
     def __init__(self, messages: TypedMessages, file: ParquetTable) -> None:
         self.topic, self.total = messages.source.topic, messages.source.total
         self.messages, self.file = messages, file
-        self.waiting, self.is_done = Waiting(messages.schema, PIECE_BYTES), False
+        self.waiting, self.is_done = PendingRows(messages.schema, PIECE_BYTES), False
         self.is_open, self._stack = False, ExitStack()
         self._writing: Future[None] | None = None
 

@@ -400,7 +400,7 @@ class LogTables:
         return self._timings[key]
 
     def manifest(self, topic: str, part: MessagesPart) -> dict[str, Any]:
-        """What a channel is, and when its messages are that a table holds."""
+        """The type of a channel, and the times of the messages in its table."""
         channel = self.opened.channel(topic)
         timing: dict[str, Any] = dict.fromkeys(Timing._fields) | {"messages": channel.messages}
         with suppress(McaptrackError):  # messages later than 2262, or of several types
