@@ -85,6 +85,7 @@ def test_tables_of_all_channels_hold_what_mcap_reads(
     path = recording(tmp_path / "a.mcap", seed)
     monkeypatch.setattr(messages, "_BATCH_BYTES", random.Random(seed).choice([1, 1000, 2**22]))
     monkeypatch.setattr(messages, "_WAITING_BYTES", 30_000)
+    monkeypatch.setattr(messages, "_WINDOW_BYTES", random.Random(seed).choice([1, 5000, 2**24]))
     monkeypatch.setattr(channels, "_WAITING_BYTES", 50_000)
     monkeypatch.setattr(channels, "_MOST_AT_ONCE", 2 + seed)
     written = []

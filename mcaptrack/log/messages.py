@@ -51,6 +51,8 @@ _KEPT_BYTES: Final = 8 * 2**20
 _MAX_GAP_BYTES: Final = 16 * 2**10
 #: Payloads come in batches of this many bytes at least: fewer make each step for few messages, more exceed the caches.
 _BATCH_BYTES: Final = 4 * 2**20
+#: Chunks are read together until they have so many bytes.
+_WINDOW_BYTES: Final = 16 * 2**20
 #: Payloads of all topics together wait for others of their batch in so many bytes at most.
 _WAITING_BYTES: Final = 64 * 2**20
 #: Chunks in a store that are smaller together are read with their indexes, others after them. Indexes that are nearer
@@ -425,6 +427,64 @@ def _batch(parts: Sequence[Payloads]) -> Payloads:
     return parts[0] if len(parts) == 1 else _packed(parts)
 
 
+class _Window:
+    """Batches of several topics in some chunks, of which the bytes stand behind each other.
+
+    ``places`` says where the bytes of each chunk begin.
+    """
+
+    def __init__(self) -> None:
+        self.blocks: list[NDArray[np.uint8]] = []
+        self.size, self.places = 0, dict[int | None, int]()
+        self._batches: dict[int, list[tuple[MessageBatch, Ints | None]]] = {}
+
+    def add(self, number: int, batch: MessageBatch, at: Ints | None) -> None:
+        """Add a batch of a topic, and where its messages begin (M,); None if they are lost."""
+        self._batches.setdefault(number, []).append((batch, at))
+
+    def topics(self, lose: Lose | None) -> Iterator[tuple[int, Payloads]]:
+        """The messages of each topic. Without ``lose``, raises Damaged where the index names a message that is none."""
+        data = self.blocks[0] if len(self.blocks) == 1 else np.concatenate([np.empty(0, np.uint8), *self.blocks])
+        for number, batches in self._batches.items():
+            try:
+                part = _located_in(data, batches)
+            except Damaged:
+                if lose is None:
+                    raise
+                part = _located_in(data, [(batch, _checked(data, number, batch, at, lose)) for batch, at in batches])
+            if 2 * int((part.end - part.start).sum()) < len(data):  # what waits holds no bytes of others
+                part = _packed([part])
+            yield number, part
+
+
+def _checked(data: NDArray[np.uint8], number: int, batch: MessageBatch, at: Ints | None, lose: Lose) -> Ints | None:
+    """Where the messages of a batch begin; None, if they are no messages, which are lost then."""
+    try:
+        _located_in(data, [(batch, at)])
+    except Damaged as error:
+        lose(number, len(batch.t_ns), error)
+        return None
+    return at
+
+
+def _located_in(data: NDArray[np.uint8], batches: Sequence[tuple[MessageBatch, Ints | None]]) -> Payloads:
+    """The messages of batches of a topic in the order of time. Raises Damaged if one is none."""
+    counts = [len(batch.t_ns) for batch, _ in batches]
+    channel = np.repeat([batch.channel for batch, _ in batches], counts).astype(np.uint16)
+    times = np.concatenate([batch.t_ns for batch, _ in batches])
+    at = np.concatenate([np.full(len(b.t_ns), -1) if places is None else places for b, places in batches])
+    chunk = [_OUTSIDE if batch.chunk is None else batch.chunk.chunk_start_offset for batch, _ in batches]
+    start, end, good = np.full(len(at), -1), np.zeros(len(at), np.int64), np.flatnonzero(at >= 0)
+    if len(good):
+        heads = message_heads_at(data.data, channel[good], times[good], at[good])
+        start[good], end[good] = heads.start, heads.end
+    t_ns = to_int64(times)
+    order = np.argsort(t_ns, kind="stable")
+    offset = np.concatenate([batch.offset for batch, _ in batches])
+    columns = (values[order] for values in (start, end, np.repeat(chunk, counts), offset))
+    return Payloads(t_ns[order], data, *columns)
+
+
 def overlaps(chunk: ChunkIndex, span: Span) -> bool:
     """Whether a chunk may have messages in a span of times."""
     first, last = span
@@ -568,37 +628,46 @@ class Messages:
         ]
         waiting: dict[int, list[Payloads]] = {}
         held: Counter[int] = Counter()
-        total = 0
+        window = _Window()
+
+        def batches() -> Iterator[tuple[int, Payloads]]:
+            for number, part in window.topics(lose):
+                waiting.setdefault(number, []).append(part)
+                held[number] += len(part.data)
+                while held.total() >= _WAITING_BYTES or held[number] >= _BATCH_BYTES:
+                    largest = number if held[number] >= _BATCH_BYTES else max(held, key=held.__getitem__)
+                    yield largest, _batch(waiting.pop(largest))
+                    del held[largest]
+
         for number, group in heapq.merge(*streams, key=lambda numbered: numbered[1][0].place):
-            parts = [self._payloads(batch, number, lose) for batch in group]
-            part = _batch(parts)
-            order = np.argsort(part.t_ns, kind="stable")
-            part = Payloads(*(values if values is part.data else values[order] for values in part))
-            if 2 * int((part.end - part.start).sum()) < len(part.data):  # what waits holds no bytes of others
-                part = _packed([part])
-            waiting.setdefault(number, []).append(part)
-            held[number] += len(part.data)
-            total += len(part.data)
-            while total >= _WAITING_BYTES or held[number] >= _BATCH_BYTES:
-                largest = number if held[number] >= _BATCH_BYTES else max(held, key=held.__getitem__)
-                yield largest, _batch(waiting.pop(largest))
-                total -= held.pop(largest)
+            for batch in group:
+                self._take(window, number, batch, lose)
+            if window.size >= _WINDOW_BYTES:
+                yield from batches()
+                window = _Window()
+        yield from batches()
         for number, parts in waiting.items():
             yield number, _batch(parts)
 
-    def _payloads(self, batch: MessageBatch, number: int, lose: Lose | None) -> Payloads:
-        t_ns = to_int64(batch.t_ns)
-        chunk_offset = np.full(len(t_ns), batch.chunk.chunk_start_offset if batch.chunk else _OUTSIDE)
+    def _take(self, window: _Window, number: int, batch: MessageBatch, lose: Lose | None) -> None:
+        """Open the bytes of a batch, and add it to the window."""
+        place = batch.place if batch.chunk is not None and not batch.is_direct else None
+        if place in window.places:
+            window.add(number, batch, batch.offset + window.places[place])
+            return
         try:
             content, offset = self._open(batch)
-            heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
         except Damaged as error:
             if lose is None:
                 raise
-            lose(number, len(t_ns), error)
-            nothing, nowhere = np.empty(0, np.uint8), np.zeros(len(t_ns), np.int64)
-            return Payloads(t_ns, nothing, nowhere - 1, nowhere, chunk_offset, batch.offset)
-        return Payloads(t_ns, np.frombuffer(content, np.uint8), heads.start, heads.end, chunk_offset, batch.offset)
+            lose(number, len(batch.t_ns), error)
+            window.add(number, batch, None)
+            return
+        if place is not None:
+            window.places[place] = window.size
+        window.add(number, batch, offset + window.size)
+        window.blocks.append(np.frombuffer(content, np.uint8))
+        window.size += len(content)
 
     def columns(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> ChannelRows | None:
         """Rows without a loop over messages; None if a message has another layout than the reader's."""
