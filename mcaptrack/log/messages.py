@@ -407,8 +407,12 @@ def _packed(parts: Sequence[Payloads]) -> Payloads:
 
     Messages begin 4 bytes behind multiples of 8, so that the numbers behind the head of a CDR message are aligned.
     """
-    joined = Payloads(*map(np.concatenate, zip(*(part._replace(data=part.t_ns) for part in parts), strict=True)))
-    sizes = np.where(joined.start < 0, 0, joined.end - joined.start)
+
+    def joined(name: str) -> Ints:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    before = joined("start")
+    sizes = np.where(before < 0, 0, joined("end") - before)
     slots = (sizes + 4 + 7) // 8 * 8
     start = np.cumsum(slots) - slots + 4
     data, low = np.empty(int(slots.sum()), np.uint8), 0
@@ -420,7 +424,8 @@ def _packed(parts: Sequence[Payloads]) -> Payloads:
         else:
             gather_bytes(part.data, np.maximum(part.start, 0), sizes[low:high], start[low:high], data)
         low = high
-    return joined._replace(data=data, start=np.where(joined.start < 0, -1, start), end=start + sizes)
+    places = joined("chunk_offset"), joined("offset")
+    return Payloads(joined("t_ns"), data, np.where(before < 0, -1, start), start + sizes, *places)
 
 
 def _batch(parts: Sequence[Payloads]) -> Payloads:

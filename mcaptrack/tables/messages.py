@@ -28,7 +28,8 @@ from mcaptrack.tables.fields import RECORDING
 if TYPE_CHECKING:
     from mcaptrack.columns import ProtobufColumns, RosColumns
 
-_NO_MESSAGES: Final = Payloads(*[np.empty(0, np.int64)] * len(Payloads._fields))
+_NOTHING: Final = np.empty(0, np.int64)
+_NO_MESSAGES: Final = Payloads(_NOTHING, np.empty(0, np.uint8), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 Path = tuple[str, ...]
 Columns = Mapping[Path, Any]
@@ -227,7 +228,8 @@ def inferred_table(source: MessageSource, wanted: Callable[[Path], bool], blobs:
     def pieces() -> Iterator[Any]:
         rows, low = _Rows(source, types), 0
         for count, columns in stored.columns(types):
-            yield rows.table(Payloads(*(column[low : low + count] for column in head)), columns)
+            t_ns, _, start, end, chunk_offset, offset = (column[low : low + count] for column in head)
+            yield rows.table(Payloads(t_ns, head.data, start, end, chunk_offset, offset), columns)
             low += count
 
     table = TablePieces(_Rows(source, types).schema, source.total, pieces, PIECE_BYTES)

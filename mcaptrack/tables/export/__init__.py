@@ -317,9 +317,11 @@ def _write_all(
             done += 1
             progress("export", done, total)
     for span, channels in passes.items():
-        write_in_one_pass(
-            opened, channels, span, fail, lambda count, done=done: progress("export", done + count, total)
-        )
+
+        def tell(count: int, done: int = done) -> None:
+            progress("export", done + count, total)
+
+        write_in_one_pass(opened, channels, span, fail, tell)
         done += len(channels)
         for channel in channels:
             job.finish(channel)

@@ -92,10 +92,12 @@ def write_in_one_pass(
     """
     everything, done = iter(channels), 0
     while some := list(islice(everything, _MOST_AT_ONCE)):
+
+        def tell(share: float, done: int = done, count: int = len(some)) -> None:
+            progress(done + int(share * count))
+
         try:
-            _Pass(some, fail).run(
-                opened, span, lambda share, done=done, some=some: progress(done + int(share * len(some)))
-            )
+            _Pass(some, fail).run(opened, span, tell)
         except BaseException as error:
             for channel in some:
                 channel.discard(error)
