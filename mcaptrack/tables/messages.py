@@ -228,8 +228,9 @@ def inferred_table(source: MessageSource, wanted: Callable[[Path], bool], blobs:
     def pieces() -> Iterator[Any]:
         rows, low = _Rows(source, types), 0
         for count, columns in stored.columns(types):
-            t_ns, _, start, end, chunk_offset, offset = (column[low : low + count] for column in head)
-            yield rows.table(Payloads(t_ns, head.data, start, end, chunk_offset, offset), columns)
+            part = slice(low, low + count)
+            places = head.chunk_offset[part], head.offset[part]
+            yield rows.table(Payloads(head.t_ns[part], head.data, head.start[part], head.end[part], *places), columns)
             low += count
 
     table = TablePieces(_Rows(source, types).schema, source.total, pieces, PIECE_BYTES)
