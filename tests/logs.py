@@ -18,7 +18,7 @@ from mcaptrack.pipeline.views import make_views
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import CLOCK, Provenance
-from mcaptrack.tables import Pointers, TablePieces, messages
+from mcaptrack.tables import TablePieces, messages
 from tests.commands import zones_file
 from tests.worlds import boxes_at, ns, tracks_at
 
@@ -161,13 +161,12 @@ if find_spec("torch"):  # without it `train` reads nothing
 def flat_table(rows: Sequence[Mapping[str, object]], blobs: bool) -> tuple[TablePieces, list[str]]:
     """The table of messages with these fields."""
     numbers = np.arange(len(rows))
-    places = Pointers("a.mcap", numbers, numbers, numbers, numbers, numbers)
     starts = 8 * numbers
-    data = Payloads(numbers, numbers.astype("<i8").view(np.uint8), starts, starts + 8)
+    data = Payloads(numbers, numbers.astype("<i8").view(np.uint8), starts, starts + 8, numbers, numbers)
 
     def flatten(payload: bytes) -> dict[tuple[str, ...], object]:
         return {(name,): value for name, value in rows[int.from_bytes(payload, "little")].items()}
 
-    source = messages.MessageSource("a.mcap: /a", len(rows), lambda: iter([data]), flatten)
-    fields = messages.inferred_fields(source, lambda _: True, blobs)
-    return messages.messages_table("/a", "A", places, fields), [name for (name,) in fields.left_out]
+    source = messages.MessageSource("/a", "A", "a.mcap", 0, len(rows), "a.mcap: /a", lambda _: iter([data]), flatten)
+    table = messages.inferred_table(source, lambda _: True, blobs)
+    return table.pieces, [name for (name,) in table.left_out]

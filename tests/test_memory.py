@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from importlib import import_module
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 import mcaptrack
@@ -100,19 +99,6 @@ def test_a_table_is_made_in_pieces():
     read(short)
     few, many = (held(lambda frames=frames: read(frames))[1] for frames in (short, long))
     assert many - few < 0.6 * (300 * PEOPLE) * TRACKS.dtype.itemsize
-
-
-def test_a_table_is_read_back_in_small_parts(tmp_path):
-    """Not in row groups, of which two were in memory at once."""
-    table = pa.table({name: np.random.default_rng(1).random(300_000) for name in "abcdef"})
-    tables.write(tmp_path / "a.parquet", table, {})
-    before, pool = pa.default_memory_pool(), pa.proxy_memory_pool(pa.default_memory_pool())
-    pa.set_memory_pool(pool)
-    try:
-        assert tables.verify(tmp_path / "a.parquet") == 300_000
-    finally:
-        pa.set_memory_pool(before)
-    assert 100_000 < pool.max_memory() < table.nbytes / 3
 
 
 @pytest.mark.usefixtures("small_blocks")

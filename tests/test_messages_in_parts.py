@@ -52,7 +52,7 @@ def test_parts_give_the_table_of_all_messages(rows, blobs, count, piece, piece_r
     expected = whole.table()
     with (
         patch.object(messages, "_PART_MESSAGES", count),
-        patch.object(messages, "_PIECE_BYTES", piece),
+        patch.object(messages, "PIECE_BYTES", piece),
         patch.object(build, "PIECE_ROWS", piece_rows),
     ):
         pieces, without = flat_table(rows, blobs)
@@ -91,7 +91,7 @@ def test_a_channel_of_pictures_is_exported_without_holding_them(tmp_path):
 
     with (
         patch.object(messages, "_PART_MESSAGES", 4),
-        patch.object(messages, "_PIECE_BYTES", 2**18),
+        patch.object(messages, "PIECE_BYTES", 2**18),
         patch.object(files, "_BYTES_READ", 2**18),
     ):
         for blobs in (False, True):

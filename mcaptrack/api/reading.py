@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
-from mcaptrack.api.common import names_of
+from mcaptrack.api.common import names_of, split_names
 from mcaptrack.api.declared import Option, checked
 from mcaptrack.api.messages import DecodedMessage, checked_factories, decoded_messages
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
@@ -36,6 +36,7 @@ from mcaptrack.sources.own_rows import nanoseconds_of, times_of
 from mcaptrack.sources.pictures import Pictures, find_pictures, only_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
+from mcaptrack.tables.export.contents import WHOLE, MessagesPart
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -199,7 +200,16 @@ class LogReader:
             return tuple(sorted(opened.channels))
 
     @checked
-    def table(self, name: str, topic: str | None = None) -> pa.Table:
+    def table(
+        self,
+        name: str,
+        topic: str | None = None,
+        *,
+        columns: str | Sequence[str] | None = None,
+        blobs: bool = False,
+        start: int | datetime | np.datetime64 | None = None,
+        end: int | datetime | np.datetime64 | None = None,
+    ) -> pa.Table:
         """Return a table as Arrow: the same as in the files that ``export`` writes, with the column ``recording``.
 
         Parameters
@@ -208,6 +218,14 @@ class LogReader:
             One of ``tables``; or the topic of any channel, for a table of its rows, or of its flattened messages.
         topic : str, optional
             Return the rows of this channel only.
+        columns : str or sequence of str, optional
+            Of a channel of other software: read these fields only, as in angular_velocity.z; of a message all its
+            fields.
+        blobs : bool, default False
+            Of a channel of other software: include binary fields, such as pictures and point clouds.
+        start, end : int, datetime or numpy.datetime64, optional
+            Of a channel of other software: read messages from the first time on, and before the second, in nanoseconds
+            since 1970, or with a time zone. Chunks outside of the period are not read.
 
         Returns
         -------
@@ -217,7 +235,7 @@ class LogReader:
         Raises
         ------
         McaptrackError
-            If there is no such table or channel, or if the rows of the table are not by channel.
+            If there is no such table, channel or column, or if the rows of the table are not by channel.
 
         Examples
         --------
@@ -227,11 +245,14 @@ class LogReader:
         ['topic', 'frame', 't', 't_ns']
 
         """
+        part = MessagesPart(blobs, split_names("columns", columns), *_span(start, end))
         with self._now() as opened:
             if str(name) in tables.TABLES:
+                if part != WHOLE:
+                    raise McaptrackError(f"{name} is read whole; fields and times are chosen of channels, by topic")
                 whole = self._contents.table(name)
             elif (channel := opened.find(str(name))) in opened.channels:
-                whole = self._contents.messages(channel)[0]
+                whole = self._contents.messages(channel, part)
             else:
                 raise McaptrackError(
                     f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"
@@ -516,10 +537,7 @@ class LogReader:
 
         """
         factories = checked_factories(decoder_factories)
-        start_ns = None if start is None else nanoseconds_of(start, "`start=`")
-        end_ns = None if end is None else nanoseconds_of(end, "`end=`")
-        if start_ns is not None and end_ns is not None and start_ns > end_ns:
-            raise McaptrackError(f"`end=` is before `start=`: {end_ns} and {start_ns} ns")
+        start_ns, end_ns = _span(start, end)
         with self._now() as opened:
             chosen = opened.channels if topics is None else _topics(opened, topics)
             return _InTurn(
@@ -538,6 +556,15 @@ class _InTurn(Iterator[T]):
         with self._reader._alone():
             self._reader._refuse_closed()
             return next(self._items)
+
+
+def _span(start: Any, end: Any) -> tuple[int | None, int | None]:
+    """Return a period in nanoseconds. Raises McaptrackError if it ends before it starts."""
+    start_ns = None if start is None else nanoseconds_of(start, "`start=`")
+    end_ns = None if end is None else nanoseconds_of(end, "`end=`")
+    if start_ns is not None and end_ns is not None and start_ns > end_ns:
+        raise McaptrackError(f"`end=` is before `start=`: {end_ns} and {start_ns} ns")
+    return start_ns, end_ns
 
 
 def _topics(opened: Log, names: Any) -> set[str]:

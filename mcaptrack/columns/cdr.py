@@ -10,7 +10,8 @@ size. Otherwise (messages with strings or lists in them) the first elements of a
 the second ones, and so on; where few messages have that many, element by element.
 
 Alignment (XCDR1) is relative to the end of the 4-byte head of a message, so the bodies of CDR messages are first copied
-to multiples of 8, or, if they are long, read in groups. ROS 1 has neither heads nor alignment, and is read in place.
+to multiples of 8, unless all are as far from these already, or, if they are long, read in groups. ROS 1 has neither
+heads nor alignment, and is read in place.
 
 Nothing is read, nor room made for it, before it is certain to be within its message: other messages raise Malformed.
 
@@ -26,6 +27,8 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+
+from mcaptrack.geometry.ragged import gather_bytes
 
 Bytes = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -161,7 +164,7 @@ class Cursor:
         else:
             out = windows(self.data, kind)[self.at]
         self.offset += kind.itemsize
-        return out.astype(kind.newbyteorder("="), copy=False)
+        return out
 
     def joined(self, sizes: Ints, to: Ints | None = None) -> Bytes:
         """So many bytes at each position, end to end, or at ``to`` (N + 1,), of which the last is the end of all."""
@@ -169,21 +172,11 @@ class Cursor:
         if int(ends[-1]) > _MAX_BYTES:
             raise Unsupported("more than 2 GiB of a field in a batch")
         out = np.empty(int(ends[-1]), np.uint8)
-        if _are_equal(sizes) and len(sizes):
-            width = int(sizes[0])
-            if width and self.step and len(out) == len(sizes) * width:
-                begin, shape = int(self.base[0]) + self.offset, (len(sizes), width)
-                out.reshape(shape)[:] = np.ndarray(shape, np.uint8, self.data, begin, (self.step, 1))
-            elif width:
-                windows(out, f"V{width}")[ends[:-1]] = windows(self.data, f"V{width}")[self.at]
-            return out
-        at, width = self.at, 1
-        while width <= int(sizes.max(initial=0)):  # a piece for each bit of a size, the small ones first
-            rows = np.flatnonzero(sizes & width)
-            if len(rows):
-                before = sizes[rows] & (width - 1)
-                windows(out, f"V{width}")[ends[rows] + before] = windows(self.data, f"V{width}")[at[rows] + before]
-            width *= 2
+        if self.step and len(sizes) and _are_equal(sizes) and len(out) == len(sizes) * int(sizes[0]):
+            begin, shape = int(self.base[0]) + self.offset, (len(sizes), int(sizes[0]))
+            out.reshape(shape)[:] = np.ndarray(shape, np.uint8, self.data, begin, (self.step, 1))
+        else:
+            gather_bytes(self.data, self.at, sizes, ends[:-1], out)
         return out
 
 
@@ -223,8 +216,11 @@ class _Number(_Type):
         self.is_byte = self.size == 1 and not self.is_flag
 
     def read(self, cursor: Cursor) -> pa.Array:
-        values = cursor.take(self.kind, self.align)
-        return pa.array(values != 0 if self.is_flag else values)
+        return self.column(cursor.take(self.kind, self.align))
+
+    def column(self, values: NDArray[Any]) -> pa.Array:
+        """Numbers in any byte order as Arrow."""
+        return pa.array(values != 0 if self.is_flag else values.astype(self.kind.newbyteorder("="), copy=False))
 
 
 class _Counted(_Type):
@@ -327,6 +323,8 @@ class _List(_Counted):
         if self.is_bytes:
             buffers = [None, limits.buffers()[1], pa.py_buffer(data)]
             return pa.Array.from_buffers(pa.binary(), len(counts), buffers)
+        if isinstance(self.of, _Number):
+            return pa.ListArray.from_arrays(limits, self.of.column(data.view(self.of.kind)))
         start = np.arange(ends[-1]) * self.stride
         inner = Cursor(data, start, start + self.stride, self.of.align, self.stride)
         return pa.ListArray.from_arrays(limits, self.of.read(inner))
@@ -533,7 +531,7 @@ class RosColumns:
         if (order > 1).any():  # parameter lists, and the encodings of XCDR2
             raise Unsupported(f"messages in the encapsulation {order.max():04x} are not read")
         body = start + 4
-        is_in_place = int((end - start).sum()) > _COPIED * len(start)
+        is_in_place = _are_equal(body % _GRID) or int((end - start).sum()) > _COPIED * len(start)
         group = order * _GRID + (body % _GRID if is_in_place else 0)
         if _are_equal(group):
             return self._read(data, body, end, "<" if not len(order) or order[0] else ">", is_in_place)

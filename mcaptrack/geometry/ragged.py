@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,6 +61,59 @@ def ragged_range(starts: ArrayLike, counts: ArrayLike, step: int = 1) -> Ints:
     before = np.cumsum(sizes) - sizes
     offset = np.asarray(starts, np.int64) - step * before
     return np.repeat(np.broadcast_to(offset, sizes.shape), sizes) + step * np.arange(int(sizes.sum()))
+
+
+def gather_bytes(data: NDArray[np.uint8], at: Ints, sizes: Ints, to: Ints, out: NDArray[np.uint8]) -> None:
+    """Copy pieces of bytes, of any sizes, without a loop over them; long ones are copied one by one.
+
+    Parameters
+    ----------
+    data : (B,) of uint8
+    at, sizes : (G,) of int64
+        Where each piece begins in ``data``, and its bytes.
+    to : (G,) of int64
+        Where it begins in ``out``; pieces don't overlap there.
+    out : (C,) of uint8
+
+    Raises
+    ------
+    IndexError
+        If a piece is not within ``data`` or ``out``.
+
+    Examples
+    --------
+    >>> out = np.zeros(5, np.uint8)
+    >>> gather_bytes(np.frombuffer(b"abcdef", np.uint8), np.array([4, 0]), np.array([2, 1]), np.array([0, 3]), out)
+    >>> out.tolist() == [*b"ef", 0, *b"a", 0]
+    True
+    """
+    if not len(sizes):
+        return
+    if at.min() < 0 or to.min() < 0 or (at + sizes).max() > len(data) or (to + sizes).max() > len(out):
+        raise IndexError("a piece is not within the bytes")
+    widest = int(sizes.max())
+    if int(sizes.sum()) > _LONG * len(sizes):
+        for begin, size, place in zip(at.tolist(), sizes.tolist(), to.tolist(), strict=True):
+            out[place : place + size] = data[begin : begin + size]
+    elif widest == sizes.min():
+        if widest:
+            _windows(out, widest)[to] = _windows(data, widest)[at]
+    else:
+        for bit in range(widest.bit_length()):  # a part of each piece for each bit of its size, the small ones first
+            width = 1 << bit
+            rows = np.flatnonzero(sizes & width)
+            if len(rows):
+                before = sizes[rows] & (width - 1)
+                _windows(out, width)[to[rows] + before] = _windows(data, width)[at[rows] + before]
+
+
+#: Longer pieces, on average, are copied one by one.
+_LONG: Final = 2048
+
+
+def _windows(data: NDArray[np.uint8], width: int) -> NDArray[np.void]:
+    """So many bytes at each byte of ``data``, as a view."""
+    return np.ndarray((len(data) - width + 1,), f"V{width}", data, 0, (1,))
 
 
 def batches(counts: Ints, size: int) -> list[slice]:

@@ -6,11 +6,12 @@ Letters: M messages.
 from __future__ import annotations
 
 import hashlib
+import heapq
 import zlib
 from array import array
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from itertools import islice, repeat
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -20,7 +21,7 @@ from mcap.records import Message as MessageRecord
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import gather_bytes, group_index, ragged_range, run_starts
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import GAP_BYTES, ByteSource
 from mcaptrack.log.checksums import crc_of
@@ -50,6 +51,10 @@ _KEPT_BYTES: Final = 8 * 2**20
 _MAX_GAP_BYTES: Final = 16 * 2**10
 #: Payloads come in batches of this many bytes at least: fewer make each step for few messages, more exceed the caches.
 _BATCH_BYTES: Final = 4 * 2**20
+#: Chunks are read together until they have so many bytes.
+_WINDOW_BYTES: Final = 16 * 2**20
+#: Payloads of all topics together wait for others of their batch in so many bytes at most.
+_WAITING_BYTES: Final = 64 * 2**20
 #: Chunks in a store that are smaller together are read with their indexes, others after them. Indexes that are nearer
 #: to each other come in one request.
 _READ_AT_ONCE_BYTES: Final = 16 * 2**20
@@ -75,12 +80,16 @@ class ChannelRows(NamedTuple):
 
 
 class Payloads(NamedTuple):
-    """Messages in time order, (M,): their times in ns, and their bytes: ``data`` from ``start`` to before ``end``."""
+    """Messages in time order, (M,): times in ns, bytes (``data`` from ``start`` to before ``end``), and locations as in
+    ``MessageLocations``. ``start`` is -1 for messages in damaged chunks.
+    """
 
     t_ns: Ints
     data: NDArray[np.uint8]
     start: Ints
     end: Ints
+    chunk_offset: Ints
+    offset: Ints
 
 
 class MessageLocations(NamedTuple):
@@ -186,6 +195,7 @@ def _in_order_of_time(channel: ChannelRows) -> ChannelRows:
 
 Times = NDArray[np.uint64]
 Span = tuple[int | None, int | None]
+Lose = Callable[[int, int, Damaged], None]
 
 _NO_ENTRIES: Final[Entries] = np.empty((0, 2), "<u8")
 _OUTSIDE: Final = -1
@@ -212,6 +222,11 @@ class MessageBatch(NamedTuple):
     is_direct: bool
     t_ns: Times
     offset: Ints
+
+    @property
+    def place(self) -> int:
+        """Where it is read in the file."""
+        return int(self.offset[0]) if self.chunk is None else int(self.chunk.chunk_start_offset)
 
     @property
     def size(self) -> int:
@@ -327,9 +342,16 @@ class MessageBatches:
         offsets = np.append(self._index.chunks.offsets.astype(np.int64), -1)  # the last one is that of _OUTSIDE
         return np.repeat(offsets[rows], np.diff(self.edges))
 
-    def in_order(self) -> Iterator[list[MessageBatch]]:
-        """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
+    def of(self, channels: Sequence[int]) -> Ints:
+        """The numbers of the batches of some of the channels."""
+        return np.flatnonzero(np.isin(np.frombuffer(self._channel, np.uint16), channels))
+
+    def in_order(self, some: Ints | None = None) -> Iterator[list[MessageBatch]]:
+        """Batches, all or ``some``, in groups that follow one another in time; batches of one group overlap, and keep
+        their order.
+        """
         numbers = np.flatnonzero(np.diff(self.edges))
+        numbers = numbers if some is None else some[np.diff(self.edges)[some] > 0]
         first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
         order = np.argsort(first_ns, kind="stable")
         group: list[int] = []
@@ -380,17 +402,92 @@ def joined_by_chunk(batches: Sequence[MessageBatch], *, reverse: bool) -> tuple[
     ], of
 
 
-def _joined_payloads(parts: Sequence[Payloads]) -> Payloads:
-    """Payloads behind each other, in one buffer."""
-    if len(parts) == 1:
-        return parts[0]
-    before = np.cumsum([0, *(len(part.data) for part in parts)]).tolist()
-    start, end = (
-        np.concatenate([places + size for places, size in zip(columns, before, strict=False)])
-        for columns in ([part.start for part in parts], [part.end for part in parts])
-    )
-    t_ns = np.concatenate([part.t_ns for part in parts])
-    return Payloads(t_ns, np.concatenate([part.data for part in parts]), start, end)
+def _packed(parts: Sequence[Payloads]) -> Payloads:
+    """Payloads behind each other in a buffer of their own, without the bytes of other channels.
+
+    Messages begin 4 bytes behind multiples of 8, so that the numbers behind the head of a CDR message are aligned.
+    """
+
+    def joined(name: str) -> Ints:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    before = joined("start")
+    sizes = np.where(before < 0, 0, joined("end") - before)
+    slots = (sizes + 4 + 7) // 8 * 8
+    start = np.cumsum(slots) - slots + 4
+    data, low = np.empty(int(slots.sum()), np.uint8), 0
+    for part in parts:
+        high = low + len(part.t_ns)
+        place = int(start[low]) - 4 if high > low else 0
+        if high > low and np.array_equal(part.start, start[low:high] - place):  # it is packed
+            data[place : place + len(part.data)] = part.data
+        else:
+            gather_bytes(part.data, np.maximum(part.start, 0), sizes[low:high], start[low:high], data)
+        low = high
+    places = joined("chunk_offset"), joined("offset")
+    return Payloads(joined("t_ns"), data, np.where(before < 0, -1, start), start + sizes, *places)
+
+
+def _batch(parts: Sequence[Payloads]) -> Payloads:
+    return parts[0] if len(parts) == 1 else _packed(parts)
+
+
+class _Window:
+    """Batches of several topics in some chunks, of which the bytes stand behind each other.
+
+    ``places`` says where the bytes of each chunk begin.
+    """
+
+    def __init__(self) -> None:
+        self.blocks: list[NDArray[np.uint8]] = []
+        self.size, self.places = 0, dict[int | None, int]()
+        self._batches: dict[int, list[tuple[MessageBatch, Ints | None]]] = {}
+
+    def add(self, number: int, batch: MessageBatch, at: Ints | None) -> None:
+        """Add a batch of a topic, and where its messages begin (M,); None if they are lost."""
+        self._batches.setdefault(number, []).append((batch, at))
+
+    def topics(self, lose: Lose | None) -> Iterator[tuple[int, Payloads]]:
+        """The messages of each topic. Without ``lose``, raises Damaged where the index names a message that is none."""
+        data = self.blocks[0] if len(self.blocks) == 1 else np.concatenate([np.empty(0, np.uint8), *self.blocks])
+        for number, batches in self._batches.items():
+            try:
+                part = _located_in(data, batches)
+            except Damaged:
+                if lose is None:
+                    raise
+                part = _located_in(data, [(batch, _checked(data, number, batch, at, lose)) for batch, at in batches])
+            if 2 * int((part.end - part.start).sum()) < len(data):  # what waits holds no bytes of others
+                part = _packed([part])
+            yield number, part
+
+
+def _checked(data: NDArray[np.uint8], number: int, batch: MessageBatch, at: Ints | None, lose: Lose) -> Ints | None:
+    """Where the messages of a batch begin; None, if they are no messages, which are lost then."""
+    try:
+        _located_in(data, [(batch, at)])
+    except Damaged as error:
+        lose(number, len(batch.t_ns), error)
+        return None
+    return at
+
+
+def _located_in(data: NDArray[np.uint8], batches: Sequence[tuple[MessageBatch, Ints | None]]) -> Payloads:
+    """The messages of batches of a topic in the order of time. Raises Damaged if one is none."""
+    counts = [len(batch.t_ns) for batch, _ in batches]
+    channel = np.repeat([batch.channel for batch, _ in batches], counts).astype(np.uint16)
+    times = np.concatenate([batch.t_ns for batch, _ in batches])
+    at = np.concatenate([np.full(len(b.t_ns), -1) if places is None else places for b, places in batches])
+    chunk = [_OUTSIDE if batch.chunk is None else batch.chunk.chunk_start_offset for batch, _ in batches]
+    start, end, good = np.full(len(at), -1), np.zeros(len(at), np.int64), np.flatnonzero(at >= 0)
+    if len(good):
+        heads = message_heads_at(data.data, channel[good], times[good], at[good])
+        start[good], end[good] = heads.start, heads.end
+    t_ns = to_int64(times)
+    order = np.argsort(t_ns, kind="stable")
+    offset = np.concatenate([batch.offset for batch, _ in batches])
+    columns = (values[order] for values in (start, end, np.repeat(chunk, counts), offset))
+    return Payloads(t_ns[order], data, *columns)
 
 
 def overlaps(chunk: ChunkIndex, span: Span) -> bool:
@@ -519,23 +616,63 @@ class Messages:
                 del opened[number]
                 size -= batch.size
 
-    def payloads(self, channels: Sequence[int], span: Span = (None, None)) -> Iterator[Payloads]:
-        """The bytes of messages in time order, in batches of whole chunks."""
-        waiting: list[Payloads] = []
-        for group in self._located(channels, span).in_order():
-            joined = _joined_payloads([self._payloads(batch) for batch in group])
-            order = np.argsort(joined.t_ns, kind="stable")
-            waiting.append(Payloads(joined.t_ns[order], joined.data, joined.start[order], joined.end[order]))
-            if sum(len(part.data) for part in waiting) >= _BATCH_BYTES:
-                yield _joined_payloads(waiting)
-                waiting = []
-        if waiting:
-            yield _joined_payloads(waiting)
+    def payloads(
+        self, topics: Sequence[Sequence[int]], span: Span = (None, None), lose: Lose | None = None
+    ) -> Iterator[tuple[int, Payloads]]:
+        """The bytes of messages of several topics in batches, with the number of the topic; ``topics`` are the ids of
+        their channels. The batches of each topic are in time order.
 
-    def _payloads(self, batch: MessageBatch) -> Payloads:
-        content, offset = self._open(batch)
-        heads = message_heads_at(content, batch.channel, batch.t_ns, offset)
-        return Payloads(to_int64(batch.t_ns), np.frombuffer(content, np.uint8), heads.start, heads.end)
+        Each chunk is opened once for all topics, if chunks hardly overlap. ``lose`` is called for messages that are
+        lost with a damaged chunk, with the number of the topic, that of messages, and the damage; without it, Damaged
+        is raised.
+        """
+        located = self._located([channel for channels in topics for channel in channels], span)
+        streams = [
+            zip(repeat(number), located.in_order(located.of(channels)), strict=False)
+            for number, channels in enumerate(topics)
+        ]
+        waiting: dict[int, list[Payloads]] = {}
+        held: Counter[int] = Counter()
+        window = _Window()
+
+        def batches() -> Iterator[tuple[int, Payloads]]:
+            for number, part in window.topics(lose):
+                waiting.setdefault(number, []).append(part)
+                held[number] += len(part.data)
+                while held.total() >= _WAITING_BYTES or held[number] >= _BATCH_BYTES:
+                    largest = number if held[number] >= _BATCH_BYTES else max(held, key=held.__getitem__)
+                    yield largest, _batch(waiting.pop(largest))
+                    del held[largest]
+
+        for number, group in heapq.merge(*streams, key=lambda numbered: numbered[1][0].place):
+            for batch in group:
+                self._take(window, number, batch, lose)
+            if window.size >= _WINDOW_BYTES:
+                yield from batches()
+                window = _Window()
+        yield from batches()
+        for number, parts in waiting.items():
+            yield number, _batch(parts)
+
+    def _take(self, window: _Window, number: int, batch: MessageBatch, lose: Lose | None) -> None:
+        """Open the bytes of a batch, and add it to the window."""
+        place = batch.place if batch.chunk is not None and not batch.is_direct else None
+        if place in window.places:
+            window.add(number, batch, batch.offset + window.places[place])
+            return
+        try:
+            content, offset = self._open(batch)
+        except Damaged as error:
+            if lose is None:
+                raise
+            lose(number, len(batch.t_ns), error)
+            window.add(number, batch, None)
+            return
+        if place is not None:
+            window.places[place] = window.size
+        window.add(number, batch, offset + window.size)
+        window.blocks.append(np.frombuffer(content, np.uint8))
+        window.size += len(content)
 
     def columns(self, channels: Sequence[int], schema: Schema, reader: RowReader) -> ChannelRows | None:
         """Rows without a loop over messages; None if a message has another layout than the reader's."""

@@ -18,6 +18,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Message as MessageRecord
 from mcap.records import Schema as SchemaRecord
 from mcap.well_known import SchemaEncoding
+from numpy.typing import NDArray
 
 from mcaptrack import notices
 from mcaptrack.errors import DamagedError, McaptrackError, call, list_names
@@ -496,13 +497,33 @@ class Log:
 
         Raises McaptrackError where the file is damaged, and for times that don't fit into int64.
         """
-        if (part := self.part(topic)) is not self:
-            yield from part.payloads(topic, start_ns, end_ns)
-            return
-        channels = self._ids(topic)
-        with self.snapshot.reporting_bad_times(topic):
-            yield from self._messages.payloads(channels, (start_ns, end_ns))
-            self.snapshot.confirm_unchanged(channels)
+        for _, payloads in self.payloads_of([topic], start_ns, end_ns):
+            yield payloads
+
+    def payloads_of(
+        self,
+        topics: Sequence[str],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        lose: Callable[[str, int, str], None] | None = None,
+    ) -> Iterator[tuple[str, Payloads]]:
+        """The same of several channels, with their topics, in one pass over the chunks.
+
+        ``lose`` is called with topic, number and reason for messages in damaged chunks, which ``Payloads`` then mark.
+        """
+        for part in self.parts:
+            here = [topic for topic in topics if self.part(topic) is part]
+            channels = [part._ids(topic) for topic in here]
+
+            def lose_some(number: int, count: int, damage: Damaged, here: Sequence[str] = here) -> None:
+                assert lose is not None
+                lose(here[number], count, str(damage))
+
+            if here:
+                with part.snapshot.reporting_bad_times(here[0] if len(here) == 1 else ""):
+                    batches = part._messages.payloads(channels, (start_ns, end_ns), lose_some if lose else None)
+                    yield from ((here[number], payloads) for number, payloads in batches)
+                    part.snapshot.confirm_unchanged([channel for ids in channels for channel in ids])
 
     def records(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None, *, reverse: bool = False
@@ -638,6 +659,14 @@ class Log:
         channels = self._ids(topic)
         with self.snapshot.reporting_bad_times(topic):
             return self.snapshot.consistent(lambda messages: messages.places(channels), _are_equal)
+
+    def chunk_offsets(self, topic: str) -> NDArray[np.uint64]:
+        """Where the chunks with messages of a channel begin in the file (C,), and messages of it outside of chunks."""
+        if (part := self.part(topic)) is not self:
+            return part.chunk_offsets(topic)
+        channels, chunks = self._ids(topic), self.index.chunks
+        loose = [self.index.loose[number][:, 1].astype(np.uint64) for number in channels if number in self.index.loose]
+        return np.concatenate([chunks.offsets[chunks.rows_with(channels)], *loose])
 
     def message_at(self, chunk_offset: int | None, offset: int) -> tuple[str, Message]:
         """The message at a location in this file (not in its sidecar), and its topic; one chunk is opened.

@@ -38,8 +38,8 @@ from mcaptrack.tables.build import (
 )
 from mcaptrack.tables.catalogue import join
 from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES
-from mcaptrack.tables.files import FORMATS, file_metadata, verify, write
-from mcaptrack.tables.messages import MessageFields, MessageSource, inferred_fields, messages_table, typed_fields
+from mcaptrack.tables.files import FORMATS, ParquetTable, file_metadata, verify, write
+from mcaptrack.tables.messages import MessageSource, MessagesTable, TypedMessages, inferred_table, typed_table
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, summary_table
 
 # Parquet files of mcaptrack or of other tools, as arrays and frames.

@@ -196,6 +196,43 @@ def times(t_ns: Ints) -> Any:
 PIECE_ROWS: Final = 128 * 1024
 
 
+class PendingRows:
+    """Rows that wait for others, until they are a piece of ``PIECE_ROWS`` rows, or of at least ``most_bytes``."""
+
+    def __init__(self, schema: Any, most_bytes: int | None = None) -> None:
+        self._schema, self._most_bytes = schema, most_bytes
+        self._start([])
+
+    def _start(self, tables: list[Any]) -> None:
+        self._tables = tables
+        self.rows, self.nbytes = sum(table.num_rows for table in tables), sum(table.nbytes for table in tables)
+
+    def add(self, table: Any) -> Iterator[Any]:
+        """Add rows; gives the pieces that are whole."""
+        import pyarrow as pa
+
+        self._tables.append(table)
+        self.rows += table.num_rows
+        self.nbytes += table.nbytes
+        if self._most_bytes is not None and self.nbytes >= self._most_bytes:
+            yield self.rest()
+        elif self.rows >= PIECE_ROWS:
+            whole = self.rest()
+            end = whole.num_rows - whole.num_rows % PIECE_ROWS
+            for start in range(0, end, PIECE_ROWS):
+                yield whole.slice(start, PIECE_ROWS)
+            rest = whole.slice(end)  # copied, because a slice keeps what it is a part of
+            self._start([rest.take(pa.array(range(rest.num_rows), pa.int64()))])
+
+    def rest(self) -> Any:
+        """The rows that wait, of which none do then."""
+        import pyarrow as pa
+
+        tables = [self._schema.empty_table(), *self._tables]
+        self._start([])
+        return pa.concat_tables(tables)
+
+
 class TablePieces:
     """A table in pieces of ``PIECE_ROWS`` rows, which are made again each time they are read.
 
@@ -216,26 +253,14 @@ class TablePieces:
 
     def __iter__(self) -> Iterator[Any]:
         """The pieces; at least one, which may be empty."""
-        import pyarrow as pa
-
-        waiting, count, is_first = [self.schema.empty_table()], 0, True
+        waiting, is_first = PendingRows(self.schema, self._most_bytes), True
         for table in self._make():
-            waiting.append(table)
-            count += table.num_rows
-            if self._most_bytes is not None and sum(piece.nbytes for piece in waiting) >= self._most_bytes:
-                yield pa.concat_tables(waiting)
-                waiting, count, is_first = [self.schema.empty_table()], 0, False
-            if count < PIECE_ROWS:
-                continue
-            whole = pa.concat_tables(waiting)
-            end = count - count % PIECE_ROWS
-            for start in range(0, end, PIECE_ROWS):
-                yield whole.slice(start, PIECE_ROWS)
-            rest = whole.slice(end)  # copied, because a slice keeps what it is a part of
-            waiting, count, is_first = [rest.take(pa.array(range(rest.num_rows), pa.int64()))], count - end, False
-            del whole
-        if count or is_first:
-            yield pa.concat_tables(waiting)
+            for piece in waiting.add(table):
+                yield piece
+                is_first = False
+                del piece
+        if waiting.rows or is_first:
+            yield waiting.rest()
 
     def table(self) -> Any:
         """The whole table."""

@@ -1,17 +1,19 @@
-"""Tables as files, published when they are complete and were read back identically.
+"""Tables as files, published when they are complete and were read back.
 
 Parquet: floats are split by byte and whole numbers stored as differences, which makes files smaller and writing faster
 than the defaults; pages have checksums and an index. The metadata hold ``source``, which identifies the input, and
-``digest``, that of the content; a file that would not change is not touched.
+``digest``, that of the pages or of the content; a file that would not change is not touched.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import IO, Any, Final, get_args
 
 import numpy as np
 
@@ -23,15 +25,10 @@ from mcaptrack.tables.build import PIECE_ROWS, pieces_of
 from mcaptrack.tables.fields import TABLE_VERSION
 
 FORMATS: Final[tuple[TableFormat, ...]] = get_args(TableFormat)
-#: Formats with metadata, by which a file can be found up to date.
-_DESCRIBED: Final = ("parquet", "arrow")
-
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
-#: Rows that are read back at once; fewer if they are larger.
-_ROWS_READ: Final = 16 * 1024
-_BYTES_READ: Final = 16 * 2**20
-#: Below this, starting a thread takes longer than what it would do.
-_ROWS_WORTH_A_THREAD: Final = 8 * 1024
+#: The values of so many rows of each file are compared when it was written; of fewer if they are larger.
+_ROWS_COMPARED: Final = 1024
+_BYTES_READ: Final = 4 * 2**20
 #: Smaller files leave so little memory behind that looking for it takes longer than they did.
 _BYTES_WORTH_RELEASING: Final = 64 * 1024
 _PREFIX: Final = "mcaptrack."
@@ -45,46 +42,68 @@ def write(
     form: TableFormat = "parquet",
     force: bool = False,
 ) -> bool:
-    """Write a table; the file appears when it is complete and reads back identically. Returns whether it was written.
+    """Write a table; the file appears when it is complete and was read back. Returns whether it was written.
 
     ``table`` is an Arrow table or ``TablePieces``; these are written piece by piece. ``provenance`` goes into the
     metadata, ``order`` names the columns by which rows are sorted. A file with the same content and metadata is left as
     it is, unless ``force``. Raises McaptrackError if the file can't be written.
     """
-    metadata = {"table_version": TABLE_VERSION} | dict(provenance)
-    if form in _DESCRIBED and not force:
-        old_metadata = file_metadata(path, form)
-        may_stay = old_metadata is not None and _describes(old_metadata, metadata)
-        if may_stay and digest(table.schema, pieces_of(table)) == (old_metadata or {}).get("digest"):
+    if form == "parquet":
+        file = ParquetTable(path, table.schema, provenance, order, force)
+        with file.published():
+            for piece in pieces_of(table):
+                file.add(piece)
+                del piece  # else it would stay while the next one is made
+        return file.is_new
+    metadata = _stated(provenance)
+    if form == "arrow":
+        metadata["digest"] = digest(table.schema, pieces_of(table))
+        if not force and _without_source(file_metadata(path, form) or {}) == _without_source(metadata):
             return False
+    with _publishing(path) as part:
+        if form == "arrow":
+            _write_arrow(part, table, metadata)
+            if verify(part, form) != table.num_rows:
+                raise _Different
+        else:
+            from mcaptrack.tables import text
+
+            text.write(part, pieces_of(table), form)
+    return True
+
+
+class _Different(Exception):
+    """A file does not hold what was written to it."""
+
+
+class _Unchanged(Exception):
+    """The file at its place has the same content already."""
+
+
+def _stated(provenance: Mapping[str, str]) -> dict[str, str]:
+    return {"table_version": TABLE_VERSION} | dict(provenance)
+
+
+@contextmanager
+def _publishing(path: Path) -> Iterator[Path]:
+    """A path to write a file to, which is published then. Raises McaptrackError if it can't be written."""
+    is_large = False
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with publish(path) as part:
-            if form == "parquet":
-                _write_parquet(part, table, metadata, order)
-            elif form == "arrow":
-                _write_arrow(part, table, metadata | {"digest": digest(table.schema, pieces_of(table))})
-            else:
-                from mcaptrack.tables import text
-
-                text.write(part, pieces_of(table), form)
+            yield part
             is_large = part.stat().st_size >= _BYTES_WORTH_RELEASING
-            if is_large:
-                _release()
-            try:
-                rows_read = verify(part, form) if form in _DESCRIBED else table.num_rows
-            except McaptrackError:
-                rows_read = -1
-            if rows_read != table.num_rows:
-                raise McaptrackError(
-                    f"{path} can't be written: what was written does not read back the same; the disk or the "
-                    "memory of this machine may be at fault"
-                )
+    except _Unchanged:
+        pass
+    except _Different:
+        raise McaptrackError(
+            f"{path} can't be written: what was written does not read back the same; the disk or the memory of this "
+            "machine may be at fault"
+        ) from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
     if is_large:
         _release()
-    return True
 
 
 def _release() -> None:
@@ -95,47 +114,118 @@ def _release() -> None:
     release_memory()
 
 
-def _describes(old: Mapping[str, str], new: Mapping[str, str]) -> bool:
-    """Whether metadata are equal apart from source and digest: the source may change while the content does not."""
-    apart = {"source": "", "digest": ""}
-    return {**old, **apart} == {**new, **apart}
+class _Stream(io.BufferedWriter):
+    """A new file, and the digest of what was written to it so far."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path, "xb"))
+        self.size, self.content = 0, hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        """Write bytes."""
+        self.size += len(data)
+        self.content.update(data)
+        return super().write(data)
 
 
-def _write_parquet(part: Path, table: Any, texts: Mapping[str, str], order: Sequence[str]) -> None:
-    import pyarrow.parquet as pq
+class ParquetTable:
+    """A Parquet file that is written piece by piece, and published when it is complete; arguments are as of ``write``.
 
-    content = _TableDigest(table.schema)
+    What was written is read back: all pages by their digest, and the values of the first rows.
+    """
 
-    metadata = {_PREFIX + key: value for key, value in texts.items()}
-    ways = [(name, "ascending") for name in order]
-    with part.open("xb") as stream:
-        writer = pq.ParquetWriter(
+    def __init__(
+        self, path: Path, schema: Any, provenance: Mapping[str, str], order: Sequence[str] = (), force: bool = False
+    ) -> None:
+        self.path, self.is_new = path, False
+        self._schema, self._order, self._force = schema, order, force
+        self._metadata = _stated(provenance)
+        self._rows, self._first = 0, schema.empty_table()
+        self._writer: Any = None
+
+    @contextmanager
+    def published(self) -> Iterator[None]:
+        """Publish the file when the block ends, unless there is one of the same content, or the block fails."""
+        with _publishing(self.path) as part:
+            with _Stream(part) as stream:
+                self._open(stream)
+                try:
+                    yield
+                    self._metadata["digest"] = stream.content.hexdigest()
+                    self._writer.add_key_value_metadata({_PREFIX + "digest": self._metadata["digest"]})
+                    self._writer.close()
+                except BaseException:
+                    # Closing it, also when it is deleted, would make half a table look complete.
+                    self._writer.is_open = False
+                    raise
+            old = file_metadata(self.path, "parquet") or {}
+            if not self._force and _without_source(old) == _without_source(self._metadata):
+                raise _Unchanged
+            if not self._is_in(part):
+                raise _Different
+            self.is_new = True
+
+    def _open(self, stream: Any) -> None:
+        import pyarrow.parquet as pq
+
+        ways = [(name, "ascending") for name in self._order]
+        self._writer = pq.ParquetWriter(
             stream,
-            table.schema.with_metadata(metadata),
+            self._schema.with_metadata({_PREFIX + key: value for key, value in self._metadata.items()}),
             compression="zstd",
             compression_level=_ZSTD_LEVEL,
-            sorting_columns=pq.SortingColumn.from_ordering(table.schema, ways) if ways else None,
+            sorting_columns=pq.SortingColumn.from_ordering(self._schema, ways) if ways else None,
             write_page_index=True,
             write_page_checksum=True,
             store_schema=True,
-            **_encodings(table.schema),
+            **_encodings(self._schema),
         )
+
+    def add(self, piece: Any) -> None:
+        """Write the next rows, an Arrow table, as a row group."""
+        if not self._rows:
+            self._first = piece.slice(
+                0, max(1, min(_ROWS_COMPARED, piece.num_rows * _BYTES_READ // max(piece.nbytes, 1)))
+            )
+        self._writer.write_table(piece, row_group_size=PIECE_ROWS)
+        self._rows += piece.num_rows
+
+    def _is_in(self, part: Path) -> bool:
+        """Whether a file holds what was written, as far as that is compared."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
         try:
-            with ThreadPoolExecutor(1) as worker:  # computes the digest while the file is written
-                for piece in pieces_of(table):
-                    is_large = piece.num_rows >= _ROWS_WORTH_A_THREAD
-                    added = worker.submit(content.add, piece) if is_large else None
-                    writer.write_table(piece, row_group_size=PIECE_ROWS)
-                    if added:
-                        added.result()
-                    else:
-                        content.add(piece)
-                    del piece  # else it would stay while the next one is made
-            writer.add_key_value_metadata({_PREFIX + "digest": content.hexdigest()})
-            writer.close()
-        except BaseException:
-            writer.is_open = False  # closing it, also when it is deleted, would make half a table look complete
-            raise
+            with part.open("rb") as stream, pq.ParquetFile(stream, page_checksum_verification=True) as file:
+                if _pages_digest(stream, file.metadata) != self._metadata["digest"]:
+                    return False
+                count = self._first.num_rows
+                batches = file.iter_batches(count, [0], use_threads=False) if count else iter(())
+                rows = pa.Table.from_batches([*islice(batches, 1)], file.schema_arrow)
+                is_same = digest(self._schema, [rows]) == digest(self._schema, [self._first])
+                return is_same and bool(file.metadata.num_rows == self._rows)
+        except pa.ArrowException:
+            return False
+
+
+def _pages_digest(stream: IO[bytes], about: Any) -> str:
+    """The digest of a Parquet file up to the end of its last page; ``about`` are its metadata."""
+    end = 4
+    if about.num_row_groups:
+        group = about.row_group(about.num_row_groups - 1)
+        for column in map(group.column, range(group.num_columns)):
+            begin = column.dictionary_page_offset or column.data_page_offset
+            end = max(end, begin + column.total_compressed_size)
+    content = hashlib.sha256()
+    stream.seek(0)
+    while block := stream.read(min(_BYTES_READ, end - stream.tell())):
+        content.update(block)
+    return content.hexdigest()
+
+
+def _without_source(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Metadata of a content: its source may change while it does not."""
+    return {name: text for name, text in metadata.items() if name != "source"}
 
 
 def _encodings(schema: Any) -> dict[str, Any]:
@@ -143,14 +233,27 @@ def _encodings(schema: Any) -> dict[str, Any]:
     import pyarrow as pa
 
     encodings, dictionaries = {}, []
-    for field in schema:
-        if pa.types.is_floating(field.type):
-            encodings[field.name] = "BYTE_STREAM_SPLIT"
-        elif (pa.types.is_integer(field.type) and field.type.bit_width >= 32) or pa.types.is_timestamp(field.type):
-            encodings[field.name] = "DELTA_BINARY_PACKED"
-        elif pa.types.is_string(field.type) or pa.types.is_dictionary(field.type):
-            dictionaries.append(field.name)
+    for name, kind in (leaf for field in schema for leaf in _leaves(field.name, field.type)):
+        if pa.types.is_floating(kind):
+            encodings[name] = "BYTE_STREAM_SPLIT"
+        elif (pa.types.is_integer(kind) and kind.bit_width >= 32) or pa.types.is_timestamp(kind):
+            encodings[name] = "DELTA_BINARY_PACKED"
+        elif pa.types.is_string(kind) or pa.types.is_dictionary(kind):
+            dictionaries.append(name)
     return {"use_dictionary": dictionaries, "column_encoding": encodings}
+
+
+def _leaves(name: str, kind: Any) -> Iterator[tuple[str, Any]]:
+    """The columns of a Parquet file that hold a column, also those in lists and structs, and their types."""
+    import pyarrow as pa
+
+    if pa.types.is_list(kind):
+        yield from _leaves(f"{name}.list.element", kind.value_type)
+    elif pa.types.is_struct(kind):
+        for field in kind:
+            yield from _leaves(f"{name}.{field.name}", field.type)
+    else:
+        yield name, kind
 
 
 def _write_arrow(part: Path, table: Any, texts: Mapping[str, str]) -> None:
@@ -191,42 +294,23 @@ def verify(path: Path, form: TableFormat = "parquet") -> int:
     stored = (file_metadata(path, form) or {}).get("digest")
     if stored is None:
         raise McaptrackError(f"{path} is no exported table: it has no digest")
-    rows = [0]
-
-    def counted(pieces: Iterable[Any]) -> Iterator[Any]:
-        for piece in pieces:
-            rows[0] += piece.num_rows
-            yield piece
-
     try:
-        if form == "parquet":
-            with path.open("rb") as stream, pq.ParquetFile(stream, page_checksum_verification=True) as file:
-                rows_read, groups = _rows_at_once(file.metadata), range(file.num_row_groups)
-                # One group after the other, because iterating over all of them keeps what was read.
-                batches = (
-                    pa.Table.from_batches([batch])
-                    for group in groups
-                    for batch in file.iter_batches(rows_read, row_groups=[group])
-                )
-                content = digest(file.schema_arrow, counted(batches))
-        else:
-            with path.open("rb") as stream:
+        with path.open("rb") as stream:
+            if form == "parquet":
+                about = pq.read_metadata(stream)
+                rows, content = about.num_rows, _pages_digest(stream, about)
+            else:
                 reader = pa.ipc.open_file(stream)
                 batches = (reader.get_batch(number) for number in range(reader.num_record_batches))
-                tables = (pa.Table.from_batches([batch]) for batch in batches)
-                content = digest(reader.schema, counted(tables))
+                total = _TableDigest(reader.schema)
+                for batch in batches:
+                    total.add(pa.Table.from_batches([batch]))
+                rows, content = total.rows, total.hexdigest()
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read back: {str(error).splitlines()[0]}") from None
     if content != stored:
         raise McaptrackError(f"{path} does not hold what was written to it; export it again")
-    return rows[0]
-
-
-def _rows_at_once(about: Any) -> int:
-    """The number of rows of a Parquet file to read at once: pictures take more memory than numbers."""
-    size = sum(about.row_group(number).total_byte_size for number in range(about.num_row_groups))
-    rows: int = about.num_rows * _BYTES_READ // max(size, 1)
-    return max(1, min(_ROWS_READ, rows))
+    return int(rows)
 
 
 def digest(schema: Any, pieces: Iterable[Any]) -> str:
@@ -241,18 +325,18 @@ class _TableDigest:
     """The digest of a table: ``add`` its pieces."""
 
     def __init__(self, schema: Any) -> None:
-        self._schema, self._columns, self._rows = schema, [_ColumnDigest() for _ in schema], 0
+        self._schema, self._columns, self.rows = schema, [_ColumnDigest() for _ in schema], 0
 
     def add(self, piece: Any) -> None:
         """Add the next rows, an Arrow table."""
         for column, values in zip(self._columns, piece.columns, strict=True):
             for chunk in values.chunks:
                 column.add(chunk)
-        self._rows += piece.num_rows
+        self.rows += piece.num_rows
 
     def hexdigest(self) -> str:
         """The digest of all added rows."""
-        total = hashlib.sha256(self._rows.to_bytes(8, "little"))
+        total = hashlib.sha256(self.rows.to_bytes(8, "little"))
         for field, column in zip(self._schema, self._columns, strict=True):
             total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
         return total.hexdigest()

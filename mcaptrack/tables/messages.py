@@ -19,6 +19,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
+from mcaptrack.log.messages import Payloads
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.foreign.flatten import UnreadMessages
 from mcaptrack.tables.build import Pointers, TablePieces, frames_table
@@ -26,7 +27,9 @@ from mcaptrack.tables.fields import RECORDING
 
 if TYPE_CHECKING:
     from mcaptrack.columns import ProtobufColumns, RosColumns
-    from mcaptrack.log.messages import Payloads
+
+_NOTHING: Final = np.empty(0, np.int64)
+_NO_MESSAGES: Final = Payloads(_NOTHING, np.empty(0, np.uint8), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 Path = tuple[str, ...]
 Columns = Mapping[Path, Any]
@@ -35,69 +38,116 @@ Flatten = Callable[[bytes], Mapping[Path, Any]]
 #: A part of flat messages ends after so many of them.
 _PART_MESSAGES: Final = 4096
 #: Bytes of rows after which a piece of the table ends, so that a table of pictures is made in pieces, too.
-_PIECE_BYTES: Final = 32 * 2**20
-
-
-class MessageFields(NamedTuple):
-    """The fields of a channel's messages: their types by path, those left out, and their columns, batch by batch."""
-
-    types: Mapping[Path, Any]
-    left_out: Sequence[Path]
-    columns: Callable[[], Iterator[tuple[int, Columns]]]
+PIECE_BYTES: Final = 32 * 2**20
 
 
 class MessageSource(NamedTuple):
-    """The messages of a channel, or of a part of it: their place for errors, their number, their bytes in batches, and
-    the function that decodes a single one.
+    """The messages of a channel, or of a part of it.
+
+    Attributes
+    ----------
+    topic, schema_name, file : str
+        ``file`` is the name of the file that holds them.
+    first, total : int
+        The number of messages of the channel before them, and theirs.
+    where : str
+        Their place for errors.
+    payloads : callable
+        Gives their bytes in batches; takes a function that is called with number and reason for those in damaged
+        chunks.
+    flatten : callable
+        Decodes a single one.
     """
 
-    where: str
+    topic: str
+    schema_name: str
+    file: str
+    first: int
     total: int
-    payloads: Callable[[], Iterator[Payloads]]
+    where: str
+    payloads: Callable[[Callable[[int, str], None]], Iterator[Payloads]]
     flatten: Flatten
 
 
-def messages_table(topic: str, schema_name: str, places: Pointers, fields: MessageFields) -> TablePieces:
-    """A channel as a table: time and place of each message, then its fields."""
-    import pyarrow as pa
+class MessagesTable(NamedTuple):
+    """A channel as a table, the paths of its fields, and of those that were left out."""
 
-    head = frames_table({topic: places}).drop_columns(["rows"])
-    names = dict.fromkeys(head.column_names, ())
-    columns = list(head.schema)
-    for path, kind in fields.types.items():
-        unit = "ns" if path[-1].endswith("_ns") else ""
-        metadata = {"unit": unit, "description": f"field {'.'.join(path)} of {schema_name or 'the message'}"}
-        name = _free_name("_".join(path), names)
-        columns.append(pa.field(name, kind, metadata=metadata | {"path": ".".join(path)}))
-    schema = pa.schema(columns)
+    pieces: TablePieces
+    fields: Sequence[Path]
+    left_out: Sequence[Path]
 
-    def pieces() -> Iterator[Any]:
-        low = 0
-        for count, values in fields.columns():
-            arrays = [values.get(path, pa.nulls(count, kind)) for path, kind in fields.types.items()]
-            yield pa.table([*head.slice(low, count).columns, *arrays], schema=schema)
-            low += count
 
-    return TablePieces(schema, head.num_rows, pieces, _PIECE_BYTES)
+class _Rows:
+    """Rows of messages: time and place of each, then its fields, of the types by path."""
+
+    def __init__(self, source: MessageSource, types: Mapping[Path, Any]) -> None:
+        import pyarrow as pa
+
+        self._source, self._types, self._done = source, types, source.first
+        head = self._head(_NO_MESSAGES).schema
+        names = dict.fromkeys(head.names, ())
+        columns = list(head)
+        for path, kind in types.items():
+            unit = "ns" if path[-1].endswith("_ns") else ""
+            metadata = {"unit": unit, "description": f"field {'.'.join(path)} of {source.schema_name or 'the message'}"}
+            name = _free_name("_".join(path), names)
+            columns.append(pa.field(name, kind, metadata=metadata | {"path": ".".join(path)}))
+        self.schema = pa.schema(columns)
+
+    def _head(self, messages: Payloads) -> Any:
+        count = len(messages.t_ns)
+        frame = np.arange(self._done, self._done + count)
+        places = Pointers(
+            self._source.file, messages.t_ns, frame, np.full(count, -1), messages.chunk_offset, messages.offset
+        )
+        return frames_table({self._source.topic: places}).drop_columns(["rows"])
+
+    def table(self, messages: Payloads, values: Columns) -> Any:
+        """The next messages as rows; fields without values are null."""
+        import pyarrow as pa
+
+        count = len(messages.t_ns)
+        arrays = [values.get(path, pa.nulls(count, kind)) for path, kind in self._types.items()]
+        out = pa.table([*self._head(messages).columns, *arrays], schema=self.schema)
+        self._done += count
+        return out
 
 
 # Messages with a definition
 
 
-def typed_fields(source: MessageSource, reader: RosColumns | ProtobufColumns) -> MessageFields:
-    """The fields of messages that are read as columns, or, where ``reader`` can't, each for itself."""
-    nothing = np.empty(0, np.int64)
-    types = {path: column.type for path, column in reader.read(np.empty(0, np.uint8), nothing, nothing).items()}
-    types = {path: kind for path, kind in types.items() if _has_fields(kind)}
+class TypedMessages:
+    """Messages that are read as columns batch by batch, or, where ``reader`` can't, each for itself."""
 
-    def columns() -> Iterator[tuple[int, Columns]]:
-        unread = UnreadMessages(source.where, source.total)
-        for batch in source.payloads():
-            unread.count(len(batch.t_ns))
-            yield len(batch.t_ns), _read(reader, batch, types, source.flatten, unread)
-        unread.warn("they have no values")
+    def __init__(self, source: MessageSource, reader: RosColumns | ProtobufColumns) -> None:
+        nothing = np.empty(0, np.int64)
+        types = {path: column.type for path, column in reader.read(np.empty(0, np.uint8), nothing, nothing).items()}
+        self.types = {path: kind for path, kind in types.items() if _has_fields(kind)}
+        self.source, self.reader, self._rows = source, reader, _Rows(source, self.types)
+        self.unread = UnreadMessages(source.where, source.total)
+        self.schema, self.left_out = self._rows.schema, list(reader.left_out)
 
-    return MessageFields(types, list(reader.left_out), columns)
+    def rows(self, batch: Payloads) -> Any:
+        """The next batch as a table. Raises McaptrackError if most messages so far can't be read."""
+        self.unread.count(len(batch.t_ns))
+        return self._rows.table(batch, _read(self.reader, batch, self.types, self.source.flatten, self.unread))
+
+    def warn(self) -> None:
+        """Warn of messages that could not be read, when all were."""
+        self.unread.warn("they have no values")
+
+
+def typed_table(described: TypedMessages) -> MessagesTable:
+    """The table of messages that are read as columns."""
+    source = described.source
+
+    def pieces() -> Iterator[Any]:
+        messages = TypedMessages(source, described.reader)
+        yield from map(messages.rows, source.payloads(messages.unread.lose))
+        messages.warn()
+
+    table = TablePieces(described.schema, source.total, pieces, PIECE_BYTES)
+    return MessagesTable(table, list(described.types), described.left_out)
 
 
 def _read(
@@ -113,7 +163,7 @@ def _read(
     from mcaptrack.columns import Malformed, Unsupported
 
     parts: list[tuple[Ints, Columns]] = []
-    todo = [np.arange(len(batch.t_ns))]
+    todo = [np.flatnonzero(batch.start >= 0)]
     while todo:
         rows = todo.pop()
         try:
@@ -151,7 +201,7 @@ def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: UnreadMessages)
         *(values[rows].tolist() for values in (batch.t_ns, batch.start, batch.end)), strict=True
     ):
         try:
-            yield flatten(batch.data[start:end].tobytes())
+            yield {} if start < 0 else flatten(batch.data[start:end].tobytes())
         except McaptrackError as error:
             unread.add(t_ns, str(error))
             yield {}
@@ -160,17 +210,31 @@ def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: UnreadMessages)
 # Messages without one
 
 
-def inferred_fields(source: MessageSource, wanted: Callable[[Path], bool], blobs: bool) -> MessageFields:
-    """The fields of messages by their values."""
+def inferred_table(source: MessageSource, wanted: Callable[[Path], bool], blobs: bool) -> MessagesTable:
+    """The table of messages without types: fields have those of their values."""
     stored, unread = _Stored(wanted, blobs), UnreadMessages(source.where, source.total)
-    for batch in source.payloads():
+    heads = [_NO_MESSAGES]
+    for batch in source.payloads(unread.lose):
         unread.count(len(batch.t_ns))
+        heads.append(batch._replace(data=_NO_MESSAGES.data))
         for row in _flat(batch, np.arange(len(batch.t_ns)), source.flatten, unread):
             stored.add(row)
     stored.close()
     unread.warn("they have no values")
     types = stored.types()
-    return MessageFields(types, list(stored.left_out), lambda: stored.columns(types))
+
+    head = Payloads(*map(np.concatenate, zip(*heads, strict=True)))
+
+    def pieces() -> Iterator[Any]:
+        rows, low = _Rows(source, types), 0
+        for count, columns in stored.columns(types):
+            part = slice(low, low + count)
+            places = head.chunk_offset[part], head.offset[part]
+            yield rows.table(Payloads(head.t_ns[part], head.data, head.start[part], head.end[part], *places), columns)
+            low += count
+
+    table = TablePieces(_Rows(source, types).schema, source.total, pieces, PIECE_BYTES)
+    return MessagesTable(table, list(types), list(stored.left_out))
 
 
 class _Stored:

@@ -64,7 +64,7 @@ class _LogTables:
 
     def channel(self, topic: str) -> Any:
         """The table of a channel; None if it does not exist."""
-        return self.contents.messages(topic)[0] if topic in self.opened.channels else None
+        return self.contents.messages(topic) if topic in self.opened.channels else None
 
     def channels(self) -> list[str]:
         """The channels that have tables of their own."""

@@ -11,6 +11,7 @@ same tables by pyarrow alone.
 from __future__ import annotations
 
 import argparse
+import heapq
 import importlib
 import importlib.util
 import tempfile
@@ -30,6 +31,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import mcaptrack
 from mcaptrack import log
+from mcaptrack.log.chunks import chunk_record, open_chunk
 
 STORE = get_typestore(Stores.LATEST)
 RANDOM = np.random.default_rng(1)
@@ -158,8 +160,11 @@ def compare(path: Path, name: str) -> None:
 
 
 def compare_export(paths: list[Path], folder: Path) -> None:
-    """All channels of a recording as Parquet, against its chunks and the same tables by pyarrow alone."""
-    robot = folder / "robot.mcap"
+    """All channels of a recording as Parquet, against its chunks and the same tables by pyarrow alone.
+
+    Their messages stand between each other, as a robot records them.
+    """
+    robot, streams = folder / "robot.mcap", []
     with robot.open("wb") as stream:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(profile="ros2")
@@ -170,18 +175,21 @@ def compare_export(paths: list[Path], folder: Path) -> None:
                 schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
                 encoding = "protobuf" if schema.encoding == "protobuf" else "cdr"
                 channel = writer.register_channel(f"/t{number}", encoding, schema_id)
-                for _, _, message in reader.iter_messages():
-                    writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
+                payloads = [message.data for _, _, message in reader.iter_messages()]
+                step_ns = 10**11 // len(payloads)
+                streams.append([(10**18 + n * step_ns, channel, n, data) for n, data in enumerate(payloads)])
+        for t_ns, channel, sequence, data in heapq.merge(*streams):
+            writer.add_message(channel, t_ns, data, t_ns, sequence)
         writer.finish()
     with mcaptrack.open(robot) as opened:
         tables = {topic: opened.table(topic) for topic in opened.topics}
 
     def alone() -> None:
         with log.read(robot) as opened:
-            for topic, table in tables.items():
-                for _ in opened.payloads(topic):
-                    pass
-                pq.write_table(table, folder / "alone.parquet", compression="zstd")
+            for chunk in opened.index.chunks:
+                open_chunk(opened.snapshot.source, chunk_record(opened.snapshot.source, chunk))
+        for table in tables.values():
+            pq.write_table(table, folder / "alone.parquet", compression="zstd")
 
     def export() -> None:
         mcaptrack.export(robot, folder / "tables", all_topics=True, force=True)

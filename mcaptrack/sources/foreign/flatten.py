@@ -79,8 +79,9 @@ class UnreadMessages:
 
     def __init__(self, where: str, total: int) -> None:
         self._where, self._total = where, total
-        self._seen = self._unread = 0
+        self._seen = self._unread = self._lost = 0
         self._first = (0, "")
+        self._damage = ""
 
     def count(self, messages: int) -> None:
         """Count messages that are read next."""
@@ -93,10 +94,20 @@ class UnreadMessages:
         if self._unread == self._total or (self._unread > _MOST_UNREAD and 2 * self._unread > self._seen):
             raise McaptrackError(f"{self._where}{self}")
 
+    def lose(self, messages: int, why: str) -> None:
+        """Count messages in a damaged chunk. Raises McaptrackError if all are."""
+        self._damage = self._damage or why
+        self._lost += messages
+        if self._lost == self._total:
+            raise McaptrackError(f"{self._where}: all of its {self._lost} messages are in damaged chunks ({why})")
+
     def warn(self, so: str) -> None:
         """Warn of them, if there are any, and ``so`` of what follows."""
         if self._unread:
             warn(f"{self._where}{self}; {so}", "lost")
+        if self._lost:
+            where = f"{self._lost} of {self._total} messages are in damaged chunks ({self._damage})"
+            warn(f"{self._where}: {where}; {so}", "lost")
 
     def __str__(self) -> str:
         many = f"; {self._unread} of {self._seen} messages are like this" if self._unread > 1 else ""

@@ -2,6 +2,7 @@
 
     <folder>/<table>/recording=<name of the log>/part-0.parquet
     <folder>/topics/<channel>/recording=<name of the log>/part-0.parquet     foreign channels, on request
+    <folder>/manifest/recording=<name of the log>/part-0.json                what these channels are
 
 Files that have not changed since the last export are not touched. ``recordings`` is written last: if its digest is that
 of the log, all tables are up to date.
@@ -23,12 +24,14 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import __version__, log, tables
 from mcaptrack.choices import TableFormat
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import place_of, sweep
+from mcaptrack.files import place_of, publish_bytes, sweep
 from mcaptrack.location import Location, Url, is_remote, local_name, parse
+from mcaptrack.log.messages import Span
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.tables import TABLES
+from mcaptrack.tables.export.channels import ChannelFile, write_in_one_pass
 from mcaptrack.tables.export.contents import (
     WHOLE,
     LogTables,
@@ -43,6 +46,8 @@ from mcaptrack.tables.files import FORMATS
 
 #: The folder of the tables of single channels.
 TOPICS: Final = "topics"
+#: The folder of what these tables are.
+MANIFEST: Final = "manifest"
 
 
 @dataclass
@@ -286,19 +291,42 @@ def _write_all(
     topics_before = job.known_topics()
     kept = (topic for topic in topics_before if topic in opened.channels)
     wanted = sorted({*topics, *kept, *job.contents.own_topics()})
-    total = len(TABLES) + len(wanted)
+    total, done = len(TABLES) + len(wanted), len(TABLES) - 1
     for count, name in enumerate(names, start=1):
         job.table(name)
         progress("export", count, total)
-    for count, topic in enumerate(wanted, start=len(TABLES)):
+
+    def fail(topic: str, error: McaptrackError) -> None:
+        if not are_all:
+            raise error
+        job.done.notes.append(f"{error}; it has no table")
+        job.reasons[topic] = str(error)
+        job.remove([topic])
+
+    passes: dict[Span, list[ChannelFile]] = {}
+    parts = {topic: part if topic in topics else topics_before.get(topic, WHOLE) for topic in wanted}
+    for topic, of_topic in parts.items():
+        channel = None
         try:
-            job.messages(topic, part if topic in topics else topics_before.get(topic, WHOLE))
+            channel = job.messages(topic, of_topic)
         except McaptrackError as error:
-            if not are_all:
-                raise
-            job.done.notes.append(f"{error}; it has no table")
-        progress("export", count, total)
+            fail(topic, error)
+        if channel is not None:
+            passes.setdefault((of_topic.start_ns, of_topic.end_ns), []).append(channel)
+        else:
+            done += 1
+            progress("export", done, total)
+    for span, channels in passes.items():
+
+        def tell(count: int, done: int = done) -> None:
+            progress("export", done + count, total)
+
+        write_in_one_pass(opened, channels, span, fail, tell)
+        done += len(channels)
+        for channel in channels:
+            job.finish(channel)
     job.remove([topic for topic in topics_before if topic not in wanted])
+    job.manifest(parts)
     job.table(last)
     progress("export", total, total)
 
@@ -310,6 +338,8 @@ class _Job:
     form: TableFormat
     force: bool
     done: Exported
+    #: Why channels have no table.
+    reasons: dict[str, str] = field(default_factory=dict)
 
     def path(self, *names: str) -> Path:
         return self.folder.joinpath(*names, f"recording={self.contents.recording}", f"part-0.{self.form}")
@@ -325,18 +355,38 @@ class _Job:
             self._write(name, path, pieces, metadata | ({"note": note} if note else {}), TABLES[name].order)
             self.done.notes += [f"{name}: {note}"] if note else []
 
-    def messages(self, topic: str, part: MessagesPart) -> None:
-        """Update the table of a channel."""
+    def messages(self, topic: str, part: MessagesPart) -> ChannelFile | None:
+        """Update the table of a channel, unless it can be written in one pass with others: then it comes back."""
         name = f"{TOPICS}/{topic_folder(topic)}"
         path = self.path(*name.split("/"))
-        metadata = {"topic": topic, "part": json.dumps(part), "source": self.contents.messages_source(topic, part)}
-        metadata_before = tables.file_metadata(path, self.form) or {}
-        if not self._stands(name, path, metadata["source"]):
+        metadata = {"topic": topic, "part": json.dumps(part), "source": self.contents.messages_digest(topic, part)}
+        if self._stands(name, path, metadata["source"]):
+            metadata_before = tables.file_metadata(path, self.form) or {}
+            self._note_left_out(topic, metadata_before.get("left_out", ""))
+            return None
+        messages = self.contents.typed_messages(topic, part) if self.form == "parquet" else None
+        if messages is not None:
+            left_out = [".".join(path) for path in messages.left_out]
+        else:
             pieces, left_out = self.contents.message_pieces(topic, part)
-            metadata |= {"left_out": ", ".join(left_out)} if left_out else {}
-            self._write(name, path, pieces, metadata, ("topic", "t_ns"))
-        left = metadata.get("left_out") or metadata_before.get("left_out")
-        self.done.notes += [f"{topic}: {left} left out, bytes; `blobs=True` keeps them"] if left else []
+        metadata |= {"left_out": ", ".join(left_out)} if left_out else {}
+        if messages is not None:
+            about = self._about(metadata, messages.source.total)
+            file = tables.ParquetTable(path, messages.schema, about, ("topic", "t_ns"), self.force)
+            return ChannelFile(messages, file)
+        self._write(name, path, pieces, metadata, ("topic", "t_ns"))
+        self._note_left_out(topic, metadata.get("left_out", ""))
+        return None
+
+    def finish(self, channel: ChannelFile) -> None:
+        """Note a table that was written in one pass with others."""
+        if channel.is_done:
+            name = f"{TOPICS}/{topic_folder(channel.topic)}"
+            self._note(name, channel.messages.source.total, channel.file.is_new)
+            self._note_left_out(channel.topic, ", ".join(".".join(path) for path in channel.messages.left_out))
+
+    def _note_left_out(self, topic: str, left_out: str) -> None:
+        self.done.notes += [f"{topic}: {left_out} left out, bytes; `blobs=True` keeps them"] if left_out else []
 
     def _stands(self, name: str, path: Path, source: str) -> bool:
         """Whether a table is up to date and may stay."""
@@ -350,10 +400,16 @@ class _Job:
 
     def _write(self, name: str, path: Path, pieces: object, metadata: dict[str, str], order: Sequence[str]) -> None:
         rows = pieces.num_rows  # type: ignore[attr-defined]  # a table, which only tables knows
-        metadata |= {"version": __version__, "recording": file_name(self.contents.opened.path), "rows": str(rows)}
-        if tables.write(path, pieces, metadata, order, self.form, self.force):
-            self.done.written.append(name)
+        self._note(name, rows, tables.write(path, pieces, self._about(metadata, rows), order, self.form, self.force))
+
+    def _about(self, metadata: dict[str, str], rows: int) -> dict[str, str]:
+        """The metadata of a table."""
+        recording = file_name(self.contents.opened.path)
+        return metadata | {"version": __version__, "recording": recording, "rows": str(rows)}
+
+    def _note(self, name: str, rows: int, is_written: bool) -> None:
         self.done.rows[name] = rows
+        self.done.written += [name] if is_written else []
 
     def known_topics(self) -> dict[str, MessagesPart]:
         """The channels of this log with tables of their own in the folder, and what these hold."""
@@ -389,8 +445,36 @@ class _Job:
         """Remove tables of channels that are gone, and folders that are empty then."""
         for topic in topics:
             path = self.path(TOPICS, topic_folder(topic))
-            path.unlink(missing_ok=True)
-            with suppress(OSError):
-                path.parent.rmdir()
-                path.parent.parent.rmdir()
-            self.done.removed.append(f"{TOPICS}/{topic_folder(topic)}")
+            if path.exists():
+                _remove(path)
+                self.done.removed.append(f"{TOPICS}/{topic_folder(topic)}")
+
+    def manifest(self, parts: Mapping[str, MessagesPart]) -> None:
+        """Write what channels with tables of their own are, and those of other software without, and why."""
+        path = self.path(MANIFEST).with_suffix(".json")
+        if not parts:
+            _remove(path)
+            return
+        rows = []
+        for topic in sorted({*parts, *self.contents.other_topics()}):
+            name = f"{TOPICS}/{topic_folder(topic)}"
+            file = self.path(*name.split("/"))
+            why = self.reasons.get(topic) or (None if topic in parts else "it was not asked for")
+            about = {} if why else tables.file_metadata(file, self.form) or {}
+            rows.append(
+                self.contents.manifest(topic, parts.get(topic, WHOLE))
+                | {"file": None if why else file.relative_to(self.folder).as_posix(), "rows": self.done.rows.get(name)}
+                | {"bytes": None if why else file.stat().st_size, "left_out": about.get("left_out"), "reason": why}
+            )
+        text = json.dumps(rows, indent=1, ensure_ascii=False).encode("utf-8", "backslashreplace")
+        if not path.is_file() or path.read_bytes() != text:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            publish_bytes(path, text)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, and its folders if they are empty then."""
+    path.unlink(missing_ok=True)
+    with suppress(OSError):
+        path.parent.rmdir()
+        path.parent.parent.rmdir()

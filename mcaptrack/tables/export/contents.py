@@ -8,7 +8,8 @@ import os
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property, partial
+from contextlib import suppress
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,9 +18,9 @@ from mcaptrack import __version__, evaluation, log, tables
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
-from mcaptrack.geometry.clocks import LAST_NS
+from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.location import Location, shortened
-from mcaptrack.log.messages import MessageLocations
+from mcaptrack.log.messages import Payloads
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
@@ -177,6 +178,19 @@ class MessagesPart(NamedTuple):
         return next(unknown, "")
 
 
+class Timing(NamedTuple):
+    """The times of messages: the number of those before, and theirs; times of the first and the last in ns, the largest
+    gap, and the rate by the usual step. None where there are too few.
+    """
+
+    first: int
+    messages: int
+    first_t_ns: int | None
+    last_t_ns: int | None
+    largest_gap_s: float | None
+    rate_hz: float | None
+
+
 #: All messages, and all fields but bytes.
 WHOLE: Final = MessagesPart()
 
@@ -196,6 +210,7 @@ class LogTables:
         self.recording = recording_name(opened.path)
         self._kept: dict[str, FrameColumns] = {}
         self._class_names: dict[str, dict[int, str]] = {}
+        self._timings: dict[tuple[str, int | None, int | None], Timing] = {}
         #: Notes about tables, by name.
         self.notes: dict[str, str] = {}
 
@@ -288,17 +303,16 @@ class LogTables:
 
     # Foreign channels
 
-    def messages_source(self, topic: str, part: MessagesPart) -> str:
+    def messages_digest(self, topic: str, part: MessagesPart) -> str:
         """A digest of the input of ``messages`` of a topic."""
-        places = self._pointers(topic, of_rows=False)
         # The table has the places of messages, so it changes when they move.
-        where = hashlib.sha256(places.chunk_offset.tobytes() + places.message_offset.tobytes()).hexdigest()
-        return _digest([topic, __version__, self.recording, places.file, self.opened.fingerprint(topic), where, *part])
+        where = hashlib.sha256(self.opened.chunk_offsets(topic).tobytes()).hexdigest()
+        file = file_name(self.opened.part(topic).path)
+        return _digest([topic, __version__, self.recording, file, self.opened.fingerprint(topic), where, *part])
 
-    def messages(self, topic: str, part: MessagesPart = WHOLE) -> tuple[Any, list[str]]:
-        """The messages of any channel as a flat table, and the fields that were left out; as ``message_pieces``."""
-        pieces, left_out = self.message_pieces(topic, part)
-        return pieces.table(), left_out
+    def messages(self, topic: str, part: MessagesPart = WHOLE) -> Any:
+        """The messages of any channel as a flat table; as ``message_pieces``."""
+        return self.message_pieces(topic, part)[0].table()
 
     def message_pieces(self, topic: str, part: MessagesPart = WHOLE) -> tuple[TablePieces, list[str]]:
         """The rows of a channel, or the messages of any other as a flat table; in pieces, and the fields left out.
@@ -307,29 +321,98 @@ class LogTables:
         """
         schema = self.opened.channel(topic).schema
         if schema is not None:
+            if part[1:] != WHOLE[1:]:
+                raise McaptrackError(
+                    f"{self.opened.path}: {topic} has rows; columns and times are chosen of channels of other software"
+                )
             return self._rows(schema, [topic]), []
+        messages = self.typed_messages(topic, part)
+        table = tables.typed_table(messages) if messages else self._inferred(topic, part)
+        if messages is None:
+            self._refuse_unknown(topic, part, [*table.fields, *table.left_out])
+        return table.pieces, [".".join(path) for path in table.left_out]
+
+    def typed_messages(self, topic: str, part: MessagesPart) -> tables.TypedMessages | None:
+        """The messages of a channel, if they can be read as columns; otherwise, and for rows, None.
+
+        Raises McaptrackError for columns that it does not have.
+        """
         from mcaptrack.columns import Unsupported
 
-        kind, where, span = (
-            message_type_of(self.opened, topic),
+        if self.opened.channel(topic).schema is not None:
+            return None
+        try:
+            reader = column_reader(message_type_of(self.opened, topic), part.wants, part.blobs)
+        except Unsupported:
+            return None
+        messages = tables.TypedMessages(self._source(topic, part), reader)
+        self._refuse_unknown(topic, part, [*messages.types, *messages.left_out])
+        return messages
+
+    def _inferred(self, topic: str, part: MessagesPart) -> tables.MessagesTable:
+        return tables.inferred_table(self._source(topic, part), part.wants, part.blobs)
+
+    def _refuse_unknown(self, topic: str, part: MessagesPart, fields: Collection[tuple[str, ...]]) -> None:
+        """Raise McaptrackError for a column that a channel does not have."""
+        if column := part.unknown(fields):
+            messages = self.typed_messages(topic, WHOLE)
+            everything = list(messages.types) if messages else self._inferred(topic, WHOLE).fields
+            names = list_names([".".join(path) for path in everything], _FIELDS_LISTED)
+            raise McaptrackError(f"{self.opened.path}: {topic} has no field {column}; it has {names}")
+
+    def _source(self, topic: str, part: MessagesPart) -> tables.MessageSource:
+        """The messages of a channel of other software that a table holds. Raises McaptrackError for bad times."""
+        span, timing = (part.start_ns, part.end_ns), self.timing(topic, part)
+
+        def payloads(lose: Callable[[int, str], None]) -> Iterator[Payloads]:
+            batches = self.opened.payloads_of([topic], *span, lambda _, count, why: lose(count, why))
+            return (batch for _, batch in batches)
+
+        return tables.MessageSource(
+            topic,
+            message_type_of(self.opened, topic).name,
+            file_name(self.opened.part(topic).path),
+            timing.first,
+            timing.messages,
             f"{self.opened.path}: {topic}",
-            (part.start_ns, part.end_ns),
+            payloads,
+            payload_decoder(self.opened, topic, flattener),
         )
-        flatten = payload_decoder(self.opened, topic, flattener)
-        places = self._pointers(topic, of_rows=False, span=span)
-        source = tables.MessageSource(where, len(places.t_ns), partial(self.opened.payloads, topic, *span), flatten)
 
-        def fields_of(wanted: MessagesPart) -> tables.MessageFields:
-            try:
-                return tables.typed_fields(source, column_reader(kind, wanted.wants, wanted.blobs))
-            except Unsupported:
-                return tables.inferred_fields(source, wanted.wants, wanted.blobs)
+    def timing(self, topic: str, part: MessagesPart) -> Timing:
+        """The times of the messages of a channel that a table holds. Raises McaptrackError for bad times."""
+        key = (topic, part.start_ns, part.end_ns)
+        if key not in self._timings:
+            times = self.opened.times(topic)
+            first = 0 if part.start_ns is None else int(np.searchsorted(times, part.start_ns))
+            last = len(times) if part.end_ns is None else int(np.searchsorted(times, part.end_ns))
+            times = times[first:last]
+            steps_ns = np.diff(times)
+            usual_ns = float(np.median(steps_ns)) if len(steps_ns) else 0.0
+            self._timings[key] = Timing(
+                first,
+                len(times),
+                int(times[0]) if len(times) else None,
+                int(times[-1]) if len(times) else None,
+                float(steps_ns.max()) / NS_PER_S if len(steps_ns) else None,
+                NS_PER_S / usual_ns if usual_ns else None,
+            )
+        return self._timings[key]
 
-        fields = fields_of(part)
-        if column := part.unknown([*fields.types, *fields.left_out]):
-            all_fields = list_names([".".join(path) for path in fields_of(WHOLE).types], _FIELDS_LISTED)
-            raise McaptrackError(f"{where} has no field {column}; it has {all_fields}")
-        return tables.messages_table(topic, kind.name, places, fields), [".".join(path) for path in fields.left_out]
+    def manifest(self, topic: str, part: MessagesPart) -> dict[str, Any]:
+        """The type of a channel, and the times of the messages in its table."""
+        channel = self.opened.channel(topic)
+        timing: dict[str, Any] = dict.fromkeys(Timing._fields) | {"messages": channel.messages}
+        with suppress(McaptrackError):  # messages later than 2262, or of several types
+            timing = self.timing(topic, part)._asdict()
+        del timing["first"]
+        return {
+            "topic": topic,
+            "schema": channel.schema_name or None,
+            "encoding": channel.message_encoding or None,
+            **timing,
+            "columns": list(part.columns) or None,
+        }
 
     # Parts of tables
 
@@ -396,20 +479,13 @@ class LogTables:
     def _note(self, name: str, note: str) -> None:
         self.notes[name] = "; ".join([*filter(None, [self.notes.get(name)]), note])
 
-    def _pointers(
-        self, topic: str, of_rows: bool = True, span: tuple[int | None, int | None] = (None, None)
-    ) -> Pointers:
-        places, low = self.opened.places(topic), 0
-        if span != (None, None):
-            first, last = (0 if span[0] is None else span[0]), (LAST_NS if span[1] is None else span[1])
-            low, high = np.searchsorted(places.t_ns, (first, last)).tolist()
-            places = MessageLocations(*(values[low:high] for values in places))
+    def _pointers(self, topic: str) -> Pointers:
+        places = self.opened.places(topic)
         file = file_name(self.opened.part(topic).path)
-        count = len(places.t_ns)
-        frame, rows = np.arange(low, low + count), np.full(count, -1)
+        frame, rows = np.arange(len(places.t_ns)), np.full(len(places.t_ns), -1)
         # Rows of 3D boxes are at their stamps: several messages may be one frame.
         has_rows = not foreign.holds_pictures(self.opened.channel(topic)) and not holds_boxes_3d(self.opened, topic)
-        if of_rows and has_rows:
+        if has_rows:
             frames = self._frames(topic)
             frame, rows = frames.numbers, np.diff(frames.ends)
         return Pointers(file, places.t_ns, frame, rows, places.chunk_offset, places.offset)
