@@ -193,7 +193,7 @@ def _cell(name: str, value: float | str, rivals: Sequence[Mapping[str, Any]]) ->
 
 
 def _compared(result: EvaluationRow) -> tuple[Any, ...]:
-    """What results have in common whose scores can be compared: also the rows of the ground truth."""
+    """The key of results with comparable scores: they have the same rows of ground truth."""
     rows = result.score.counts["TP"] + result.score.counts["FN"]
     return result.sequence, result.of_class, result.similarity, result.gate, rows
 

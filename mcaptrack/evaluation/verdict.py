@@ -1,4 +1,4 @@
-"""What scores say in a line or two: identities before and after re-tracking, and what forecasts are worth."""
+"""Scores in a few lines: identities before and after re-tracking, and forecasts beside constant velocity."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcaptrack.transforms import STAGES
 
 #: Similarities that are overlaps, as text.
 OVERLAPS: Final = {"iou": "IoU", "bev-iou": "BEV IoU", "3d-iou": "3D IoU"}
-#: Forecasts whose errors differ by less than this share are as good as each other.
+#: A smaller difference of errors, as a share, is no difference.
 _ALIKE: Final = 0.01
 
 
@@ -40,7 +40,7 @@ def main_results(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
 
 
 def matched_by(result: EvaluationRow) -> str:
-    """How ground truth and tracks were matched, as in "within 1 m" or "with IoU 0.5"."""
+    """The rule by which tracks match ground truth: "within 1 m" or "with IoU 0.5"."""
     overlap = OVERLAPS.get(result.similarity)
     return f"with {overlap} {result.gate:g}" if overlap else f"within {result.gate:g} m"
 
