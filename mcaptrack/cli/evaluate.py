@@ -142,7 +142,8 @@ def print_results(scores: Scores, all_gates: bool, verbose: bool) -> None:
     results = sorted(scores.results, key=lambda r: (r.sequence == COMBINED, r.sequence, r.similarity, r.gate))
     main = main_results(results)
     _print_scores(results if all_gates else main)
-    if not all_gates and (others := dict.fromkeys(_gate_cell(result) for result in results if result not in main)):
+    others = dict.fromkeys(gate for result in results if (gate := _gate_cell(result)) != _gate_cell(main[0]))
+    if others and not all_gates:
         show(f"matched {matched_by(main[0])}; --all has the scores of {', '.join(others)}, too")
     forecasts: dict[_Key, Displacement] = {}
     for result in results:
