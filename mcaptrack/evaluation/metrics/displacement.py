@@ -287,7 +287,7 @@ def combine_displacements(parts: list[Displacement]) -> Displacement:
     arrays = [name for name in ("d_obs_m2", "consistency_m", *ForecastErrors._fields) if name not in by_step]
     counts = {name: sum(getattr(part, name) for part in parts) for name in ("people", "false_forecasts", "frames")}
     values: dict[str, Any] = {name: pooled(name) for name in arrays} | counts
-    return Displacement(**values, **{name: padded(name) for name in by_step})
+    return Displacement(**values | {name: padded(name) for name in by_step})
 
 
 # Pairing of forecasts with people: at each time tracks and people are assigned by their last positions.
