@@ -153,7 +153,8 @@ def test_evaluate_gives_a_row_for_each_class_in_python_on_the_terminal_and_in_ta
     with pytest.raises(McaptrackError, match="no class 'bus' was scored by itself; there are person, cart"):
         scores.score("MOTA", of_class="bus")
     said = call("evaluate", str(path), "--gate-m", "1").out
-    assert [line.split()[1] for line in said.splitlines()[1:5]] == ["all", "mean", "person", "cart"]
+    assert said.startswith("within 1 m: IDF1 ")
+    assert [line.split()[1] for line in said.splitlines()[3:7]] == ["all", "mean", "person", "cart"]
     rows = json.loads(call("evaluate", str(path), "--gate-m", "1", "--json").out)["results"]
     assert [row["class"] for row in rows] == [None, "person", "cart"]
     lines = call("evaluate", str(path), "--gate-m", "1", "--csv").out.splitlines()

@@ -102,6 +102,9 @@ class TestCommands:
 class TestEvaluate:
     def test_scores_as_a_table(self, finished):
         out, _ = printed("evaluate", finished)
+        assert out.startswith("within 1 m: IDF1 ")
+        assert out.count("/camera/samples  ") == 2  # its scores, and its forecasts
+        out, _ = printed("evaluate", finished, "--all")
         for words in ("IDF1", "IoU 0.5", "0.5 m", "2 m", "/camera/retracks/online", "forecasts of", "ADE m"):
             assert words in out
 

@@ -124,12 +124,19 @@ def test_the_site_is_built_without_a_warning_and_has_every_page(tmp_path):
         )
 
 
+@thorough
+def test_pictures_and_numbers_are_those_that_are_made_now():
+    words = [sys.executable, "tools/readme.py", "--check"]
+    outcome = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+
+
 def test_the_readme_is_one_page():
     assert len(README.read_text().splitlines()) <= 150
 
 
 def test_the_two_commands_of_the_readme_are_those_of_the_makefile_and_of_ci():
-    assert re.findall(r"```sh\n(make \w+)\n```", README.read_text()) == ["make demo", "make test"]
+    assert re.findall(r"`(make \w+)`", README.read_text()) == ["make demo", "make test"]
     targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
     assert {"demo", "test"} <= targets
     assert "exec make test" in (ROOT / ".ci" / "run").read_text()

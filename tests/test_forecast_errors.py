@@ -19,8 +19,8 @@ from mcaptrack import log, notices, pipeline
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
-from mcaptrack.evaluation.forecasts import find_forecast_errors, smoothed_predictions
-from mcaptrack.evaluation.metrics.displacement import displacement, pair_forecasts
+from mcaptrack.evaluation.forecasts import find_forecast_errors, score_forecasts, smoothed_predictions
+from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement, pair_forecasts
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.predictions import forecast_to_rows
@@ -167,6 +167,24 @@ def evaluated(truth, tracks, made):
     options = EvaluateOptions(similarities=("metres",), gates_m=(1.0,))
     (result,) = evaluate([EvaluationInput("x", truth, [Candidate("t", None, tracks, made, "p")])], options).results
     return result.displacement and result.displacement.summary()
+
+
+@given(scene=scenes())
+def test_constant_velocity_beside_forecasts_is_what_its_predictor_scores(scene):
+    """Forecasts by ``cv`` score what stands beside them, and what stands beside others at the same times is the same."""
+    truth, tracks, _ = scene
+    made = [frame for (frame,) in Predict(predictor="cv", horizon_s=3 * STEP_S)(tracks)]
+    moved = [frame._replace(rows=frame.rows.copy()) for frame in made]
+    for frame in moved:
+        frame.rows["x_m"] += 1.0
+    scored = [score_forecasts(forecasts, tracks, truth, "p") for forecasts in (made, moved)]
+    if None in scored:
+        return
+    beside = [displacement.constant_velocity() for displacement in scored]
+    assert beside[0] == pytest.approx({name: scored[0].summary()[name] for name in ("ADE_m", "FDE_m")}, abs=1e-9)
+    assert beside[1] == pytest.approx(beside[0], abs=1e-9)
+    both = combine_displacements(scored).constant_velocity()
+    assert both == pytest.approx(beside[0], abs=1e-9)
 
 
 @given(scene=scenes(), seed=st.integers(0, 99))

@@ -13,7 +13,7 @@ import pytest
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
-from mcaptrack.predictors import OnClock, PeopleSeen, make
+from mcaptrack.predictors import OnClock, PeopleSeen, make, weights_sha256
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.onnx import are_covariances
@@ -80,6 +80,13 @@ class TestAgainstTorch:
             here = kind.of(Weights(Path("w"), tensors, card, "")).predict(part.past, part.known).mean
             here = here if kind is Red else here - part.past[:, -1:]
             np.testing.assert_allclose(here, there.numpy(), atol=2e-4)
+
+
+def test_a_blend_is_the_mean_of_the_network_and_of_constant_velocity():
+    blend, red, cv = (make(name, 12, 0.4).predict(PAST, KNOWN) for name in ("blend", "red", "cv"))
+    np.testing.assert_allclose(blend.mean, (red.mean + cv.mean) / 2, atol=1e-12)
+    np.testing.assert_array_equal(blend.cov, red.cov)
+    assert weights_sha256("blend") == weights_sha256("red")
 
 
 class TestShippedWeights:
@@ -172,9 +179,9 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("name", "said"),
         [
-            ("ret", r"no predictor is called ret; did you mean red\? there are red, social, cv, holt-cv, kalman, lstm, onnx;"),
-            ("red:", "or red:FILE, social:FILE, lstm:FILE, onnx:FILE, not red:"),
-            ("cv:file", "or red:FILE, social:FILE, lstm:FILE, onnx:FILE, not cv:file"),
+            ("ret", r"no predictor is called ret; did you mean red\? there are blend, red, social, cv, holt-cv, kalman, lstm, onnx;"),
+            ("red:", "or blend:FILE, red:FILE, social:FILE, lstm:FILE, onnx:FILE, not red:"),
+            ("cv:file", "or blend:FILE, red:FILE, social:FILE, lstm:FILE, onnx:FILE, not cv:file"),
             ("onnx", "predictor onnx needs a file, as in onnx:FILE"),
             (":x", ":x is not of the form module:Class"),
         ],

@@ -181,7 +181,7 @@ def test_errors_of_predictions_are_those_of_each_class_alone(passed):
     found = {name: rows[name].summary()["ADE_m"] for name in rows}
     assert min(found["car"], found["pedestrian"]) <= found[None] <= max(found["car"], found["pedestrian"])
     out = done("evaluate", passed, "--similarity", "metres").out
-    table = out[out.index("forecasts of") :].splitlines()
+    table = out[out.rindex("forecasts of") :].splitlines()
     assert table[0].split()[:3] == ["forecasts", "of", "class"]
     assert [tuple(line.split()[:2]) for line in table[1:4]] == [
         ("/lidar/samples", "all" if name is None else name) for name in rows

@@ -30,10 +30,11 @@ from mcaptrack.evaluation.metrics.displacement import TAU_M2, Forecasts, Positio
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
+from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, Predictor, make, predict_among
 from mcaptrack.predictors.tail_calibration import TABLES, counts_of
-from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.schema.framing import join_frames
+from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.framing import JoinedFrames, join_frames
 from mcaptrack.training.walks import walks
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
@@ -104,6 +105,11 @@ class _Kept:
         return self.inner.predict(xy_m, valid)
 
 
+def _keys(joined: JoinedFrames, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Step and track id of each row."""
+    return np.rint((joined.row_ns - start_ns) / (STEP_S * NS_PER_S)).astype(int), joined.rows["track_id"].astype(int)
+
+
 def distances(true: Positions, samples: list[Frame]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """For each predictor squared distances (N, T), and groups (N,), from samples and after re-tracking."""
     start = samples[0].t_ns
@@ -111,14 +117,14 @@ def distances(true: Positions, samples: list[Frame]) -> Iterator[tuple[str, np.n
     kept = run._forecasts._predictor = _Kept(run._forecasts._predictor)
     for frame in samples:
         run.step(frame)
-    online = list(run.outputs()[0])
-    joined = join_frames(TRACKS, online)
-    step = np.rint((joined.row_ns - start) / (STEP_S * NS_PER_S)).astype(int)
-    after = step, joined.rows["track_id"].astype(int), np.concatenate(kept.pasts), ~joined.rows["observed"]
+    online, forecasts = map(list, run.outputs())
+    joined, predicted = join_frames(TRACKS, online), join_frames(PREDICTIONS, forecasts)
+    tracked, is_first = _keys(joined, start), predicted.rows["step"] == 1
+    step, ids = (part[is_first] for part in _keys(predicted, start))
+    after = step, ids, np.concatenate(kept.pasts), ~joined.rows["observed"][find_rows(tracked, (step, ids))]
     for frames, (step, ids, past, coasts) in ((samples, histories(samples, PAST)), (online, after)):
         rows = join_frames(TRACKS, frames)
-        at = np.rint((rows.row_ns - start) / (STEP_S * NS_PER_S)).astype(int)
-        tracks = Positions(at, rows.rows["track_id"].astype(int), np.stack([rows.rows["x_m"], rows.rows["y_m"]], -1))
+        tracks = Positions(*_keys(rows, start), np.stack([rows.rows["x_m"], rows.rows["y_m"]], -1))
         for name in NAMES:
             predictor = make(name, STEPS, STEP_S)
             seen = past[:, -predictor.past :]

@@ -36,8 +36,8 @@ STEPS, STEP_S, ITERATIONS = 12, 0.4, 300
 NEAR_M = 1.5
 BOX = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad", "score", "class_id")
 STATES = ("standing", "moving")
-#: The default predictors of re-tracking and of predict; of others the distributions stay as they are.
-NAMES = ("kalman", "red")
+#: The default predictor and those beside it; of others the distributions stay as they are.
+NAMES = ("blend", "kalman", "red")
 
 
 def scene(seed: int):

@@ -24,7 +24,6 @@ ROOT = Path(__file__).resolve().parent.parent
 NOT_RUN = {
     "docker": "it needs Docker",
     "environment": "it changes the Python environment",
-    "make": "make installs packages; another job runs these targets",
     "minutes": "it takes minutes",
     "store": "it needs a bucket and its credentials",
     "torch": "it needs torch, several gigabytes",

@@ -1,12 +1,18 @@
-"""Run the commands of README.md as they are written, in an environment that begins empty.
+"""Run the commands of README.md as they are written; make its pictures and numbers, and those of docs/.
 
     python3 tools/readme.py FOLDER
+    .venv/bin/python tools/readme.py --write    # makes all pictures and numbers again
+    .venv/bin/python tools/readme.py --check    # compares them with what is made now
 
 FOLDER, which must not exist, gets a copy of the repository, an environment, and every file that the commands name:
 videos, labels and recordings of one drawn scene. All ``sh`` blocks run in their order, then all ``sql`` and ``python``
 blocks. The packages that the text asks for (`pip install ".[sql]"`) are installed without constraints, so in their
 newest releases. Needs nothing but Python 3.11 or later and a package registry. Prints what it leaves out, and why;
 exits with 1 and the output of the first command that fails.
+
+Pictures and numbers are of `mcaptrack demo` with its usual seed, and of ten seeds of each scene (demo_scores.json,
+which `tools/bench/demo.py` measures). Screenshots need Chromium; without it they are left out by name. A minute of one
+core.
 """
 
 from __future__ import annotations
@@ -18,7 +24,8 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 #: What isn't run, and why.
 LEFT_OUT = {
     r"make test": "it is run by itself",
+    r"pip install git\+https://.*": "the copy of the repository is installed",
     r"pip install -c constraints\.txt .*": "it would replace the newest releases",
     r'pip install "\.\[train\]"|mcaptrack train .*': "torch is several gigabytes",
 }
@@ -52,8 +60,15 @@ VISION = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder.resolve()
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--write", action="store_true", help="make pictures and numbers again")
+    parser.add_argument("--check", action="store_true", help="compare pictures and numbers with what is made now")
+    given = parser.parse_args()
+    if given.write or given.check:
+        return renew(given.write)
+    if given.folder is None:
+        parser.error("name a folder, or give --write or --check")
+    folder = given.folder.resolve()
     folder.mkdir(parents=True)
     work = copy_of_the_repository(folder / "mcaptrack")
     subprocess.run([sys.executable, "-m", "venv", folder / "env"], check=True)
@@ -61,10 +76,9 @@ def main() -> int:
     blocks = re.findall(r"^```(\w+)\n(.*?)^```$", text, re.S | re.M)
     asked = re.findall(r"`(pip install [^`]+)`", text)
     lines = [line for kind, block in blocks if kind == "sh" for line in block.splitlines() if line.strip()]
-    if "pip install ." not in lines:
-        raise SystemExit("README.md has no `pip install .`")
-    at = lines.index("pip install .") + 1
-    lines[at:at] = list(dict.fromkeys(asked))
+    if not lines[0].startswith("pip install "):
+        raise SystemExit("README.md doesn't begin with `pip install`")
+    lines[1:1] = ["pip install .", *dict.fromkeys(asked)]
     for line in lines:
         why = next((why for pattern, why in LEFT_OUT.items() if re.fullmatch(pattern, line)), None)
         if why:
@@ -118,6 +132,137 @@ def run(words: list[object], work: Path, folder: Path, also_good: set[int] = fro
     print(f"{monotonic() - begun:6.1f} s  {said}", flush=True)
     if done.returncode not in {0, *also_good} or "Traceback (most recent" in done.stdout:
         raise SystemExit(f"exit {done.returncode}\n{done.stdout}")
+
+
+# Pictures and numbers. What follows runs where mcaptrack and its dependencies are.
+
+#: How the picture of the README is drawn, and the size of the report's screenshot (px).
+PICTURE = "--compare --width 800 --start-s 26.5 --end-s 33 --max-fps 3"
+SCREENSHOT = (800, 1077)
+#: Pictures are alike if they differ by less than so many grey levels in the mean: encoders and fonts differ.
+ALIKE = {".gif": 3.0, ".jpg": 10.0}
+#: Sentences with numbers, and the page that each is on.
+SENTENCES = {
+    "README.md": (
+        "In {runs} runs of drawn scenes {before} identity switches become {after}; IDF1: {idf1_before} to {idf1_after}",
+        "SORT switches identities {switches_tracks} times in the whole scene, re-tracked tracks {switches} times",
+    ),
+    "docs/tutorial.md": (
+        "IDF1 rises from {was} to {now}, and identity switches fall from {switches_was} to {switches}.",
+    ),
+}
+
+
+def renew(writes: bool) -> int:
+    """Make all pictures and numbers, and write them, or say which differ; returns the exit code."""
+    differ = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        log = folder / "mcaptrack-demo" / "demo.mcap"
+        mcaptrack("demo", "-o", log.parent, "-q")
+        for made, path in pictures(log, folder):
+            if writes:
+                shutil.copy2(made, path)
+            elif not path.exists() or difference(made, path) > ALIKE[path.suffix]:
+                differ.append(str(path.relative_to(ROOT)))
+        for path, text in texts(log):
+            if writes:
+                path.write_text(text, encoding="utf-8")
+            elif path.read_text(encoding="utf-8") != text:
+                differ.append(str(path.relative_to(ROOT)))
+    print("\n".join(f"{path} differs; `tools/readme.py --write` makes it" for path in differ) or "all is as it is made")
+    return int(bool(differ))
+
+
+def mcaptrack(*words: object) -> str:
+    """What a command prints."""
+    command = [sys.executable, "-m", "mcaptrack", *map(str, words)]
+    return subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout
+
+
+def pictures(log: Path, folder: Path) -> Iterator[tuple[Path, Path]]:
+    """Pictures as they are made now, and where they stand."""
+    mcaptrack("render", log, "-o", folder / "demo.gif", *PICTURE.split(), "-q")
+    yield folder / "demo.gif", ROOT / "docs" / "demo.gif"
+    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if browser is None:
+        print("left out: docs/report.jpg (there is no Chromium)")
+        return
+    import cv2
+
+    mcaptrack("report", log, "-o", folder / "report.html", "-q")
+    size = "--window-size={},{}".format(*SCREENSHOT)
+    words = [
+        "--headless",
+        "--no-sandbox",
+        "--hide-scrollbars",
+        "--disable-gpu",
+        size,
+        f"--screenshot={folder}/report.png",
+    ]
+    subprocess.run([browser, *words, (folder / "report.html").as_uri()], check=True, capture_output=True)
+    cv2.imwrite(str(folder / "report.jpg"), cv2.imread(str(folder / "report.png")), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    yield folder / "report.jpg", ROOT / "docs" / "report.jpg"
+
+
+def difference(made: Path, path: Path) -> float:
+    """The mean difference of two pictures in grey levels; infinite if their sizes or numbers of pictures differ."""
+    import av
+    import numpy as np
+
+    both = []
+    for picture in (made, path):
+        with av.open(str(picture)) as container:
+            both.append(np.stack([frame.to_ndarray(format="gray") for frame in container.decode(video=0)]))
+    if both[0].shape != both[1].shape:
+        return float("inf")
+    return float(np.abs(both[0].astype(int) - both[1]).mean())
+
+
+def texts(log: Path) -> Iterator[tuple[Path, str]]:
+    """Pages, and their text with the numbers of now."""
+    import json
+
+    from mcaptrack.sources.demo import mean_and_range, read_scores
+
+    scenes = read_scores()["scenes"]
+    evaluated = ("evaluate", log, "--similarity", "metres", "--gate-m", "1")
+    rows = {row["tracks"]: row for row in json.loads(mcaptrack(*evaluated, "--json", "-q"))["results"]}
+    tracks, samples, retracks = (rows[f"/camera/{name}"] for name in ("tracks", "samples", "retracks"))
+    of_all = {
+        (mode, score): [value for scene in scenes.values() for value in scene[mode][score]]
+        for mode in ("SORT", "re-tracked")
+        for score in ("IDF1", "IDSW")
+    }
+    mean = {mode: 100 * sum(of_all[mode, "IDF1"]) / len(of_all[mode, "IDF1"]) for mode in ("SORT", "re-tracked")}
+    numbers = {
+        "runs": len(of_all["SORT", "IDSW"]),
+        "before": sum(of_all["SORT", "IDSW"]),
+        "after": sum(of_all["re-tracked", "IDSW"]),
+        "idf1_before": f"{mean['SORT']:.1f}",
+        "idf1_after": f"{mean['re-tracked']:.1f}",
+        "was": f"{100 * samples['IDF1']:.1f}",
+        "now": f"{100 * retracks['IDF1']:.1f}",
+        "switches_was": samples["IDSW"],
+        "switches": retracks["IDSW"],
+        "switches_tracks": tracks["IDSW"],
+    }
+    for name, sentences in SENTENCES.items():
+        text = (ROOT / name).read_text(encoding="utf-8")
+        for sentence in sentences:
+            pattern = re.sub(r"\\\{\w+\\\}", r"[\\d.,]*\\d", re.escape(sentence))
+            text, count = re.subn(pattern, sentence.format(**numbers), text)
+            if not count:
+                raise SystemExit(f"{name} has no sentence like: {sentence}")
+        if name == "README.md":
+            for scene, values in scenes.items():
+                cells = [mean_and_range(values[mode]["IDF1"], 100) for mode in ("SORT", "re-tracked")]
+                text = re.sub(rf"^\| `{scene}` \|.*$", f"| `{scene}` | {' | '.join(cells)} |", text, flags=re.M)
+        else:
+            # Tests print the block of another video, of which predictions may help more or less.
+            printed = re.sub(r"(constant velocity [\d.]+ m).*", r"\1...", mcaptrack(*evaluated, "-q"))
+            text = re.sub(r"```text\nwithin 1 m: .*?```", f"```text\n{printed}```", text, flags=re.S)
+        yield ROOT / name, text
 
 
 # The files that the commands name. What follows runs in the environment, where mcaptrack and its dependencies are.

@@ -321,8 +321,9 @@ def predict(
     Parameters
     ----------
     predictor : str or Transform, optional
-        "red" (the default), "social" (looks at other people), "kalman", "holt-cv", "cv", "lstm" (less exact than "cv"),
-        "red:FILE", "onnx:FILE", the name of an installed predictor, or "module:Class"; or a transform.
+        "blend" (the default: the mean of "red" and "cv"), "red", "social" (looks at other people), "kalman", "holt-cv",
+        "cv", "lstm" (less exact than "cv"), "red:FILE", "onnx:FILE", the name of an installed predictor, or
+        "module:Class"; or a transform.
     **options
         Options such as ``horizon_s``; `mcaptrack predict --help-all` lists them.
 

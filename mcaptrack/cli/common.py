@@ -73,7 +73,7 @@ class Talk:
     def say(self, line: str, level: Level = "info", event: str = "", **about: Any) -> None:
         """Print a line to stderr; see ``text.say``."""
         if not self.quiet:
-            self._stop()
+            self.clear()
             say(line, level, event, **about)
 
     def detail(self, line: str) -> None:
@@ -87,7 +87,7 @@ class Talk:
             self.say(line, "info", event, **about)
 
     def _hear(self, notice: Notice) -> None:
-        self._stop()
+        self.clear()
         _show_warning(notice)
 
     def progress(self, stage: str, done: float, total: float | None) -> None:
@@ -115,10 +115,11 @@ class Talk:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("{task.description:>8}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
         self._bar.start()
 
-    def _stop(self) -> None:
+    def clear(self) -> None:
+        """Remove the bar of progress from the terminal: something is printed, or all is done."""
         if self._bar is not None:
             self._bar.stop()
             self._bar, self._tasks = None, {}
@@ -130,7 +131,7 @@ class Talk:
             try:
                 yield self
             finally:
-                self._stop()
+                self.clear()
 
 
 class _Printer(logging.Handler):

@@ -129,6 +129,7 @@ class Once(Called[T]):
             arguments = self.arguments(names)
             with stdout_to_stderr():
                 done = common.with_progress(self.function, talk.progress)(**arguments)
+            talk.clear()
             self.print_result(done, talk)
         if code := self.code(done):
             raise typer.Exit(code)

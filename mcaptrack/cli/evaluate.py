@@ -11,23 +11,29 @@ from mcaptrack.api.options import FILES, SCORES, PathLike
 from mcaptrack.cli import common
 from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once, Printed
-from mcaptrack.cli.text import console, printable, say
+from mcaptrack.cli.text import print_table, printable, say, show, show_left_out
 from mcaptrack.errors import McaptrackError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
+    from rich.text import Text
 
     from mcaptrack import Scores
+    from mcaptrack.evaluation import EvaluationRow
     from mcaptrack.evaluation.metrics.displacement import Displacement
 
 #: Name of a sequence, topic of tracks and class, None for all classes.
 _Key = tuple[str, str, str | None]
 
-_COLUMNS: Final = ("MOTA", "IDF1", "HOTA", "IDSW", "FP", "FN", "Frag")
-_FORECAST_COLUMNS: Final = {
-    "ADE_m": "ADE m",
-    "FDE_m": "FDE m",
+_RATES: Final = ("MOTA", "IDF1", "HOTA")
+_COLUMNS: Final = (*_RATES, "IDSW", "FP", "FN", "Frag")
+#: Columns that a narrow terminal has no room for, the first to go first.
+_SPARE: Final = ("Frag", "sAMOTA", "FN", "FP", "HOTA", "AMOTA", "MOTA", "class")
+_SPARE_OF_FORECASTS: Final = ("drift m", "ADE m²", "false", "NLL", "in 90 %", "in 50 %", "class", "recall", "in 95 %")
+#: Columns of forecasts, and of constant velocity beside them, by the names of the scores; others are for ``--all``.
+_ERRORS: Final = {"ADE_m": "ADE m", "FDE_m": "FDE m"}
+_OF_CONSTANT_VELOCITY: Final = {"ADE_m": "CV: ADE m", "FDE_m": "CV: FDE m"}
+_FORECAST_COLUMNS: Final = {"recall": "recall", "coverage_95": "in 95 %"}
+_ALL_FORECAST_COLUMNS: Final = {
     "ADE_squared_m2": "ADE m²",
     "recall": "recall",
     "false_forecasts_per_frame": "false",
@@ -41,8 +47,6 @@ _FORECAST_COLUMNS: Final = {
 
 #: Columns of 3D tracks with scores, after the others.
 _AVERAGES: Final = ("AMOTA", "sAMOTA")
-#: Similarities that are overlaps, as the table names them.
-_OVERLAPS: Final = {"iou": "IoU", "bev-iou": "BEV IoU", "3d-iou": "3D IoU"}
 #: Keys of results that are no single value.
 _NESTED: Final = ("displacement", "class_means")
 
@@ -60,8 +64,11 @@ class Evaluate(Once["Scores"]):
             PathLike | None, Option(FILES, help="Draw the error of predictions over recall as an SVG.")
         ] = None
         csv: Annotated[bool, Option(FILES, help="Print rows for a spreadsheet.")] = False
+        all_gates: Annotated[
+            bool, Option(SCORES, flag="all", help="Print the scores at all gates, and all columns of forecasts.")
+        ] = False
 
-    most_used = ("truth", "topic", "similarity", "gate_m", "rules", "fail_under", "csv", "output", "force")
+    most_used = ("truth", "topic", "all_gates", "similarity", "gate_m", "fail_under", "csv", "output", "force")
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)
@@ -89,8 +96,11 @@ class Evaluate(Once["Scores"]):
             super().print_result(done, talk)
 
     def show(self, done: Scores, talk: common.Talk) -> None:
-        """Print a table, or rows of CSV."""
-        (_print_csv if self.values["csv"] else print_results)(done)
+        """Print a verdict and a table, or rows of CSV."""
+        if self.values["csv"]:
+            _print_csv(done)
+        else:
+            print_results(done, self.values["all_gates"], self.values["verbose"])
 
     def code(self, done: Scores) -> int:
         """Return the exit code, and print the scores that are below their limits."""
@@ -123,97 +133,131 @@ def _limit(text: str) -> tuple[str, float]:
         ) from None
 
 
-def print_results(scores: Scores) -> None:
-    """Print the scores as a table, and those of predictions below it."""
-    from rich.table import Table
+def print_results(scores: Scores, all_gates: bool, verbose: bool) -> None:
+    """Print the verdict, the scores as a table, and those of predictions below it."""
+    from mcaptrack.evaluation import COMBINED
+    from mcaptrack.evaluation.verdict import main_results, matched_by, verdict
 
-    out = console()
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    several = len({result.sequence for result in scores.results}) > 1
-    classes = any(result.of_class is not None for result in scores.results)
-    for name in (*(("sequence",) if several else ()), "tracks", *(("class",) if classes else ()), "by"):
-        table.add_column(name, no_wrap=True)
-    columns = (*_COLUMNS, *(_AVERAGES if any(result.averages for result in scores.results) else ()))
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
-    previous = None
-    for result in sorted(scores.results, key=lambda r: (r.sequence == "COMBINED", r.sequence, r.similarity, r.gate)):
-        row = result.to_json()
-        by = (
-            f"{_OVERLAPS[result.similarity]} {result.gate:g}"
-            if result.similarity in _OVERLAPS
-            else f"{result.gate:g} m"
-        )
-        if previous not in (None, (result.sequence, by)):
-            table.add_row()
-        previous = (result.sequence, by)
-        cells = [row.get(name, "") for name in columns]
-        numbers = [f"{100 * cell:.1f}" if isinstance(cell, float) else str(cell) for cell in cells]
-        first = [result.sequence] if several else []
-        own = [_class_cell(result.of_class)] if classes else []
-        table.add_row(*first, result.tracks, *own, by, *numbers)
-        if result.class_means is not None:
-            means = [f"{100 * result.class_means[name]:.1f}" if name in result.class_means else "" for name in columns]
-            table.add_row(*first, result.tracks, "mean of classes", by, *means)
-    out.print(table)
+    show(*verdict(scores.results), "")
+    results = sorted(scores.results, key=lambda r: (r.sequence == COMBINED, r.sequence, r.similarity, r.gate))
+    main = main_results(results)
+    _print_scores(results if all_gates else main)
+    others = dict.fromkeys(gate for result in results if (gate := _gate_cell(result)) != _gate_cell(main[0]))
+    if others and not all_gates:
+        show(f"matched {matched_by(main[0])}; --all has the scores of {', '.join(others)}, too")
     forecasts: dict[_Key, Displacement] = {}
-    for result in scores.results:
+    for result in results:
         if result.displacement is not None:
-            key = (result.sequence, result.tracks, result.of_class)
-            forecasts.setdefault(key, result.displacement)
+            forecasts.setdefault((result.sequence, result.tracks, result.of_class), result.displacement)
     if forecasts:
-        _print_forecasts(out, forecasts, several)
-        _print_reliability(out, forecasts, several)
+        show("")
+        _print_forecasts(forecasts, _ALL_FORECAST_COLUMNS if all_gates or verbose else _FORECAST_COLUMNS)
+    if verbose:
+        _print_reliability(forecasts)
 
 
-def _print_forecasts(out: Console, forecasts: Mapping[_Key, Displacement], several: bool) -> None:
-    """The errors of forecasts."""
-    table, first = _table_of_forecasts("forecasts of", forecasts, several)
-    for name in _FORECAST_COLUMNS.values():
-        table.add_column(name, justify="right", no_wrap=True)
+def _print_scores(results: Sequence[EvaluationRow]) -> None:
+    """The scores of tracks; the best rates of those with the same rows of ground truth are bold."""
+    keys = [(result.sequence, result.tracks, result.of_class) for result in results]
+    names, first = _first_columns("tracks", keys)
+    several_gates = len({(result.similarity, result.gate) for result in results}) > 1
+    columns = (*_COLUMNS, *(_AVERAGES if any(result.averages for result in results) else ()))
+    compared: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for result in results:
+        compared.setdefault(_compared(result), []).append(result.to_json())
+    rows: list[list[str | Text]] = []
+    previous = None
+    for key, result in zip(keys, results, strict=True):
+        by = _gate_cell(result)
+        if previous not in (None, (result.sequence, by)):
+            rows.append([])
+        previous = (result.sequence, by)
+        gate, own = ([by] if several_gates else []), result.to_json()
+        rivals = compared[_compared(result)]
+        rows.append([*first(key), *gate, *(_cell(name, own.get(name, ""), rivals) for name in columns)])
+        if (means := result.class_means) is not None:
+            cells = [f"{100 * means[name]:.1f}" if name in means else "" for name in columns]
+            rows.append([*first((*key[:2], "mean of classes")), *gate, *cells])
+    names += ["by"] if several_gates else []
+    left_out = print_table([*names, *columns], rows, columns, _present(_SPARE, [*names, *columns]))
+    show_left_out(left_out)
+
+
+def _cell(name: str, value: float | str, rivals: Sequence[Mapping[str, Any]]) -> str | Text:
+    """A score as text, bold if it is the best of several that differ."""
+    from rich.text import Text
+
+    text = f"{100 * value:.1f}" if isinstance(value, float) else str(value)
+    values = [rival[name] for rival in rivals] if name in _RATES else []
+    is_best = bool(values) and min(values) < max(values) == value
+    return Text(text, "bold") if is_best else text
+
+
+def _compared(result: EvaluationRow) -> tuple[Any, ...]:
+    """The key of results with comparable scores: they have the same rows of ground truth."""
+    rows = result.score.counts["TP"] + result.score.counts["FN"]
+    return result.sequence, result.of_class, result.similarity, result.gate, rows
+
+
+def _gate_cell(result: EvaluationRow) -> str:
+    from mcaptrack.evaluation.verdict import OVERLAPS
+
+    return f"{OVERLAPS[result.similarity]} {result.gate:g}" if result.similarity in OVERLAPS else f"{result.gate:g} m"
+
+
+def _print_forecasts(forecasts: Mapping[_Key, Displacement], more: Mapping[str, str]) -> None:
+    """The errors of forecasts, beside those of constant velocity for the same tracks; the smaller ones are bold."""
+    from rich.text import Text
+
+    names, first = _first_columns("forecasts of", forecasts)
+    numbers = [*_ERRORS.values(), *_OF_CONSTANT_VELOCITY.values(), *more.values()]
+    rows: list[list[str | Text]] = []
     for key, forecast in forecasts.items():
-        values = forecast.summary()
-        numbers = ["-" if values[name] is None else f"{values[name]:.3f}" for name in _FORECAST_COLUMNS]
-        table.add_row(*first(key), *numbers)
-    out.print()
-    out.print(table)
+        own, straight = forecast.summary(), forecast.constant_velocity()
+        pairs = [(own[name], straight[name]) for name in _ERRORS]
+        both = [
+            Text(_length(mine), "bold" if mine is not None and other is not None and mine < other else "")
+            for side in (pairs, [pair[::-1] for pair in pairs])
+            for mine, other in side
+        ]
+        rows.append([*first(key), *both, *(_length(own[name]) for name in more)])
+    show_left_out(print_table([*names, *numbers], rows, numbers, _present(_SPARE_OF_FORECASTS, [*names, *numbers])))
 
 
-def _print_reliability(out: Console, forecasts: Mapping[_Key, Displacement], several: bool) -> None:
+def _length(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def _print_reliability(forecasts: Mapping[_Key, Displacement]) -> None:
     """The share of true positions in the ellipses of each probability; nothing if no forecast has ellipses."""
     held = {key: displacement.reliability() for key, displacement in forecasts.items()}
-    levels = [f"in {100 * part['level']:g} %" for part in next((parts for parts in held.values() if parts), [])]
+    levels = [f"{100 * part['level']:g} %" for part in next((parts for parts in held.values() if parts), [])]
     if not levels:
         return
-    table, first = _table_of_forecasts("reliability of", forecasts, several)
-    for level in levels:
-        table.add_column(level, justify="right", no_wrap=True)
-    for key, parts in held.items():
-        table.add_row(*first(key), *([f"{part['held']:.3f}" for part in parts] or ["-"] * len(levels)))
-    out.print()
-    out.print(table)
+    names, first = _first_columns("true positions in", forecasts)
+    rows = [
+        [*first(key), *([f"{part['held']:.2f}" for part in parts] or ["-"] * len(levels))]
+        for key, parts in held.items()
+    ]
+    show("")
+    show_left_out(print_table([*names, *levels], rows, levels, [*levels[:-3], *_present(("class",), names)]))
 
 
-def _table_of_forecasts(
-    name: str, forecasts: Collection[_Key], several: bool
-) -> tuple[Table, Callable[[_Key], list[str]]]:
-    """An empty table of forecasts with its first columns, and the cells of these for each key."""
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    has_classes = any(of_class is not None for _, _, of_class in forecasts)
-    for column in (*(("sequence",) if several else ()), name, *(("class",) if has_classes else ())):
-        table.add_column(column, no_wrap=True)
+def _first_columns(name: str, keys: Collection[_Key]) -> tuple[list[str], Callable[[_Key], list[str]]]:
+    """The names of the first columns of a table of ``keys``, and a function that returns their cells for a key."""
+    has_sequences = len({sequence for sequence, _, _ in keys}) > 1
+    has_classes = any(of_class is not None for _, _, of_class in keys)
 
     def first(key: _Key) -> list[str]:
         sequence, tracks, of_class = key
-        return [*([sequence] if several else []), tracks, *([_class_cell(of_class)] if has_classes else [])]
+        of_class = "all" if of_class is None else of_class
+        return [*([sequence] if has_sequences else []), tracks, *([of_class] if has_classes else [])]
 
-    return table, first
+    return [*(["sequence"] if has_sequences else []), name, *(["class"] if has_classes else [])], first
 
 
-def _class_cell(name: str | None) -> str:
-    return "all" if name is None else printable(name)
+def _present(spare: Sequence[str], names: Collection[str]) -> list[str]:
+    return [name for name in spare if name in names]
 
 
 def _print_csv(scores: Scores) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Printed
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import console, show
+from mcaptrack.cli.text import print_table, show
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ def _as_json(checked: CheckResult) -> dict[str, object]:
 
 
 def _print_check(checked: CheckResult, quiet: bool) -> None:
-    from rich.table import Table
     from rich.text import Text
 
     if not quiet:
@@ -78,13 +77,11 @@ def _print_check(checked: CheckResult, quiet: bool) -> None:
     findings = [finding for finding in checked.findings if not quiet or finding.level == "error"]
     if not findings:
         return
-    table = Table(box=None, pad_edge=False)
-    for name, justify in (("", "left"), ("byte", "right"), ("times", "right"), ("kind", "left"), ("", "left")):
-        table.add_column(name, justify=justify, overflow="fold")  # type: ignore[arg-type]
-    for finding in findings:
-        style = "red" if finding.level == "error" else "yellow"
-        table.add_row(Text(finding.level, style), str(finding.where), str(finding.times), finding.kind, finding.words)
-    console().print(table)
+    rows = [
+        [Text(f.level, "red" if f.level == "error" else "yellow"), str(f.where), str(f.times), f.kind, f.words]
+        for f in findings
+    ]
+    print_table(("level", "byte", "times", "kind", "what"), rows, ("byte", "times"))
 
 
 class Recover(EachLog["LogRecovery"]):

@@ -214,6 +214,7 @@ class EachLog(Called[T]):
     def _process_here(self, path: Location, options: Mapping[str, Any], talk: common.Talk) -> T:
         with stdout_to_stderr():
             result: T = common.with_progress(self.function, talk.progress)(path, **options)
+        talk.clear()
         self.show(path, result, talk)
         state = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
         talk.event(f"{path}: {state}", "log", log=str(path), state=state)

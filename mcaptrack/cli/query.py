@@ -16,14 +16,12 @@ from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once, Printed
-from mcaptrack.cli.text import console, printable, show
+from mcaptrack.cli.text import console, print_table, printable, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url
 from mcaptrack.location import is_remote, parse
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from mcaptrack import TableList
 
 Form = Literal["table", "csv", "json", "jsonl", "parquet", "arrow"]
@@ -182,56 +180,38 @@ def _write(answer: Any, form: Form, output: Path | None, json: bool) -> None:
 
 def _print_answer(answer: Any, limit: int) -> str:
     """Print an answer as a table with the columns that fit; returns a note on what is not shown, or ""."""
+    from rich.text import Text
+
     from mcaptrack.tables import cells
 
     shown = min(limit or answer.num_rows, answer.num_rows)
-    numbers, rows = cells(answer, shown)
+    are_numbers, rows = cells(answer, shown)
     if answer.schema.names == _PLAN:
         show(*(line for row in rows for line in (row[1] or "").splitlines()))
         return ""
-    out, is_terminal = console(), sys.stdout.isatty()
-    widest = _WIDEST if is_terminal else _WIDEST_UNBROKEN
+    widest = _WIDEST if sys.stdout.isatty() else _WIDEST_UNBROKEN
     words = [[None if word is None else printable(word) for word in row] for row in rows]
-    rows = [[_cut(word, widest) for word in row] for row in words]
+    shown_rows = [[Text("null", "dim") if word is None else _cut(word, widest) for word in row] for row in words]
     names = [printable(name) for name in answer.schema.names]
-    fitting = _fitting(names, rows, out.width) if is_terminal else len(names)
-    out.print(_table(names[:fitting], numbers, rows))
+    numbers = {name for name, is_number in zip(names, are_numbers, strict=True) if is_number}
+    # Times in nanoseconds, where the same time is a column, too; then from the right.
+    twice = [name for name in names[1:] if name.endswith("_ns") and name.removesuffix("_ns") in names]
+    spare = [*reversed(twice), *(name for name in reversed(names[1:]) if name not in twice)]
+    left_out = print_table(names, shown_rows, numbers, spare, ruled=True)
+    without = ", ".join(name for name in names if name in left_out)
     cut = sum(word is not None and len(word) > widest for row in words for word in row)
     notes = {
         f"{cut} long value{'s are' if cut > 1 else ' is'} cut; --format json or csv has all of it": cut,
         f"the first {shown} of {answer.num_rows} rows; --rows 0 shows all": shown < answer.num_rows,
         "no rows": not answer.num_rows,
-        f"{fitting} of {len(names)} columns fit; without: {', '.join(names[fitting:])}": fitting < len(names),
+        f"{len(names) - len(left_out)} of {len(names)} columns fit; name those that you want, or see them with "
+        f"--format csv: {without}": bool(left_out),
     }
     return "; ".join(note for note, holds in notes.items() if holds)
 
 
-def _table(names: Sequence[str], are_numbers: Sequence[bool], rows: Sequence[Sequence[str | None]]) -> Table:
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for name, is_number in zip(names, are_numbers, strict=False):
-        justify: Literal["left", "right"] = "right" if is_number else "left"
-        table.add_column(name, justify=justify, no_wrap=not sys.stdout.isatty(), overflow="fold")
-    for row in rows:
-        table.add_row(*(Text("null", "dim") if word is None else word for word in row[: len(names)]))
-    return table
-
-
-def _cut(word: str | None, widest: int) -> str | None:
-    return word if word is None or len(word) <= widest else word[: widest - 1] + "\N{HORIZONTAL ELLIPSIS}"
-
-
-def _fitting(names: Sequence[str], rows: Sequence[Sequence[str | None]], width: int) -> int:
-    """Return the number of columns that fit into ``width`` characters, at least one."""
-    used = 0
-    for at, name in enumerate(names):
-        used += max([len(name), *(len(row[at] or "null") for row in rows)]) + 2
-        if used > width and at:
-            return at
-    return len(names)
+def _cut(word: str, widest: int) -> str:
+    return word if len(word) <= widest else word[: widest - 1] + "\N{HORIZONTAL ELLIPSIS}"
 
 
 def _print_tables(listed: TableList, json: bool) -> None:

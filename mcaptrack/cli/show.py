@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Printed
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import console, printable
+from mcaptrack.cli.text import console, print_table, printable, show_left_out
+from mcaptrack.geometry.clocks import FIRST_DATE_NS
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -102,8 +103,11 @@ class Export(EachLog["ExportResult"]):
         super().print_result(results, totals)
 
 
+#: Columns of the table of channels that a narrow terminal has no room for, the first to go first.
+_SPARE: Final = ("per second", "schema", "messages")
+
+
 def _print(data: dict[str, Any], verbose: bool) -> None:
-    from rich.table import Table
     from rich.text import Text
 
     out = console()
@@ -113,17 +117,15 @@ def _print(data: dict[str, Any], verbose: bool) -> None:
     out.print(f"starts at {_when(data['start_ns'])}" if data["messages"] else "no messages")
     if data["results"]:
         out.print(f"with results in {data['results']}")
-    table = Table(box=None, pad_edge=False)
-    for column in ("topic", "schema", "messages", "per second"):
-        is_number = column in ("messages", "per second")
-        table.add_column(column, justify="right" if is_number else "left", overflow="fold")
+    rows: list[Sequence[str | Text]] = []
     for camera, channel in _by_camera(data["channels"]):
         if camera is not None:
-            table.add_row(Text(camera, "bold"))
+            rows.append([Text(camera, "bold")])
         topic = channel["topic"] + ("  (replaced by the results)" if channel["replaced"] else "")
         rate = "" if channel["rate_hz"] is None else f"{channel['rate_hz']:.1f}"
-        table.add_row(topic, channel["schema"], f"{channel['messages']:,}", rate)
-    out.print(table)
+        rows.append([topic, channel["schema"], f"{channel['messages']:,}", rate])
+    names = ("topic", "schema", "messages", "per second")
+    show_left_out(print_table(names, rows, ("messages", "per second"), _SPARE))
     shown = {channel["topic"]: channel for channel in reversed(data["channels"]) if not channel["replaced"]}
     out.print(_lineage([*reversed(shown.values())], verbose))
     if data["frames"] is not None:
@@ -148,13 +150,11 @@ def _when(t_ns: int) -> str:
     """A time of a log: date and time if it is one, otherwise seconds."""
     from datetime import UTC, datetime
 
-    if t_ns < _FIRST_DATE_NS:
+    if t_ns < FIRST_DATE_NS:
         return f"{t_ns / 1e9:.3f} s"
     return f"{datetime.fromtimestamp(t_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S}.{t_ns % 10**9 // 10**6:03d} UTC"
 
 
-#: Earlier times are not dates but seconds since something began: the year 1980.
-_FIRST_DATE_NS: Final = 315_532_800 * 10**9
 #: Deepest level of drawn trees. Channels and frames below it are drawn at this level, beside their input or parent.
 _DEEPEST: Final = 30
 #: The most gaps, or jumps, of a frame that are shown one by one.

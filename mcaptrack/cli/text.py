@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from datetime import UTC, datetime
@@ -22,6 +22,7 @@ from mcaptrack.cli.flags import with_flags
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.text import Text
 
 WRONG_USAGE: Final = 2
 _STDOUT, _STDERR = 1, 2
@@ -122,3 +123,57 @@ def console() -> Console:
 
     width = None if sys.stdout.isatty() else _UNBROKEN
     return Plain(file=sys.stdout, width=width, markup=False, emoji=False, highlight=False)
+
+
+def print_table(
+    names: Sequence[str],
+    rows: Sequence[Sequence[str | Text]],
+    numbers: Collection[str] = (),
+    spare: Sequence[str] = (),
+    ruled: bool = False,
+) -> list[str]:
+    """Print a table of which no number is ever cut; returns the names of the columns that were left out.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of the columns.
+    rows : sequence of sequences
+        Their cells; a shorter row ends early, and an empty one is an empty line.
+    numbers : collection of str
+        Names of the columns of numbers. The others are broken over lines where even the least columns don't fit.
+    spare : sequence of str
+        Names of columns that are left out, in this order, as long as the table is wider than the terminal.
+    ruled : bool
+        Whether a line is drawn below the names.
+
+    """
+    from rich import box
+    from rich.cells import cell_len
+    from rich.table import Table
+
+    out = console()
+    cells = [[cell if isinstance(cell, str) else cell.plain for cell in row] for row in (names, *rows)]
+    widths = [max(cell_len(printable(row[at])) for row in cells if at < len(row)) for at in range(len(names))]
+    kept, left_out, between = list(range(len(names))), [], 3 if ruled else 2
+    for name in spare:
+        if sum(widths[at] + between for at in kept) - between <= out.width:
+            break
+        kept.remove(next(at for at in reversed(kept) if names[at] == name))
+        left_out.append(name)
+    table = Table(box=box.SIMPLE_HEAD if ruled else None, show_edge=False, pad_edge=False, header_style="bold")
+    for at in kept:
+        is_number = names[at] in numbers
+        justify: Literal["left", "right"] = "right" if is_number else "left"
+        least = widths[at] if is_number else None
+        table.add_column(names[at], justify=justify, overflow="fold", no_wrap=is_number, min_width=least)
+    for row in rows:
+        table.add_row(*(row[at] for at in kept if at < len(row)))
+    out.print(table)
+    return left_out
+
+
+def show_left_out(names: Sequence[str], where: str = "--json") -> None:
+    """Print which columns a table has no room for, and where they are."""
+    if names:
+        show(f"no room for {', '.join(names)}: a wider window, a pipe and {where} have all")

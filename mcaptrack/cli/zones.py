@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import mcaptrack
 from mcaptrack.cli import common
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import console, say
+from mcaptrack.cli.text import print_table, say, show_left_out
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -77,18 +77,13 @@ def zones_in_short(result: RunResult) -> str:
 
 def print_zones(result: RunResult) -> None:
     """Print a table of zones and one of lines, with a row for each channel of tracks."""
-    from rich import box
-    from rich.table import Table
-
     heads = {
         False: ("zone", "tracks of", "tracks", "visits", "entered", "left", "mean stay", "most inside"),
         True: ("line", "tracks of", "tracks", "forward", "backward"),
     }
     names = dict.fromkeys((total.zone, total.is_line) for totals in result.zones.values() for total in totals)
     for is_line, head in heads.items():
-        table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-        for place, name in enumerate(head):
-            table.add_column(name, justify="left" if place < 2 else "right", overflow="fold")
+        rows: list[tuple[str, ...]] = []
         for name, _ in (pair for pair in names if pair[1] == is_line):
             for topic, totals in result.zones.items():
                 counts = next((total for total in totals if (total.zone, total.is_line) == (name, is_line)), None)
@@ -97,6 +92,6 @@ def print_zones(result: RunResult) -> None:
                 stay = "" if counts.mean_dwell_s is None else f"{counts.mean_dwell_s:.1f} s"
                 of_zone = (counts.visits, counts.entered, counts.left, stay, counts.most_inside)
                 cells = (counts.tracks, *((counts.forward, counts.backward) if is_line else of_zone))
-                table.add_row(name, topic, *map(str, cells))
-        if table.row_count:
-            console().print(table)
+                rows.append((name, topic, *map(str, cells)))
+        if rows:
+            show_left_out(print_table(head, rows, head[2:], head[:1:-1], ruled=True))

@@ -193,6 +193,7 @@ class EvaluationRow:
         if self.displacement is not None:
             recall, ade = self.displacement.curve()
             out["displacement"] = self.displacement.summary() | {
+                "constant_velocity": self.displacement.constant_velocity(),
                 "reliability": self.displacement.reliability(),
                 "curve_recall": recall.tolist(),
                 "curve_ADE_m": ade.tolist(),

@@ -13,6 +13,8 @@ from fractions import Fraction
 from typing import Final
 
 NS_PER_S: Final = 1_000_000_000
+#: Earlier times are not dates but seconds since something began: the year 1980.
+FIRST_DATE_NS: Final = 315_532_800 * NS_PER_S
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 #: A longer time without frames is a jump of the clock, or a pause: nothing goes on after it, and its length has no
 #: effect. By default stages bridge at most 24 s (links by appearance); 60 s leaves room for options. An option that

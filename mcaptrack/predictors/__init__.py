@@ -52,7 +52,7 @@ __all__ = [
 #: ``red:FILE``, ``lstm:FILE``, ``onnx:FILE``.
 PredictorName = str
 #: The built-in predictors that need no file.
-NAMES: Final = ("cv", "holt-cv", "kalman", "lstm", "red", "social")
+NAMES: Final = ("blend", "cv", "holt-cv", "kalman", "lstm", "red", "social")
 #: Those that are less exact than ``cv`` on most recordings (docs/predictors.md).
 WEAK: Final = ("lstm",)
 
@@ -181,8 +181,8 @@ def warn_if_weak(name: PredictorName) -> None:
     """Warn that a predictor that comes with mcaptrack is less exact than constant velocity."""
     if name in WEAK:
         warn(
-            f"{name}, the paper's network, predicts less exactly than constant velocity (cv) on most recordings; red "
-            "predicts most exactly",
+            f"{name}, the paper's network, predicts less exactly than constant velocity (cv) on most recordings; "
+            "blend predicts better",
             "weak-predictor",
         )
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from mcaptrack.predictors.linear import LinearPredictor
 
 if TYPE_CHECKING:
+    from mcaptrack.predictors.blend import Blend
     from mcaptrack.predictors.lstm import Lstm
     from mcaptrack.predictors.onnx import Onnx
     from mcaptrack.predictors.red import Red
@@ -38,6 +39,13 @@ def red(steps: int, step_s: float, file: Path | None = None) -> Red:
     from mcaptrack.predictors.weights import SHIPPED, load
 
     return Red.of(load(file or SHIPPED / "red.safetensors"))
+
+
+def blend(steps: int, step_s: float, file: Path | None = None) -> Blend:
+    """The mean of ``red`` and ``cv``, with the weights of a file or those that come with mcaptrack."""
+    from mcaptrack.predictors.blend import Blend
+
+    return Blend(red(steps, step_s, file))
 
 
 def social(steps: int, step_s: float, file: Path | None = None) -> Social:

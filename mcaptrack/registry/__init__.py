@@ -83,6 +83,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "ground": "mcaptrack.transforms.ground:GroundTracker",
         },
         "predictor": {
+            "blend": "mcaptrack.predictors.built_in:blend",
             "red": "mcaptrack.predictors.built_in:red",
             "social": "mcaptrack.predictors.built_in:social",
             "cv": "mcaptrack.predictors.built_in:cv",

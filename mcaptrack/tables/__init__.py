@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
+from mcaptrack.geometry.clocks import FIRST_DATE_NS, NS_PER_S
 from mcaptrack.schema import Frame
 from mcaptrack.schema.framing import split_rows
 from mcaptrack.tables import text
@@ -198,6 +199,10 @@ def write_answer(path: Path, table: Any, form: str) -> None:
         raise McaptrackError(f"{path} can't be written: {reason}") from error
 
 
+#: The decimals of each unit of times.
+_DECIMALS: Final = {"s": 0, "ms": 3, "us": 6, "ns": 9}
+
+
 def cells(table: Any, limit: int) -> tuple[list[bool], list[list[str | None]]]:
     """The first rows of an answer for a terminal: which columns are numbers, and the texts of each row, None for
     null.
@@ -205,7 +210,11 @@ def cells(table: Any, limit: int) -> tuple[list[bool], list[list[str | None]]]:
     import pyarrow as pa
 
     numbers = [pa.types.is_integer(field.type) or pa.types.is_floating(field.type) for field in table.schema]
-    rows = text.rows(_for_text(table.slice(0, limit)))
+    shown = table.slice(0, limit)
+    for number, field in enumerate(shown.schema):
+        if pa.types.is_timestamp(field.type):
+            shown = shown.set_column(number, field.name, _times(shown.column(number)))
+    rows = text.rows(_for_text(shown))
     return numbers, [[_word(value) for value in row.values()] for row in rows]
 
 
@@ -225,6 +234,21 @@ def _word(value: Any) -> str | None:
         members = [f"{name}: {_word(member) or 'null'}" for name, member in value.items()]
         return f"{{{', '.join(members)}}}"
     return str(value)
+
+
+def _times(column: Any) -> Any:
+    """Times as text with the decimals that one of them needs; in seconds if none is a date."""
+    import pyarrow as pa
+
+    try:
+        t_ns = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64()).to_pylist()
+    except pa.ArrowInvalid:  # later than nanoseconds of 64 bits reach
+        return text.iso(column)
+    decimals = max((len(f"{t % NS_PER_S:09d}".rstrip("0")) for t in t_ns if t is not None), default=0)
+    if all(t is None or 0 <= t < FIRST_DATE_NS for t in t_ns):
+        return pa.array([None if t is None else f"{t / NS_PER_S:.{decimals}f} s" for t in t_ns], pa.string())
+    unit = next(unit for unit, digits in _DECIMALS.items() if decimals <= digits)
+    return text.iso(column.cast(pa.timestamp(unit, column.type.tz)))
 
 
 def _for_text(table: Any) -> Any:

@@ -72,9 +72,9 @@ class Predict:
     Parameters
     ----------
     predictor : str
-        Predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact
-        than cv; with other weights red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package; or
-        module:Class.
+        Predictor: blend, the mean of red and cv; red, cv, holt-cv, kalman; social, which looks at other people; or
+        lstm, which is less exact than cv; with other weights red:FILE and so on, onnx:FILE; one of an installed
+        package; or module:Class.
     horizon_s : float
         How far ahead to predict, in seconds.
     min_history : int
@@ -93,7 +93,7 @@ class Predict:
     [2.0, 2.4, 2.8]
     """
 
-    predictor: PredictorName = option("red", kind="predictor")
+    predictor: PredictorName = option("blend", kind="predictor")
     horizon_s: float = option(4.8, least=0.1, most=60.0)
     min_history: int = option(4, least=1, most=100)
     adapt: bool = option(True, ADAPT_HELP)

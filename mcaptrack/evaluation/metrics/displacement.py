@@ -186,6 +186,7 @@ class Displacement:
     frames: int
     consistency_m: Floats  # |P_t - P_t+1| over the shared steps of consecutive forecasts of one track
     error_m: Floats  # (P, T): distance of each step from the ground truth; NaN beyond the horizon of shorter forecasts
+    straight_error_m: Floats  # (P, T): the same if these tracks went on at constant velocity
 
     def curve(self, squared: bool = False) -> tuple[Floats, Floats]:
         """Recall (P,) and ADE (P,) in m, or squared in m^2: entry k is for the k + 1 pairs with the most similar pasts.
@@ -207,6 +208,15 @@ class Displacement:
     def errors_by_step(self, tau_m2: float = TAU_M2) -> Floats:
         """The distance of each step from the ground truth, (pairs, T) in m, for the pairs below a threshold."""
         return self.error_m[self.d_obs_m2 < tau_m2]
+
+    def constant_velocity(self, tau_m2: float = TAU_M2) -> dict[str, float | None]:
+        """ADE_m and FDE_m of constant velocity for the same tracks at the same times, as in ``summary``."""
+        away_m = self.straight_error_m[self.d_obs_m2 < tau_m2]
+        if not len(away_m):
+            return {"ADE_m": None, "FDE_m": None}
+        steps = np.isfinite(away_m).sum(axis=1)
+        last_m = away_m[np.arange(len(away_m)), steps - 1]
+        return {"ADE_m": float((np.nansum(away_m, axis=1) / steps).mean()), "FDE_m": float(last_m.mean())}
 
     def summary(self, tau_m2: float = TAU_M2) -> dict[str, float | None]:
         """Compute the scores at one threshold.
@@ -267,12 +277,17 @@ def combine_displacements(parts: list[Displacement]) -> Displacement:
     def pooled(name: str) -> Floats:
         return np.concatenate([getattr(part, name) for part in parts])
 
-    longest = max(part.error_m.shape[1] for part in parts)
-    away = [np.pad(p.error_m, ((0, 0), (0, longest - p.error_m.shape[1])), constant_values=np.nan) for p in parts]
-    arrays = [name for name in ("d_obs_m2", "consistency_m", *ForecastErrors._fields) if name != "error_m"]
+    def padded(name: str) -> Floats:
+        away = [getattr(part, name) for part in parts]
+        longest = max(part.shape[1] for part in away)
+        to_longest = [((0, 0), (0, longest - part.shape[1])) for part in away]
+        return np.concatenate([np.pad(*both, constant_values=np.nan) for both in zip(away, to_longest, strict=True)])
+
+    by_step = ("error_m", "straight_error_m")
+    arrays = [name for name in ("d_obs_m2", "consistency_m", *ForecastErrors._fields) if name not in by_step]
     counts = {name: sum(getattr(part, name) for part in parts) for name in ("people", "false_forecasts", "frames")}
     values: dict[str, Any] = {name: pooled(name) for name in arrays} | counts
-    return Displacement(**values, error_m=np.concatenate(away))
+    return Displacement(**values | {name: padded(name) for name in by_step})
 
 
 # Pairing of forecasts with people: at each time tracks and people are assigned by their last positions.
@@ -541,8 +556,27 @@ def displacement(
         false_forecasts=int(pairs.is_judged.sum() - (pairs.d_obs_m2 < tau_m2).sum()),
         frames=pairs.frames,
         consistency_m=_consistency_m(forecasts),
+        straight_error_m=_straight_error_m(tracks, forecasts, number, pairs.offset_m[is_known], t_obs),
         **errors._asdict(),
     )
+
+
+#: The steps back from which constant velocity is taken, as that of the predictor ``cv``.
+_VELOCITY_STEPS: Final = 3
+
+
+def _straight_error_m(tracks: Positions, forecasts: Forecasts, number: Ints, offset_m: Floats, t_obs: int) -> Floats:
+    """The errors (P, T) of constant velocity instead of the forecasts ``number`` (P,), which are off by ``offset_m``.
+
+    Each of them has ``t_obs`` past positions.
+    """
+    paths = _sorted_positions(tracks, fill=True)
+    place = paths.find(forecasts.id[number], forecasts.step[number])
+    steps = min(_VELOCITY_STEPS, t_obs - 1)
+    now, velocity = paths.xy_m[place], (paths.xy_m[place] - paths.xy_m[place - steps]) / max(steps, 1)
+    ahead = np.arange(1, forecasts.mean_m.shape[1] + 1)[:, None]
+    away = now[:, None] + ahead * velocity[:, None] - (forecasts.mean_m[number] - offset_m)
+    return np.asarray(np.hypot(away[..., 0], away[..., 1]))
 
 
 class ForecastErrors(NamedTuple):

@@ -10,8 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
-from mcaptrack.geometry.ragged import group_index
-from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, uses_people
+from mcaptrack.geometry.ragged import group_index, run_starts
+from mcaptrack.predictors import Forecast, Predictor, make, predict_together
+from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.position_noise import PAST, PositionNoise
 from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
@@ -178,16 +179,27 @@ class OnlineForecasts:
         done = 0
         while len(waiting.ids) - done >= least:
             end = done + _BATCH
-            if uses_people(self._predictor):  # whole steps, because their tracks are predicted together
+            if not isinstance(self._predictor, LinearPredictor):
                 end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
             ids, past, is_known, coasts, steps = taken(waiting, slice(done, end))
-            units = past / self._unit_m
-            people = PeopleSeen(units, is_known, steps, np.arange(len(ids)))
-            mean, cov = predict_among(self._predictor, units, is_known, people)
+            mean, cov = self._forecast(past / self._unit_m, is_known, steps)
             self._write(_Predicted(ids, past, coasts, mean * self._unit_m, cov * self._unit_m**2))
             done += len(ids)
         self._waiting = [taken(waiting, slice(done, None))]
         self._write(taken(self._left, slice(0)))  # frames without tracks
+
+    def _forecast(self, past: Floats, is_known: Bools, steps: Ints) -> Forecast:
+        """The forecasts of tracks, step by step unless the predictor is linear: the last digits of others depend on the
+        size of a batch, and so on later tracks.
+        """
+        if isinstance(self._predictor, LinearPredictor):
+            return self._predictor.predict(past, is_known)
+        begins = np.flatnonzero(run_starts(steps))
+        parts = [
+            predict_together(self._predictor, past[low:high], is_known[low:high])
+            for low, high in zip(begins, np.append(begins[1:], len(steps)), strict=True)
+        ]
+        return Forecast(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _write(self, new: _Predicted) -> None:
         """Write the frames that are complete with these predictions."""

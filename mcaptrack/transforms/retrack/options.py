@@ -57,8 +57,8 @@ class RetrackOptions:
     Parameters
     ----------
     predictor : str
-        Predictor: cv, holt-cv, kalman, red, social, which looks at other people, or lstm, which is less exact
-        than cv; red:FILE, social:FILE, lstm:FILE, onnx:FILE; one of an installed package, or module:Class.
+        Predictor: blend, the mean of red and cv; red, cv, holt-cv, kalman; social, which looks at other people; or
+        lstm, which is less exact than cv; red:FILE and so on, onnx:FILE; one of an installed package, or module:Class.
     horizon_s : float
         How far ahead to predict, in seconds.
     min_history : int
@@ -101,7 +101,7 @@ class RetrackOptions:
         Re-track also where no ground plane is known and the camera looks along the ground.
     """
 
-    predictor: PredictorName = option("kalman", kind="predictor", theme=_PREDICTIONS)
+    predictor: PredictorName = option("blend", kind="predictor", theme=_PREDICTIONS)
     horizon_s: float = option(4.8, least=0.1, most=60.0, theme=_PREDICTIONS)
     min_history: int = setting(2, least=1, most=100, theme=_PREDICTIONS)
     noise_m: float | None = option(None, least=0.0, theme=_MOTION)
@@ -360,6 +360,8 @@ class ConsistencyOptions(RetrackOptions):
         Whether a new track gets the past of its first observation: not at all, what no other track has, or all.
     """
 
+    #: Its covariances decide which tracks match, so that it isn't that of predictions alone.
+    predictor: PredictorName = option("kalman", kind="predictor", theme=_PREDICTIONS)
     distance: Distance = setting("mean", theme=_ASSOCIATION)
     max_distance: float = setting(3.0, least=0.0, theme=_ASSOCIATION)
     gate_m: float | None = setting(3.0, least=0.0, theme=_ASSOCIATION)
