@@ -133,10 +133,10 @@ class RetrackOptions:
     )
     latency_s: ClassVar[Mapping[str, float]] = MappingProxyType({"": float("inf"), "online": 0.0, "predictions": 0.0})
 
-    # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture, and
-    # how long ones are filled; whether ellipses of predictions follow the log, and the unit of offline tracks its speed; whether a sample that was
-    # assigned to two tracks stays with both; the descriptors of samples, if appearance is compared, and if it is
-    # stored.
+    # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture, and how
+    # long ones are filled; whether ellipses of predictions follow the log, and the unit of offline tracks its speed;
+    # whether a sample that was assigned to two tracks stays with both; the descriptors of samples, if appearance is
+    # compared, and if it is stored.
     links_in_picture: ClassVar[bool] = False
     filled_s: ClassVar[float] = 0.0
     follows_log: ClassVar[bool] = True
