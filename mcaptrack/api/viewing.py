@@ -104,7 +104,8 @@ def _report(opened: logs.Log) -> bytes:
 
 def _tables(address: Callable[[str], str], opened: logs.Log) -> bytes:
     contents = export.LogTables(opened)
-    filled = [(name, table) for name in tables.TABLES if (table := contents.table(name)).num_rows]
+    names = sorted(tables.TABLES, key=lambda name: name not in ("track_summary", "tracks"))
+    filled = [(name, table) for name in names if (table := contents.table(name)).num_rows]
     shown = [{"name": name, "html": arrow_html(table), "csv": address(name)} for name, table in filled]
     return render("tables.html", tables=shown, log=opened.path.name).encode()
 

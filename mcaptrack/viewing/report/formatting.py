@@ -129,7 +129,7 @@ def policy(script: str = "", more: str = "") -> str:
 def _printable(value: Any) -> Any:
     if value is None:
         raise ValueError("a template prints a value that is None")
-    if isinstance(value, str) and not isinstance(value, Markup):
+    if isinstance(value, str) and not isinstance(value, Markup) and not value.isprintable():
         return "".join(c if c.isprintable() or c in _BLANKS else "\N{REPLACEMENT CHARACTER}" for c in value)
     return value
 

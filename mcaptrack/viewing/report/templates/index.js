@@ -65,8 +65,9 @@ function list() {
   }));
   highlight();
 }
-function highlight() {
-  for (const button of by("events").querySelectorAll("button")) button.classList.toggle("now", Math.abs(button.at_s - at_s) < 0.051);
+function highlight() { // the last event of the two seconds before
+  const buttons = [...by("events").querySelectorAll("button")], at = buttons.findLast(one => one.at_s <= at_s + 0.001 && one.at_s > at_s - 2);
+  for (const button of buttons) button.classList.toggle("now", button === at);
 }
 for (const [k, one] of data.views.entries()) {
   const button = document.createElement("button");
