@@ -223,7 +223,7 @@ def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis
                 "name": name if len(name) <= _MAX_NAME else name[: _MAX_NAME - 1] + "…",
                 "before": at(before),
                 "after": at(after),
-                "values": [f"{100 * value:.1f} %" if axis.percent else f"{value:g}" for value in (before, after)],
+                "texts": [f"{100 * value:.1f} %" if axis.percent else f"{value:g}" for value in (before, after)],
             }
             for k, (name, before, after) in enumerate(rows)
         ],

@@ -58,8 +58,8 @@ ROLES: Final = {
 }
 #: What is added to the name of tracks at the video rate, beside those at the prediction rate that are compared.
 EVERY_PICTURE: Final = ", every picture"
-#: The channels of forecasts below the name of a camera, the best first.
-_FORECASTS: Final = ("retracks/predictions", "predictions")
+#: The channels of forecasts below the name of a camera, the best first, and the roles of their tracks.
+_FORECASTS: Final = {"retracks/predictions": "online", "predictions": "samples"}
 #: The number of events with thumbnails.
 _THUMBNAILS: Final = 12
 
@@ -444,7 +444,7 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
 
 def _forecast_scene(opened: log.Log, out: LogReport, pictures: Pictures) -> dict[str, Any] | None:
     """The forecasts of the time with the most of them, over its picture; None without forecasts or a ground plane."""
-    for below in _FORECASTS:
+    for below, role in _FORECASTS.items():
         channel = opened.channels.get(f"{out.prefix}/{below}")
         if channel is None or not channel.holds(PREDICTIONS):
             continue
@@ -457,12 +457,10 @@ def _forecast_scene(opened: log.Log, out: LogReport, pictures: Pictures) -> dict
         behind = moment_picture(pictures, chosen.t_ns) if chosen is not None and plane is not None else None
         if chosen is None or plane is None or behind is None:
             continue
-        provenance = Provenance.from_metadata(channel.metadata)
-        tracks = {track_set.topic: track_set for track_set in out.track_sets.values()}
-        past = tracks.get(provenance.input) if provenance else None
+        past = out.track_sets.get(role)
         future = out.track_sets["truth"].frames if "truth" in out.track_sets else []
         drawn = forecast_map(chosen.rows, past.frames if past else [], future, chosen.t_ns, behind, plane)
-        names = {"name": short(past.name), "role": past.role} if past else {"name": channel.topic, "role": "online"}
+        names = {"name": short(past.name) if past else channel.topic, "role": role}
         at = clock((chosen.t_ns - out.start_ns) / NS_PER_S)
         return drawn | names | {"t_ns": chosen.t_ns, "clock": at, "has_truth": bool(future)}
     return None

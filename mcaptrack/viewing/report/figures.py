@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -90,10 +90,9 @@ def _with_paths(sets: Sequence[TrackSet], paths: Sequence[list[TrackPath]]) -> l
 
 
 def _map(report: LogReport, tracks: TrackSet, paths: Sequence[TrackPath], values: dict[str, Any]) -> dict[str, Any]:
-    joined = _joined(report) if tracks.role in _TRACKER else {}
+    joined = _joined(report)
     for path in values["tracks"]:
-        keys = () if path["id"] is None else (track_key(tracks.role, path["id"]), *joined.get(path["id"], ()))
-        path["key"] = " ".join(keys)
+        path["key"] = "" if path["id"] is None else _keys(tracks.role, path["id"], joined)
     return values | {"name": short(tracks.name), "role": tracks.role, "count": counted(len(paths), "track")}
 
 
@@ -109,6 +108,11 @@ _MOST_ROWS: Final = 200
 def track_key(role: str, identity: int) -> str:
     """The key of a track. Samples of tracks have the same ids."""
     return f"{'tracks' if role in _TRACKER else role}-{identity}"
+
+
+def _keys(role: str, identity: int, joined: Mapping[int, Sequence[str]]) -> str:
+    """The key of a track, and those of the re-tracked tracks that it is part of."""
+    return " ".join([track_key(role, identity), *(joined.get(identity, ()) if role in _TRACKER else ())])
 
 
 def _joined(report: LogReport) -> dict[int, list[str]]:
@@ -280,9 +284,9 @@ def identity_timeline(report: LogReport) -> dict[str, Any]:
     scored = [(report.track_sets[role], report.people[role]) for role in report.compared_roles if role in report.people]
     rows = _of_people(report, [(side.role, people) for side, people in scored]) if scored else _of_tracks(report)
     kept = sorted(sorted(rows, key=lambda row: -row["seconds"])[:_MOST], key=lambda row: row["begins"])
-    headline = report.headline
+    headline, joined = report.headline, _joined(report)
     return {
-        "rows": [{**row, "lanes": [_lane(lane, span_s, row["key"]) for lane in row["lanes"]]} for row in kept],
+        "rows": [{**row, "lanes": [_lane(lane, span_s, joined) for lane in row["lanes"]]} for row in kept],
         "left_out": len(rows) - len(kept),
         "has_truth": bool(scored),
         "lanes": [
@@ -327,7 +331,6 @@ def _of_tracks(report: LogReport) -> list[dict[str, Any]]:
         _row(
             track,
             [("tracks", pieces(_known(sources[low:high], track), t_ns[low:high], report.start_ns, interval_ns))],
-            track_key(role, track),
         )
         for track, low, high in _groups(rows["track_id"])
     ]
@@ -344,11 +347,10 @@ def _known(source: Ints, track: int) -> Ints:
     return source[with_id[np.maximum(np.searchsorted(with_id, np.arange(len(source)), "right") - 1, 0)]]
 
 
-def _row(identity: int, lanes: list[tuple[str, list[IdentitySpan]]], key: str = "") -> dict[str, Any]:
+def _row(identity: int, lanes: list[tuple[str, list[IdentitySpan]]]) -> dict[str, Any]:
     whole = lanes[0][1]
     seconds = sum(piece.last_s - piece.first_s for piece in whole)
-    begins = whole[0].first_s if whole else 0.0
-    return {"name": str(identity), "seconds": seconds, "begins": begins, "lanes": lanes, "key": key}
+    return {"name": str(identity), "seconds": seconds, "begins": whole[0].first_s if whole else 0.0, "lanes": lanes}
 
 
 def _groups(ids: Any) -> Iterator[tuple[int, int, int]]:
@@ -362,10 +364,10 @@ def _interval_ns(t_ns: Ints) -> float:
     return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else NS_PER_S / 10
 
 
-def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float, key: str) -> dict[str, Any]:
+def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float, joined: Mapping[int, Sequence[str]]) -> dict[str, Any]:
     """A lane as coordinates in percent; pieces that are too short to be seen are drawn a little longer.
 
-    ``key`` is that of its row, if all of the row is one track.
+    ``joined`` are the keys of the re-tracked tracks that a track of the tracker is part of.
     """
     role, spans = lane
     out = []
@@ -378,7 +380,7 @@ def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float, key: str) -> dict
                 "x": f"{left:.2f}%",
                 "width": f"{width:.2f}%",
                 "colour": piece.identity % COLOURS,
-                "key": f"{key} {track_key(role, piece.identity)}".strip(),
+                "key": _keys(role, piece.identity, joined),
                 "title": f"{piece.identity}: {seconds}",
                 "label": str(piece.identity) if width >= _WIDE else "",
                 "label_x": f"{left + 0.4:.2f}%",
