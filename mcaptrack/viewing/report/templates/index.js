@@ -83,4 +83,4 @@ by("which").hidden = topics.length < 2;
 by("which").addEventListener("change", list);
 for (const button of document.querySelectorAll("[role=tab]")) button.addEventListener("click", () => open(button.getAttribute("aria-controls")));
 list(); link();
-look(0);
+if (data.views.length) look(0); else by("waiting").textContent = "There are no pictures or tracks to show.";
