@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -125,17 +125,13 @@ class Tab:
 def browser() -> Iterator[Tab]:
     """Start a browser with one page."""
     to_browser, from_browser = os.pipe(), os.pipe()
-
-    def as_expected() -> None:  # the browser reads its third descriptor, and writes to its fourth
-        os.dup2(os.dup(to_browser[0]), 3)
-        os.dup2(os.dup(from_browser[1]), 4)
-
-    before: Callable[[], None] = as_expected
+    # The browser reads from descriptor 3, and writes to descriptor 4.
+    wrapped = ["sh", "-c", f'exec "$@" 3<&{to_browser[0]} 4>&{from_browser[1]}', "sh"]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         assert PROGRAM
-        command = [PROGRAM, *_FLAGS, f"--user-data-dir={folder}"]
+        command = [*wrapped, PROGRAM, *_FLAGS, f"--user-data-dir={folder}"]
         silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        with subprocess.Popen(command, **silent, preexec_fn=before, close_fds=False) as process:
+        with subprocess.Popen(command, **silent, pass_fds=(to_browser[0], from_browser[1])) as process:
             os.close(to_browser[0])
             os.close(from_browser[1])
             try:

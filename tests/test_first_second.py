@@ -64,7 +64,8 @@ def test_each_switch_and_repair_has_a_link_a_second_before_the_track_was_lost(se
     for one in served.events:
         assert opened_at(one.link) == pytest.approx(one.t_ns / 1e9 - 1 - one.unseen_s, abs=1e-6)
         assert f"at {one.t_ns / 1e9:.1f} s" in one.text
-        assert one.link.split("&time=")[0] == served.links["Lichtblick"].split("&time=")[0]
+        (layout,) = parse_qs(urlsplit(one.link).query)["layoutUrl"]
+        assert layout == served.layouts["tracking" if "retracks" in one.topic else "comparing"]
 
 
 def test_viewers_open_where_tracks_are_and_all_links_agree(served):

@@ -340,11 +340,11 @@ class TestTables:
 
 
 class TestReport:
-    def test_a_report_is_shown_as_it_is_without_scripts(self, finished, tmp_path):
+    def test_a_report_is_shown_as_it_is_without_an_origin(self, finished, tmp_path):
         made = mcaptrack.report(finished, tmp_path / "page.html")
         (frame,) = Reader(made._repr_html_()).of("iframe")
         assert frame["srcdoc"] == made.page.read_text(encoding="utf-8")
-        assert "allow-scripts" not in frame["sandbox"]
+        assert frame["sandbox"] == "allow-scripts allow-downloads"
         made.page.write_bytes(b" " * 8_000_001)
         assert "too large to show here" in made._repr_html_()
         made.page.unlink()

@@ -90,7 +90,7 @@ def _base64(data: bytes) -> str:
 
 
 def framed_html(page: str | None, caption: str) -> str:
-    """Return a page without scripts in a frame, with a caption; the caption alone without a page."""
+    """Return a page in a frame, without an origin, with a caption; the caption alone without a page."""
     return str(render("framed.html", page=page or "", caption=caption))
 
 
