@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +23,15 @@ _FLAGS = (
     *("--disable-background-networking", "--disable-features=IsolateSandboxedIframes", "--disable-dev-shm-usage"),
     *("--remote-debugging-pipe", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"),
 )
+
+#: Runs the browser with the pipes where it expects them: it reads from descriptor 3, and writes to descriptor 4.
+_WRAPPER = """
+import fcntl, os, sys
+ends = [fcntl.fcntl(int(one), fcntl.F_DUPFD, 10) for one in sys.argv[1:3]]
+for end, at in zip(ends, (3, 4)):
+    os.dup2(end, at)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
 
 
 class Tab:
@@ -125,8 +135,7 @@ class Tab:
 def browser() -> Iterator[Tab]:
     """Start a browser with one page."""
     to_browser, from_browser = os.pipe(), os.pipe()
-    # The browser reads from descriptor 3, and writes to descriptor 4.
-    wrapped = ["sh", "-c", f'exec "$@" 3<&{to_browser[0]} 4>&{from_browser[1]}', "sh"]
+    wrapped = [sys.executable, "-c", _WRAPPER, str(to_browser[0]), str(from_browser[1])]
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         assert PROGRAM
         command = [*wrapped, PROGRAM, *_FLAGS, f"--user-data-dir={folder}"]

@@ -194,8 +194,8 @@ class LogServer:
         """Return our pages on a log, by name."""
         made = partial(_FromLog, contents.path)
         pages = {
-            f"{_FOLDER}/player-{number}.html": Page(made(partial(_player, *what)), policy("player.js"))
-            for number, (_, *what) in enumerate(contents.views)
+            f"{_FOLDER}/player-{number}.html": Page(made(partial(_player, camera, is_above)), policy("player.js"))
+            for number, (_, camera, is_above) in enumerate(contents.views)
         }
         pages[f"{_FOLDER}/report.html"] = Page(made(_report), policy("report.js"))
         pages[f"{_FOLDER}/tables.html"] = Page(made(partial(_tables, "{}.csv".format)), policy())
