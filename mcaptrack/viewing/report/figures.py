@@ -176,7 +176,7 @@ def _event(event: IdentityEvent, text: str, report: LogReport, role: str) -> dic
     others = [(role, "track_id"), ("tracks" if is_join else role, "previous_id")]
     others += [("tracks", "source_id")] if is_join else []
     return {
-        "key": " ".join(track_key(whose, int(event.row[name])) for whose, name in others if event.row[name] >= 0),
+        "key": " ".join(track_key(kind, int(event.row[column])) for kind, column in others if event.row[column] >= 0),
         "text": _WHEN.sub("", text, count=1),  # the time stands before the text
         "is_wrong": False,
         "t_ns": event.t_ns,
