@@ -187,6 +187,17 @@ def test_speeds_and_durations_by_hand():
     assert (said["tracks"], said["rows"], said["longest_s"], said["observed_share"]) == (2, 6, 3.0, 1.0)
 
 
+def test_tracks_in_numbers_by_hand():
+    frames = walk(lambda tick: {7: (3.0 * tick, 4.0 * tick)} if tick != 2 else {}, 5, rate_hz=2.0)
+    frames[4].rows["observed"] = False
+    frames[1] = Frame(frames[1].t_ns, 1, np.concatenate([frames[1].rows, boxes({9: (0, 0)})]))
+    first, second = statistics.list_tracks(frames, -ns(1))
+    assert first == {"id": 7, "from_s": 1.0, "to_s": 3.0, "seconds": 2.0, "metres": 20.0, "observed": 0.75}
+    assert (second["id"], second["seconds"]) == (9, 0.0)
+    assert np.isnan(second["metres"])
+    assert statistics.list_tracks([], 0) == []
+
+
 @given(st.dictionaries(st.text(max_size=3), st.lists(st.floats(0, 1e6), max_size=60), max_size=3))
 def test_histograms_count_every_value(values):
     found = statistics.histograms({topic: np.array(part) for topic, part in values.items()})
@@ -205,6 +216,15 @@ def test_steps_of_axes_are_round_and_not_too_small(least):
     step = charts.round_step(least)
     assert least * (1 - 1e-9) <= step <= 2.5 * least
     assert any(abs(step / 10**k / lead - 1) < 1e-9 for k in range(-10, 11) for lead in (1, 2, 2.5, 5))
+
+
+@given(st.integers(0, 10**7))
+def test_axes_of_counts_have_whole_ticks_up_to_their_end(most):
+    end = charts.round_most([np.array([float(most)])], whole=True)
+    ticks = [value for value, _ in Axis("people", end, whole=True).ticks()]
+    assert all(value == int(value) for value in ticks)
+    assert max(most, 1) <= end >= ticks[-1]
+    assert 2 <= len(ticks) <= 8
 
 
 @given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 500)), min_size=2, max_size=40))
@@ -582,6 +602,16 @@ def test_north_is_up_on_the_plan_and_both_axes_have_one_scale():
     bar_px = float(found["bar_end"]) - found["left"]
     assert bar_px * 10 / float(found["bar_label"].split()[0]) == pytest.approx(east[0], abs=1)
     assert found["tracks"][0]["title"] == "7: 2.0 to 4.5\N{NO-BREAK SPACE}s"
+
+
+def test_what_leaves_the_plan_is_counted_and_its_scale_says_where_a_point_is():
+    span = np.array([-5.0, 100.0]), np.array([5.0, 110.0])
+    found = ground_map([path([(-5, 100), (5, 110)]), path([(0, 105), (1e7, 105)])], span, 0.0)
+    assert found["outside"] == 1
+    x0, y0, step = map(float, found["scale"].split())
+    x, y = way_of(found["tracks"][0]["way"])[1]
+    assert (x0 + x * step, y0 + (found["height"] - y) * step) == pytest.approx((5, 110), abs=0.05)
+    assert float(found["bar_end"]) < found["width"]
 
 
 def test_paths_on_the_picture_are_in_its_pixels():
