@@ -55,6 +55,7 @@ Code = Literal[
     "pictures",
     "repeated",
     "scores",
+    "shared",
     "transforms",
     "units",
     "view-lost",

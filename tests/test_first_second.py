@@ -56,15 +56,16 @@ def happened(eventful) -> list[tuple[int, str]]:
     return sorted((row["t_ns"], CHANGES[row["kind"]]) for row in rows if row["kind"] in CHANGES)
 
 
-def test_each_switch_and_repair_has_a_link_a_second_before_it(served, happened):
+def test_each_switch_and_repair_has_a_link_a_second_before_the_track_was_lost(served, happened):
     assert happened == [(ns(8), "identity switch"), (ns(8), "joined"), *[(ns(16), "identity switch")] * 2]
     assert sorted((one.t_ns, one.kind) for one in served.events) == happened
     assert [one.event for one in served.events] == list(range(1, len(happened) + 1))
     assert [one.t_ns for one in served.events] == [t_ns for t_ns, _ in happened]
     for one in served.events:
-        assert opened_at(one.link) == pytest.approx(one.t_ns / 1e9 - 1, abs=1e-6)
+        assert opened_at(one.link) == pytest.approx(one.t_ns / 1e9 - 1 - one.unseen_s, abs=1e-6)
         assert f"at {one.t_ns / 1e9:.1f} s" in one.text
-        assert one.link.split("&time=")[0] == served.links["Lichtblick"].split("&time=")[0]
+        (layout,) = parse_qs(urlsplit(one.link).query)["layoutUrl"]
+        assert layout == served.layouts["tracking" if "retracks" in one.topic else "comparing"]
 
 
 def test_viewers_open_where_tracks_are_and_all_links_agree(served):
@@ -73,7 +74,7 @@ def test_viewers_open_where_tracks_are_and_all_links_agree(served):
     for link in (*served.links.values(), *served.lichtblick.values()):
         assert opened_at(link) == pytest.approx(served.at_s, abs=1e-6)
     assert (first.kind, served.at_s) == ("joined", 7.0)
-    assert f"viewers open at {served.at_s:.1f} s, a second before event {first.event} ({first.text})" in served.notes
+    assert f"viewers open at {served.at_s:.1f} s, before event {first.event} ({first.text})" in served.notes
 
 
 @pytest.mark.parametrize(("chosen", "wanted"), [({"at_s": 2.25}, 2.25), ({"at_s": 0}, None), ({"event": 2}, "event")])

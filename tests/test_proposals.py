@@ -164,10 +164,6 @@ class Scene:
             read_scenes([self.path], SourceOptions(), 0.4)
         return with_flags(str(refused.value))
 
-    def with_an_old_report(self) -> Scene:
-        self.path.with_suffix(".report.html").write_text("of another log")
-        return self
-
     def followed(self) -> str:
         """A log without tracks, and one that follows it."""
         shutil.copy(self.path, "next.mcap")
@@ -197,13 +193,11 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/train.py:show:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),
-    "cli/view.py:show:run": lambda s: s.untracked().says("view", "LOG"),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
-    "api/viewing.py:_report:report": lambda s: s.with_an_old_report().says("view", "LOG"),
     "viewing/report/figures.py:identity_events:view": Scene.page,
-    "api/viewing.py:_say_trouble:ingest": lambda s: s.says("view", "LOG"),
-    "api/viewing.py:view:run": lambda s: s.ingested("clip.mp4", "--truth", "truth.txt").says("view", "LOG"),
+    "api/viewing.py:_note_trouble:ingest": lambda s: s.says("view", "LOG", "--links"),
+    "api/viewing.py:view:run": lambda s: s.ingested("clip.mp4", "--truth", "truth.txt").says("view", "LOG", "--links"),
     "pipeline/views.py:with_views:run": Scene.without_temporary_folder,
     "api/viewing.py:view:recover": lambda s: s.half_written().says("view", "LOG"),
     "tables/compared.py:pair_files:ingest": lambda s: s.without("/camera/truth*").says(

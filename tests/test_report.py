@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import itertools
 import json
 import re
@@ -47,7 +49,7 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.elements.append((tag, dict(attrs)))
-        if tag not in ("meta", "link", "br", "img", "input"):
+        if tag not in ("meta", "link", "br", "img", "input", "wbr"):
             self.open.append(tag)
         if tag == "script":
             self.scripts.append("")
@@ -76,8 +78,7 @@ def report_on(*paths: Path) -> tuple[str, dict, Reader]:
 
 
 def numbers_in(reader: Reader) -> dict:
-    (script,) = reader.scripts
-    return json.loads(script)
+    return json.loads(reader.scripts[0])
 
 
 INGESTED = Provenance("ingest", {})
@@ -186,6 +187,17 @@ def test_speeds_and_durations_by_hand():
     assert (said["tracks"], said["rows"], said["longest_s"], said["observed_share"]) == (2, 6, 3.0, 1.0)
 
 
+def test_tracks_in_numbers_by_hand():
+    frames = walk(lambda tick: {7: (3.0 * tick, 4.0 * tick)} if tick != 2 else {}, 5, rate_hz=2.0)
+    frames[4].rows["observed"] = False
+    frames[1] = Frame(frames[1].t_ns, 1, np.concatenate([frames[1].rows, boxes({9: (0, 0)})]))
+    first, second = statistics.list_tracks(frames, -ns(1))
+    assert first == {"id": 7, "from_s": 1.0, "to_s": 3.0, "seconds": 2.0, "metres": 20.0, "observed": 0.75}
+    assert (second["id"], second["seconds"]) == (9, 0.0)
+    assert np.isnan(second["metres"])
+    assert statistics.list_tracks([], 0) == []
+
+
 @given(st.dictionaries(st.text(max_size=3), st.lists(st.floats(0, 1e6), max_size=60), max_size=3))
 def test_histograms_count_every_value(values):
     found = statistics.histograms({topic: np.array(part) for topic, part in values.items()})
@@ -204,6 +216,15 @@ def test_steps_of_axes_are_round_and_not_too_small(least):
     step = charts.round_step(least)
     assert least * (1 - 1e-9) <= step <= 2.5 * least
     assert any(abs(step / 10**k / lead - 1) < 1e-9 for k in range(-10, 11) for lead in (1, 2, 2.5, 5))
+
+
+@given(st.integers(0, 10**7))
+def test_axes_of_counts_have_whole_ticks_up_to_their_end(most):
+    end = charts.round_most([np.array([float(most)])], whole=True)
+    ticks = [value for value, _ in Axis("people", end, whole=True).ticks()]
+    assert all(value == int(value) for value in ticks)
+    assert max(most, 1) <= end >= ticks[-1]
+    assert 2 <= len(ticks) <= 8
 
 
 @given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 500)), min_size=2, max_size=40))
@@ -352,7 +373,7 @@ _ELEMENTS = {
     "html", "head", "meta", "link", "title", "style", "body", "main", "script", "section", "div", "p", "ul", "ol", "li",
     "h1", "h2", "h3", "h4", "b", "bdi", "code", "small", "span", "dl", "dt", "dd", "details", "summary", "figure",
     "figcaption", "table", "caption", "thead", "tbody", "tr", "th", "td", "svg", "g", "line", "rect", "path", "text",
-    "polyline", "polygon", "circle", "image", "use",
+    "polyline", "polygon", "circle", "image", "use", "nav", "a", "wbr",
 }  # fmt: skip
 
 
@@ -369,22 +390,25 @@ def nasty(tmp_path_factory) -> Path:
 
 
 def holds(reader: Reader) -> None:
-    """Only our elements; one script, which is data; nothing that runs, loads, or leads out of the page."""
+    """Only our elements; data, and one script that runs; nothing that loads, or leads out of the page."""
     assert {element for element, _ in reader.elements} <= _ELEMENTS
-    assert reader.of("script") == [{"type": "application/json", "id": ELEMENT}]
+    assert reader.of("script") == [{"type": "application/json", "id": ELEMENT}, {}]
     for element, attributes in reader.elements:
         for key, value in attributes.items():
             assert not key.startswith("on")
             assert key not in ("src", "srcset", "style", "action", "formaction", "xlink:href")
             if key == "href":
-                assert re.fullmatch(r"data:(image/(jpeg|png);base64,[\w+/=]+|,)|#scene-\d+", value), element
+                assert re.fullmatch(r"data:(image/(jpeg|png);base64,[\w+/=]+|,)|#[a-z]+-\d+", value), element
             if key == "id":
-                assert re.fullmatch(rf"scene-\d+|{ELEMENT}", value)
+                assert re.fullmatch(rf"[a-z]+-\d+|hint|{ELEMENT}", value)
+            if key == "data-t":
+                assert re.fullmatch(r"((tracks|online|offline|truth)--?\d+ ?)+", value)
             if key == "class":
                 assert re.fullmatch(r"[\w -]+", value)
     (policy,) = [one["content"] for one in reader.of("meta") if one.get("http-equiv")]
-    assert policy.startswith("default-src 'none'")
-    assert "script" not in policy
+    rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
+    own = base64.b64encode(hashlib.sha256(reader.scripts[1].encode()).digest()).decode()
+    assert (rules["default-src"], rules["script-src"], rules["img-src"]) == ("'none'", f"'sha256-{own}'", "data:")
     assert not reader.open
 
 
@@ -451,11 +475,11 @@ def test_templates_print_in_text_and_quoted_attributes_only(name):
     for element in re.findall(r"</?\w*\{\{.*?\}\}", source):
         assert re.fullmatch(r"</?h\{\{ level( \+ 1)? \}\}", element)
     for link in re.findall(r'(?:href|src)="([^"]*)"', source):
-        assert link in ("data:,", "#{{ id }}") or re.fullmatch(
+        assert link in ("data:,", "#{{ id }}", "#{{ place }}-{{ number }}", "{{ viewer.address }}") or re.fullmatch(
             r"data:image/(?:jpeg|png);base64,\{\{ [\w.]+ \| base64 \}\}|\./\{\{ [\w.]+ \| address \}\}", link
         )
     styles = re.findall(r"<style>(.*?)</style>", source)
-    assert not styles or re.findall(r"\{\{ (.*?) \}\}", styles[0]) == ["loop.index0", "colour"] * 2
+    assert re.findall(r"\{\{ (.*?) \}\}", "".join(styles)) in ([], ["loop.index0", "colour"] * 2)
 
 
 # Files
@@ -578,6 +602,16 @@ def test_north_is_up_on_the_plan_and_both_axes_have_one_scale():
     bar_px = float(found["bar_end"]) - found["left"]
     assert bar_px * 10 / float(found["bar_label"].split()[0]) == pytest.approx(east[0], abs=1)
     assert found["tracks"][0]["title"] == "7: 2.0 to 4.5\N{NO-BREAK SPACE}s"
+
+
+def test_what_leaves_the_plan_is_counted_and_its_scale_says_where_a_point_is():
+    span = np.array([-5.0, 100.0]), np.array([5.0, 110.0])
+    found = ground_map([path([(-5, 100), (5, 110)]), path([(0, 105), (1e7, 105)])], span, 0.0)
+    assert found["outside"] == 1
+    x0, y0, step = map(float, found["scale"].split())
+    x, y = way_of(found["tracks"][0]["way"])[1]
+    assert (x0 + x * step, y0 + (found["height"] - y) * step) == pytest.approx((5, 110), abs=0.05)
+    assert float(found["bar_end"]) < found["width"]
 
 
 def test_paths_on_the_picture_are_in_its_pixels():

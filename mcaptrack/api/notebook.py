@@ -25,7 +25,16 @@ from mcaptrack.foxglove.views import SCENE_SUFFIX
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
 from mcaptrack.viewing.links import find_moments, opening_moment
-from mcaptrack.viewing.notebook.page import FIRST, LAST, ShownColumn, Still, player_html, still_html, table_html
+from mcaptrack.viewing.notebook.page import (
+    FIRST,
+    LAST,
+    ShownColumn,
+    Still,
+    player_html,
+    player_page,
+    still_html,
+    table_html,
+)
 from mcaptrack.viewing.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
 
 if TYPE_CHECKING:
@@ -74,6 +83,8 @@ class Player:
         Times of the first and the last picture, in seconds since the start of the log.
     html : str
         What notebooks show. It opens no connection.
+    page : str
+        The player as a page of its own; "" for a still.
     still : bytes
         A JPEG file: the picture that the player opens with, for programs that show no HTML.
     warnings : tuple of mcaptrack.Notice
@@ -92,6 +103,7 @@ class Player:
     last_s: float
     html: str = field(repr=False)
     still: bytes = field(repr=False)
+    page: str = field(default="", repr=False)
     warnings: tuple[Notice, ...] = ()
 
     def __repr__(self) -> str:
@@ -140,7 +152,7 @@ class Player:
         target = as_path(path)
         refuse_overwrite(target, force)
         head = '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>mcaptrack</title>\n'
-        page = f"{head}{self.html}</html>\n"
+        page = self.page or f"{head}{self.html}</html>\n"
         publish_bytes(target, page.encode("utf-8"))
         return target
 
@@ -198,10 +210,14 @@ def show_log(
     choice: Choice,
     max_mb: float,
     progress: Progress,
+    all_tracks: bool = False,
 ) -> Player:
-    """Return a player, or a still of a time, of an open log. See ``Recording.show``."""
+    """Return a player, or a still of a time, of an open log. See ``Recording.show``.
+
+    With ``all_tracks``, those that aren't shown at first are in the player, too.
+    """
     with warnings_about(opened.path) as warnings, pipeline.with_views(opened) as (complete, _):
-        source = PictureSource(complete, pipeline.find_camera(opened, camera), topics)
+        source = PictureSource(complete, pipeline.find_camera(opened, camera), topics, all_tracks)
         if at_s is None:
             shown = _player(complete, source, choice, max_mb, progress)
         else:
@@ -226,11 +242,7 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
     numbers = source.numbers(choice.start_s, choice.end_s)
     moments = find_moments(opened)
     at_ns, _ = opening_moment(opened, moments)
-    events = [
-        (source.seconds(moment.t_ns), moment.text)
-        for moment in moments
-        if any(f"{view}/".startswith(f"{moment.topic}/") for view in source.views)
-    ]
+    events = [(source.seconds(moment.t_ns), moment.text, moment.topic) for moment in moments]
     every = choice.every or source.step(numbers, _PLANNED * max_mb * _MB, choice.width_px)
     taken = source.take(numbers[::every], choice.width_px, progress)
     while True:
@@ -243,10 +255,12 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
             opened.path, source.topic, source.is_above, source.views,
             len(seconds), len(numbers), every, *span, html="", still=still.jpeg,
         )  # fmt: skip
-        inside = [(at, text) for at, text in events if span[0] <= at <= span[1]]
-        html = player_html(taken, seconds, inside, opens_at, still, f"{opened.path.name}: {player.caption}")
+        inside = [event for event in events if span[0] <= event[0] <= span[1]]
+        caption = f"{opened.path.name}: {player.caption}"
+        page = player_page(taken, seconds, inside, opens_at, caption)
+        html = player_html(page, still, caption)
         if len(html) <= max_mb * _MB or len(seconds) == 1:
-            return replace(player, html=html)
+            return replace(player, html=html, page=page)
         if choice.every is not None:
             raise McaptrackError(
                 f"{opened.path}: {len(seconds)} {source.noun} make a player of {len(html) / _MB:.1f} MB, and "

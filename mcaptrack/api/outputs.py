@@ -73,10 +73,10 @@ def report(
 ) -> ReportResult:
     """Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.
 
-    The page needs no network and has no scripts; it contains its numbers as JSON, which --json prints. Scores are those
-    of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs; `mcaptrack run` runs
-    stages that are missing. Of a folder with the tables of many logs, the page has totals, trends, the worst logs,
-    outliers and warnings.
+    The page needs no network, and runs no script but its own; it contains its numbers as JSON, which --json prints.
+    Scores are those of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs;
+    `mcaptrack run` runs stages that are missing. Of a folder with the tables of many logs, the page has totals, trends,
+    the worst logs, outliers and warnings.
 
     Parameters
     ----------

@@ -1,48 +1,124 @@
-"""Serve a log to viewers in a browser."""
+"""Serve a log to a browser: our own page on it, and the files that other viewers read."""
 
 from __future__ import annotations
 
 import json
+import re
 import threading
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Final, Self
 
 from mcaptrack import log as logs
-from mcaptrack.api.common import Notes, as_path, log_file
+from mcaptrack import pipeline, tables
+from mcaptrack.api.common import as_path, log_file
 from mcaptrack.api.declared import Argument, Option, declared
-from mcaptrack.api.options import PathLike
+from mcaptrack.api.notebook import Choice, arrow_html, show_log
+from mcaptrack.api.options import PathLike, no_progress
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.location import sibling
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
-from mcaptrack.viewing import links
-from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, is_about, viewer_links, with_links
-from mcaptrack.viewing.serving import Server
+from mcaptrack.sources.cameras import cameras
+from mcaptrack.tables import exchange, export
+from mcaptrack.viewing import links, report
+from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, rerun_link, viewer_links
+from mcaptrack.viewing.report.formatting import policy, render
+from mcaptrack.viewing.serving import LOOPBACK, Page, Server
 
 #: Headings in the help.
 _OPENED: Final = "What is opened"
 _VIEWER: Final = "Server and viewer"
-#: The names of codecs of videos.
+#: The port where a log is served, unless another is given or this one is taken.
+PORT: Final = 8765
+#: The largest size of a player in megabytes: it is opened from this machine.
+_PLAYER_MB: Final = 16.0
+#: Our pages and scripts, below the secret word; files of the log have no folder.
+_FOLDER: Final = "page"
+#: The time in the text of an event.
+_WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
 
 
 @dataclass(frozen=True)
 class _Contents:
     """The contents of a log for viewers: its files, layouts by name (name of the file, content), events, and the time
-    at which viewers open.
+    at which viewers open. ``views`` are what players show: a name, the camera, and whether it is seen from above.
     """
 
+    path: Path
     files: Mapping[str, Path | bytes]
     layouts: Mapping[str, tuple[str, Path | bytes]]
     events: Sequence[LinkedEvent]
-    report: tuple[str, bytes] | None
+    views: Sequence[tuple[str, str, bool]]
+    rerun: str
     start_ns: int
     at_ns: int
+    notes: tuple[str, ...] = ()
+    warnings: tuple[Notice, ...] = ()
+
+    def seconds(self, t_ns: int) -> float:
+        """A log time in seconds since the start of the log."""
+        return (t_ns - self.start_ns) / NS_PER_S
+
+
+@dataclass
+class _FromLog:
+    """Content that is made of a log when it is asked for, and again when the log has changed."""
+
+    path: Path
+    make: Callable[[logs.Log], bytes]
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _made: tuple[logs.Log, bytes] | None = None
+
+    def __call__(self) -> bytes:
+        """Return the content; a page that says why there is none."""
+        with self._lock:
+            try:
+                if self._made is None or not logs.is_current(self._made[0], self.path):
+                    with collected(), logs.read(self.path) as opened:
+                        self._made = opened, self.make(opened)
+                return self._made[1]
+            except McaptrackError as error:
+                return render("nothing.html", text=str(error)).encode()
+
+
+def _player(camera: str, is_above: bool, opened: logs.Log) -> bytes:
+    with with_views(opened) as (complete, _):
+        topics = pipeline.views_from_above(complete, camera) if is_above else ()
+    shown = show_log(
+        opened, None, topics=topics, camera=camera, choice=Choice(), max_mb=_PLAYER_MB, progress=no_progress,
+        all_tracks=True,
+    )  # fmt: skip
+    return shown.page.encode()
+
+
+def _report(opened: logs.Log) -> bytes:
+    return report.page([report.gather(opened, None)]).encode()
+
+
+def _tables(address: Callable[[str], str], opened: logs.Log) -> bytes:
+    contents = export.LogTables(opened)
+    names = sorted(tables.TABLES, key=lambda name: name not in ("track_summary", "tracks"))
+    filled = [(name, table) for name in names if (table := contents.table(name)).num_rows]
+    shown = [{"name": name, "html": arrow_html(table), "csv": address(name)} for name, table in filled]
+    return render("tables.html", tables=shown, log=opened.path.name).encode()
+
+
+def _csv(name: str, opened: logs.Log) -> bytes:
+    return b"".join(tables.pieces(export.LogTables(opened).table(name), "csv"))
+
+
+def _rerun(opened: logs.Log) -> bytes:
+    with TemporaryDirectory(prefix="mcaptrack-rerun-") as folder:
+        path = Path(folder, f"{opened.path.stem}.rrd")
+        exchange.write_boxes(opened, path, "rerun", None, no_progress)
+        return path.read_bytes()
 
 
 class LogServer:
@@ -52,6 +128,8 @@ class LogServer:
 
     Attributes
     ----------
+    address : str
+        The page on the log: a player, the report, tables, and buttons that open other viewers.
     logs : tuple of str
         Addresses of the files of the log, its results included.
     layouts : dict of str to str
@@ -61,15 +139,13 @@ class LogServer:
     lichtblick : dict of str to str
         Addresses that open the log in Lichtblick, by layout.
     events : tuple of LinkedEvent
-        Every identity switch and repair, in the order of time, with the address that opens it.
-    report : str or None
-        Address of the report on the log, if there is one beside it: its times are links that open the log there.
+        Every identity switch and repair, in the order of time, with the address that opens it in Lichtblick.
     at_s : float
         The time at which viewers open, in seconds since the start of the log.
     notes : tuple of str
         Where viewers open and why, which layouts were edited, and where a viewer may have trouble with the pictures.
     warnings : tuple of mcaptrack.Notice
-        Which layouts could not be read.
+        What is assumed, and which layouts could not be read.
 
     Examples
     --------
@@ -81,17 +157,19 @@ class LogServer:
     """
 
     def __init__(
-        self,
-        contents: _Contents,
-        port: int,
-        lichtblick: str,
-        notes: tuple[str, ...],
-        warnings: tuple[Notice, ...],
-        views: ExitStack | None = None,
+        self, contents: _Contents, port: int | None, host: str, lichtblick: str, views: ExitStack | None = None
     ) -> None:
-        self._server = Server(dict(contents.files) | dict(contents.layouts.values()), port)
+        files = dict(contents.files) | dict(contents.layouts.values()) | self._pages(contents)
+        index = Page(partial(self._index, contents), policy("index.js", "frame-src 'self'"))
+        try:
+            self._server = Server(files, PORT if port is None else port, host=host, index=index)
+        except McaptrackError:
+            if port is not None:
+                raise
+            self._server = Server(files, 0, host=host, index=index)
         self._thread: threading.Thread | None = None
         self._views = views  # a temporary file with views that the log lacks
+        self.address = self._server.root
         self.logs = tuple(self._server.address(name) for name in contents.files)
         self.layouts = {name: self._server.address(file) for name, (file, _) in contents.layouts.items()}
         first = next(iter(self.layouts.values()), None)
@@ -104,18 +182,64 @@ class LogServer:
         }
         self.links = links_to(first, contents.at_ns)
         self.events = tuple(
-            event._replace(link=links_to(first, links.before(event.t_ns, contents.start_ns))["Lichtblick"])
+            event._replace(
+                link=links_to(self.layouts.get(event.layout, first), event.opens_ns(contents.start_ns))["Lichtblick"]
+            )
             for event in contents.events
         )
-        self.report = None
-        if contents.report is not None:
-            name, page = contents.report
-            lead = partial(links.before, start_ns=contents.start_ns)
-            page = with_links(page, lambda t_ns: links_to(first, lead(t_ns))["Lichtblick"])
-            self.report = self._server.add(name, page)
-        self.at_s = (contents.at_ns - contents.start_ns) / NS_PER_S
-        self.notes = notes
-        self.warnings = warnings
+        self.at_s = contents.seconds(contents.at_ns)
+        self.notes, self.warnings = contents.notes, contents.warnings
+
+    def _pages(self, contents: _Contents) -> dict[str, Page]:
+        """Return our pages on a log, by name."""
+        made = partial(_FromLog, contents.path)
+        pages = {
+            f"{_FOLDER}/player-{number}.html": Page(made(partial(_player, camera, is_above)), policy("player.js"))
+            for number, (_, camera, is_above) in enumerate(contents.views)
+        }
+        pages[f"{_FOLDER}/report.html"] = Page(made(_report), policy("report.js"))
+        pages[f"{_FOLDER}/tables.html"] = Page(made(partial(_tables, "{}.csv".format)), policy())
+        for name in tables.TABLES:
+            pages[f"{_FOLDER}/{name}.csv"] = Page(made(partial(_csv, name)), kind="text/csv; charset=utf-8")
+        if not contents.rerun:
+            pages[f"{contents.path.stem}.rrd"] = Page(made(_rerun), kind="application/octet-stream", is_shared=True)
+        return pages
+
+    def _index(self, contents: _Contents) -> bytes:
+        """Return the first page."""
+        offline = "needs a connection to the internet, and gets the log from this machine"
+        rerun = rerun_link(self._server.address(f"{contents.path.stem}.rrd")) if not contents.rerun else ""
+        viewers = [
+            {"name": name, "address": address, "about": about or f"{name} {offline}"}
+            for name, address, about in (
+                *((name, address, "") for name, address in self.links.items()),
+                ("Rerun", rerun, contents.rerun),
+            )
+        ]
+        place = f"{self._server.path(_FOLDER).decode()}/"
+        data = {
+            "root": self._server.root,
+            "start_ns": str(contents.start_ns),
+            "at_s": self.at_s,
+            "views": [
+                {"name": name, "address": f"{place}player-{number}.html"}
+                for number, (name, *_) in enumerate(contents.views)
+            ],
+            "report": f"{place}report.html",
+            "tables": f"{place}tables.html",
+            "best": links.best_tracks(contents.events),
+            "events": [
+                {
+                    "at_s": contents.seconds(event.t_ns),
+                    "topic": event.topic,
+                    "text": _WHEN.sub("", event.text, count=1),
+                }
+                for event in contents.events
+            ],
+        }
+        notes = [*contents.notes, *(notice.message for notice in contents.warnings)]
+        page = render("index.html", title=contents.path.name, viewers=viewers, data=data, notes=notes)
+        return page.encode()
 
     def __enter__(self) -> Self:
         return self.start()
@@ -164,36 +288,39 @@ def view(
     at_s: Annotated[float | None, Option(_OPENED, 0, 1e9, flag="at")] = None,
     event: Annotated[int | None, Option(_OPENED, 1, 1e9, shown="none")] = None,
     layout: Annotated[PathLike | None, Option(_OPENED, metavar="NAME or FILE", shown="all of the log")] = None,
-    port: Annotated[int, Option(_VIEWER, 0, 65535, shown="any that is free")] = 0,
+    port: Annotated[int | None, Option(_VIEWER, 0, 65535, shown=f"{PORT}, or any that is free")] = None,
+    host: Annotated[str, Option(_VIEWER)] = LOOPBACK,
     lichtblick: Annotated[str, Option(_VIEWER)] = LICHTBLICK,
     browser: Annotated[bool, Option(_VIEWER, flag="open/no-open")] = False,
 ) -> LogServer:
-    """Serve a log to this machine's browser, and print links that open it in Lichtblick and Foxglove.
+    """Look at a log in the browser: pictures with tracks, events to click, the ground from above, report and tables.
 
-    Links open the log where something happens, and there is a link for each identity switch and repair. Also serves
-    its layouts (tracking, comparing, predictions): the links open Lichtblick with one; in Foxglove import the file
-    (Layouts, Import from file). Layout files beside the log are served as they are, also while they are edited, and
-    its report with a link at each time. Only these files are served, only to this machine, until Ctrl-C.
+    Serves one page until Ctrl-C; it needs no connection. Three buttons open the log where it is shown in Lichtblick,
+    Foxglove or Rerun, which read it from this machine. Layout files beside the log are served as they are, also while
+    they are edited; in Foxglove import them (Layouts, Import from file). Only the log and what is made of it is served,
+    and only to this machine; whoever works on it can open the page.
 
     Parameters
     ----------
     at_s : float, optional
-        Open at this time of the log, in seconds; by default a second before the first identity switch or repair of the
-        best tracks.
+        Open at this time of the log, in seconds; by default before the first identity switch or repair of the best
+        tracks.
 
         Without any of these, where tracks are.
     event : int, optional
-        Open a second before this event, by its number.
+        Open before this event, by its number.
 
         Its place in ``LogServer.events``, from 1.
     layout : str or path, optional
-        Print a link for this layout only: tracking, comparing or predictions, or the layout in this file.
-    port : int, default 0
+        Open Lichtblick with this layout: tracking, comparing or predictions, or the layout in this file.
+    port : int, optional
         Port to serve it at.
+    host : str, default "127.0.0.1"
+        Address to serve it at; 0.0.0.0 lets every machine of the network read the log.
     lichtblick : str, optional
         Address of Lichtblick, if you have installed it yourself.
     browser : bool, default False
-        Open Lichtblick in the browser.
+        Open the page in the browser.
 
     Returns
     -------
@@ -223,7 +350,7 @@ def view(
         raise McaptrackError(f"`lichtblick=` needs an address such as http://localhost:8080, not {lichtblick!r}")
     if at_s is not None and event is not None:
         raise McaptrackError("`at_s=` and `event=` both say where viewers open; leave one out")
-    path, notes = log_file(log), Notes()
+    path, notes = log_file(log), list[str]()
     with ExitStack() as stack, collected() as warnings:
         opened = stack.enter_context(logs.read(path))
         if not opened.is_on_disk:
@@ -234,19 +361,54 @@ def view(
         shown, made_layouts = stack.enter_context(with_views(opened))
         files = {part.path.name: Path(part.real_path) for part in shown.parts}
         if shown is not opened:
-            notes.say(f"views that the log lacks are drawn in {[*files][-1]} for now; {call('run', path)} keeps them")
+            notes.append(
+                f"views that the log lacks are drawn in {[*files][-1]} for now; {call('run', path)} keeps them"
+            )
         layouts = _chosen_layouts(path, opened, layout, made_layouts, notes)
+        if not layouts:
+            notes.append(f"viewers have no layout yet: {call('run', path)} makes one")
         events = links.find_moments(opened)
         at_ns, why = _opening(opened, events, at_s, event)
         if opened.start_ns or opened.end_ns:
-            notes.say(f"viewers open at {links.seconds_of(opened, at_ns):.1f} s, {why}")
-        _say_trouble(opened, notes)
-        contents = _Contents(files, layouts, events, _report(path, opened, notes), opened.start_ns, at_ns)
-        said = tuple(notes), tuple(dict.fromkeys(warnings))
-        server = LogServer(contents, port, lichtblick, *said, stack.pop_all() if shown is not opened else None)
+            notes.append(f"viewers open at {links.seconds_of(opened, at_ns):.1f} s, {why}")
+        _note_trouble(opened, notes)
+        if host != LOOPBACK:
+            warn(
+                f"{path}: whoever reaches this machine at {host} can read the log and all that is made of it", "shared"
+            )
+        contents = _Contents(
+            path, files, layouts, events, _views(shown), _without_rerun(opened), opened.start_ns, at_ns,
+            tuple(notes), tuple(dict.fromkeys(warnings)),
+        )  # fmt: skip
+        server = LogServer(contents, port, host, lichtblick, stack.pop_all() if shown is not opened else None)
     if browser:
-        webbrowser.open(server.links["Lichtblick"])
+        webbrowser.open(server.address)
     return server
+
+
+def _views(opened: logs.Log) -> list[tuple[str, str, bool]]:
+    """Return what players show, the best first: a name, the camera, and whether it is seen from above."""
+    of_cameras = cameras(opened)
+    pictures = [(camera.prefix, False) for camera in of_cameras if camera.pictures]
+    above = [(camera.prefix, True) for camera in of_cameras if pipeline.views_from_above(opened, camera.prefix)]
+    what_there_is = [*pictures, *above] or [(camera.prefix, False) for camera in of_cameras[:1]]
+    names = {False: "pictures", True: "from above"}
+    return [
+        (names[is_above] if len(of_cameras) == 1 else f"{prefix.lstrip('/')}, {names[is_above]}", prefix, is_above)
+        for prefix, is_above in what_there_is
+    ]
+
+
+def _without_rerun(opened: logs.Log) -> str:
+    """Return why there is no recording of Rerun; "" if one can be made."""
+    try:
+        version("rerun-sdk")
+        exchange.boxes_topic(opened)
+    except PackageNotFoundError:
+        return 'needs rerun-sdk, which is not installed; install it with: pip install "mcaptrack[rerun]"'
+    except McaptrackError as error:
+        return str(error)
+    return ""
 
 
 def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None, event: int | None) -> tuple[int, str]:
@@ -261,27 +423,11 @@ def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None
             what_there_is = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
             raise McaptrackError(f"{opened.path} has {what_there_is}, so viewers can't open at event {event}")
         chosen = events[event - 1]
-        return links.before(chosen.t_ns, opened.start_ns), f"a second before event {event} ({chosen.text})"
+        return chosen.opens_ns(opened.start_ns), f"before event {event} ({chosen.text})"
     return links.opening_moment(opened, events)
 
 
-def _report(path: Path, opened: logs.Log, notes: Notes) -> tuple[str, bytes] | None:
-    """Return name and content of the report beside a log, if it is about the log as it is now."""
-    file = sibling(path, ".report.html")
-    try:
-        page = file.read_bytes() if file.is_file() else None
-    except OSError as error:
-        warn(f"{file} can't be served: {error.strerror}", "left-out")
-        return None
-    if page is None:
-        return None
-    if not is_about(page, opened.fingerprint()):
-        notes.say(f"{file} is not served: it is not about the log as it is now; {call('report', path, force=True)} is")
-        return None
-    return file.name, page
-
-
-def _say_trouble(opened: logs.Log, notes: Notes) -> None:
+def _note_trouble(opened: logs.Log, notes: list[str]) -> None:
     """Say where viewers may have trouble with the pictures of a log, and what helps."""
     from mcaptrack.sources.video import WORDS
 
@@ -292,16 +438,16 @@ def _say_trouble(opened: logs.Log, notes: Notes) -> None:
     for codec, those in topics.items():
         trouble = f"pictures in {', '.join(those)} are {WORDS[codec]}"
         if codec == "h264":
-            notes.say(
+            notes.append(
                 f"{trouble}: on a slow machine Lichtblick may show none while it is paused, and late ones during play. "
                 f"A log made by {again} doesn't have this, and is larger"
             )
         else:
-            notes.say(f"{trouble}, which Lichtblick doesn't play; a log made by {again} can be seen everywhere")
+            notes.append(f"{trouble}, which Lichtblick doesn't play; a log made by {again} can be seen everywhere")
 
 
 def _chosen_layouts(
-    path: Path, opened: logs.Log, chosen: PathLike | None, made_layouts: Mapping[str, bytes], notes: Notes
+    path: Path, opened: logs.Log, chosen: PathLike | None, made_layouts: Mapping[str, bytes], notes: list[str]
 ) -> dict[str, tuple[str, Path | bytes]]:
     """Return the layouts to serve by name: the name of each file, and its content or path."""
     if chosen is not None and str(chosen) not in LAYOUTS and _is_file_name(chosen):
@@ -329,7 +475,9 @@ def _is_file_name(chosen: PathLike) -> bool:
     return Path(chosen).suffix.lower() == ".json" or len(Path(chosen).parts) > 1 or Path(chosen).is_file()
 
 
-def _layouts(path: Path, opened: logs.Log, made_layouts: Mapping[str, bytes], notes: Notes) -> dict[str, Path | bytes]:
+def _layouts(
+    path: Path, opened: logs.Log, made_layouts: Mapping[str, bytes], notes: list[str]
+) -> dict[str, Path | bytes]:
     """Return the layouts of a log: files beside it, otherwise those made now, or those that it keeps.
 
     Notes tell of files that were edited.
@@ -350,5 +498,5 @@ def _layouts(path: Path, opened: logs.Log, made_layouts: Mapping[str, bytes], no
         elif kept is not None or name in made_layouts:
             layouts[name] = made_layouts.get(name, kept or b"")
         if content is not None and kept is not None and content != kept:
-            notes.say(f"{file} differs from the layout in the log; the file is served")
+            notes.append(f"{file} differs from the layout in the log; the file is served")
     return layouts

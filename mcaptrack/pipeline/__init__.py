@@ -14,7 +14,7 @@ from mcaptrack import _lazily
 if TYPE_CHECKING:
     from mcaptrack.pipeline.checks import Job
     from mcaptrack.pipeline.choice_of_cameras import SCENE, UNREAD, ChosenCameras, begins_with, choose_cameras
-    from mcaptrack.pipeline.drawing import RobotPath, find_views, robot_path
+    from mcaptrack.pipeline.drawing import RobotPath, find_views, robot_path, views_from_above
     from mcaptrack.pipeline.events import Watch
     from mcaptrack.pipeline.following import Before, Continued, begins_here
     from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _NAMES: Final = {
     "mcaptrack.pipeline.checks": "Job",
     "mcaptrack.pipeline.choice_of_cameras": "SCENE UNREAD ChosenCameras begins_with choose_cameras",
-    "mcaptrack.pipeline.drawing": "RobotPath find_views robot_path",
+    "mcaptrack.pipeline.drawing": "RobotPath find_views robot_path views_from_above",
     "mcaptrack.pipeline.events": "Watch",
     "mcaptrack.pipeline.following": "Before Continued begins_here",
     "mcaptrack.pipeline.fusing": "fusable fuse_again fuse_cameras",

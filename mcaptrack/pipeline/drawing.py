@@ -81,6 +81,11 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> Show
     raise McaptrackError(f"{lack}; {call('info', opened.path)} shows what it has")
 
 
+def views_from_above(opened: log.Log, prefix: str) -> list[str]:
+    """Return the views of a camera, from above, that layouts show by default."""
+    return _best(opened, prefix, views.SCENE_SUFFIX)
+
+
 def _given(opened: log.Log, prefix: str, topics: Sequence[str], pictures: str | None) -> Shown:
     """Return the views of given channels, or these themselves if they are views."""
     if pictures is None:

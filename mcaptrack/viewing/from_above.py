@@ -167,10 +167,10 @@ def _placed(pose: Any, points: Floats) -> Floats:
     """Points (P, 3) of a shape in the frame of its scene."""
     x, y, z, w = (getattr(pose.orientation, name) for name in "xyzw")
     norm = x * x + y * y + z * z + w * w
-    if norm:
-        axis, scale = np.array([x, y, z]), 2 / norm
-        across = np.cross(axis, points)
-        points = points + scale * (w * across + np.cross(axis, across))
+    if x or y or z:
+        across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # points @ across is the cross product
+        turned = points @ across
+        points = points + 2 / norm * (w * turned + turned @ across)
     return np.asarray(points + np.array([pose.position.x, pose.position.y, pose.position.z]), np.float64)
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import html
-import json
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Any, Final, NamedTuple
+from importlib.metadata import version
+from typing import Final, NamedTuple
 from urllib.parse import urlencode
 
 import numpy as np
@@ -27,6 +25,7 @@ from mcaptrack.sources.video import is_video_codec
 
 LICHTBLICK: Final = "https://lichtblick-suite.github.io/lichtblick/"
 FOXGLOVE: Final = "https://app.foxglove.dev/"
+RERUN: Final = "https://app.rerun.io/version/"
 
 
 def viewer_links(
@@ -46,6 +45,14 @@ def viewer_links(
     }
 
 
+def rerun_link(recording: str) -> str:
+    """The address that opens a recording in Rerun's web viewer, that of the library which is installed.
+
+    Raises PackageNotFoundError without the library.
+    """
+    return f"{RERUN}{version('rerun-sdk')}/index.html?{urlencode({'url': recording})}"
+
+
 def utc_text(t_ns: int) -> str | None:
     """A time in ns since 1970 as RFC 3339 has it; None for years beyond 9999.
 
@@ -62,47 +69,13 @@ def utc_text(t_ns: int) -> str | None:
     return f"{whole:%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"
 
 
-# A report that is served beside its log: its times become links that open a viewer there.
-
-
-#: The numbers in a page, and the times in it that become links: ns since 1970, and the text.
-_DATA: Final = re.compile(rb'<script type="application/json" id="mcaptrack-report">(.*?)</script>', re.DOTALL)
-_TIME: Final = re.compile(rb'<span class="at" data-ns="(-?[0-9]{1,19})">([^<>]{1,40})</span>')
-
-
-def is_about(page: bytes, fingerprint: str) -> bool:
-    """Return whether a page is a report on one log with this fingerprint, in its current state."""
-    match = _DATA.search(page)
-    try:
-        data: Any = json.loads(match[1]) if match else None
-        logs = data["logs"]
-        return bool(len(logs) == 1 and logs[0]["digest"] == fingerprint)
-    except (ValueError, TypeError, KeyError, RecursionError):
-        return False
-
-
-def with_links(page: bytes, link_to: Callable[[int], str]) -> bytes:
-    """Return a report with a link at each of its times; ``link_to`` returns the address for a log time in ns.
-
-    Examples
-    --------
-    >>> with_links(b'<span class="at" data-ns="5">0:01</span>', lambda t_ns: f"http://a/?t={t_ns}&b").decode()
-    '<a class="at" href="http://a/?t=5&amp;b">0:01</a>'
-    """
-
-    def linked(match: re.Match[bytes]) -> bytes:
-        address = html.escape(link_to(int(match[1])), quote=True).encode()
-        return b'<a class="at" href="' + address + b'">' + match[2] + b"</a>"
-
-    return _TIME.sub(linked, page)
-
-
 # Moments of a log that are worth a look: identity switches and repairs, and when there is something to see at all.
 
 
 #: The kinds of events that change identities.
 KINDS: Final = (EventKind.SWITCH, EventKind.JOINED, EventKind.PARTED)
-#: Viewers open so long before an event, so that it is seen when they play.
+#: Viewers open so long before an event, or before the time without detections that it ended, so that it is seen when
+#: they play.
 LEAD_S: Final = 1.0
 #: The tracks that viewers show first, below the name of a camera; the first that has events or people is opened.
 _BEST: Final = ("retracks", "tracks")
@@ -125,7 +98,9 @@ class LinkedEvent(NamedTuple):
     text : str
         What happened, and when in seconds of the log.
     link : str
-        The address that opens the log in Lichtblick, a second before; "" until the log is served.
+        The address that opens the log in Lichtblick, a second before the track was lost; "" until the log is served.
+    unseen_s : float
+        The time without detections before it.
 
     """
 
@@ -135,6 +110,16 @@ class LinkedEvent(NamedTuple):
     kind: str
     text: str
     link: str = ""
+    unseen_s: float = 0.0
+
+    @property
+    def layout(self) -> str:
+        """The name of the layout that shows its tracks."""
+        return "tracking" if "/retracks" in self.topic else "comparing"
+
+    def opens_ns(self, start_ns: int) -> int:
+        """Return the log time in ns at which viewers open, in a log with this start."""
+        return max(self.t_ns - round((LEAD_S + self.unseen_s) * NS_PER_S), start_ns)
 
 
 def find_moments(opened: log.Log) -> list[LinkedEvent]:
@@ -142,7 +127,7 @@ def find_moments(opened: log.Log) -> list[LinkedEvent]:
 
     Channels that can't be read are left out, with a warning.
     """
-    moments: list[tuple[int, str, str, str]] = []
+    moments: list[LinkedEvent] = []
     for topic, channel in sorted(opened.channels.items()):
         if not channel.holds(EVENTS):
             continue
@@ -160,9 +145,16 @@ def find_moments(opened: log.Log) -> list[LinkedEvent]:
             row = joined.rows[at]
             t_ns = int(joined.row_ns[at])
             text = describe(row, f"at {seconds_of(opened, t_ns):.1f} s", 0.0, nouns)
-            moments.append((t_ns, tracks, EVENT_KINDS[EventKind(int(row["kind"]))], text))
-    moments.sort(key=lambda moment: (moment[0], moment[1]))
-    return [LinkedEvent(number, *moment) for number, moment in enumerate(moments, 1)]
+            kind, unseen_s = EVENT_KINDS[EventKind(int(row["kind"]))], float(np.nan_to_num(row["duration_s"]))
+            moments.append(LinkedEvent(0, t_ns, tracks, kind, text, unseen_s=unseen_s))
+    moments.sort(key=lambda moment: (moment.t_ns, moment.topic))
+    return [moment._replace(event=number) for number, moment in enumerate(moments, 1)]
+
+
+def best_tracks(moments: Sequence[LinkedEvent]) -> str:
+    """Return the tracks with events that viewers show first; "" without any."""
+    topics = sorted({moment.topic for moment in moments})
+    return next((topic for name in _BEST for topic in topics if topic.endswith(f"/{name}")), "")
 
 
 def _nouns(opened: log.Log, topic: str) -> Nouns:
@@ -179,13 +171,13 @@ def _nouns(opened: log.Log, topic: str) -> Nouns:
 def opening_moment(opened: log.Log, moments: Sequence[LinkedEvent]) -> tuple[int, str]:
     """Return the log time in ns at which viewers open, and why, as text.
 
-    It is a second before the first event of the tracks that layouts show; without any, the first time with at least
+    It is before the first event of the tracks that layouts show; without any, the first time with at least
     half as many of them as there are at most; without any tracks, the start of the log.
     """
-    for name in _BEST:
-        first = next((moment for moment in moments if moment.topic.endswith(f"/{name}")), None)
-        if first is not None:
-            return before(first.t_ns, opened.start_ns), f"a second before event {first.event} ({first.text})"
+    best = best_tracks(moments)
+    first = next((moment for moment in moments if moment.topic == best), None)
+    if first is not None:
+        return first.opens_ns(opened.start_ns), f"before event {first.event} ({first.text})"
     for name in _BEST:
         for topic in sorted(opened.channels):
             t_ns, tracked = _tracks_over_time(opened, topic) if topic.endswith(f"/{name}") else _NO_TRACKS
@@ -193,7 +185,7 @@ def opening_moment(opened: log.Log, moments: Sequence[LinkedEvent]) -> tuple[int
                 at = int(np.argmax(2 * tracked >= tracked.max()))
                 return int(t_ns[at]), f"where there are {tracked[at]} of at most {tracked.max()} tracks"
     if moments:
-        return before(moments[0].t_ns, opened.start_ns), f"a second before event 1 ({moments[0].text})"
+        return moments[0].opens_ns(opened.start_ns), f"before event 1 ({moments[0].text})"
     return opened.start_ns, "its start: nothing is tracked in it yet"
 
 
@@ -212,11 +204,6 @@ def _tracks_over_time(opened: log.Log, topic: str) -> tuple[NDArray[np.int64], N
 def seconds_of(opened: log.Log, t_ns: int) -> float:
     """Return a log time as seconds since the start of the log."""
     return (t_ns - opened.start_ns) / NS_PER_S
-
-
-def before(t_ns: int, start_ns: int) -> int:
-    """Return the log time in ns at which viewers open to show an event, in a log with this start."""
-    return max(t_ns - round(LEAD_S * NS_PER_S), start_ns)
 
 
 def video_formats(opened: log.Log) -> dict[str, str]:

@@ -1,7 +1,8 @@
-"""Serve logs to viewers in a browser: a few files by HTTP, only on this machine.
+"""Serve logs to viewers in a browser: a few files by HTTP, on this machine unless another address is given.
 
-Viewers read ranges of a log from another origin, so the server supports ranges and CORS. Addresses begin with a secret
-word, because any page in a browser could send requests. Only the given files are served.
+Viewers read ranges of a log from another origin, so files have ranges and CORS, and addresses with a secret word,
+because any page in a browser could send requests. Our own pages have neither CORS nor secrets that other origins could
+read: the first one, at ``/``, has an address that anyone can remember. Only what is given is served.
 
 Requests follow RFC 9110 and RFC 9112: malformed ones get 400, and their connection is closed.
 """
@@ -9,6 +10,7 @@ Requests follow RFC 9110 and RFC 9112: malformed ones get 400, and their connect
 from __future__ import annotations
 
 import io
+import ipaddress
 import os
 import re
 import secrets
@@ -16,13 +18,14 @@ import socket
 import stat
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from email.utils import formatdate
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socketserver import TCPServer
 from time import monotonic
 from typing import Any, BinaryIO, Final
 from urllib.parse import quote, unquote_to_bytes
@@ -31,13 +34,29 @@ from mcaptrack.errors import McaptrackError
 
 LOOPBACK: Final = "127.0.0.1"
 _LOCAL: Final = (LOOPBACK, "localhost")
+#: The hosts that stand for all addresses of this machine.
+_ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104  # named, not used unless it is asked for
 _TOKEN: Final = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
 _VALUE: Final = re.compile(r"[\t\x20-\x7e\x80-\xff]*")
 _AUTHORITY: Final = re.compile(r"([0-9A-Za-z._~!$&'()*+,;=%-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{0,5})?")
 _ABSOLUTE: Final = re.compile(r"http://([^/?#]*)(/[^#]*)?", re.IGNORECASE)
 _RANGES: Final = re.compile(r"bytes=(.*)", re.IGNORECASE)
 _RANGE: Final = re.compile(r"([0-9]*)-([0-9]*)")
-_POLICY: Final = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+#: What no other origin may do with our pages: read, load or frame them, or learn their address.
+_OURS: Final = {
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+}
+#: What any origin may read if it knows the address.
+_SHARED: Final = {
+    "Accept-Ranges": "bytes",
+    "Access-Control-Allow-Origin": "*",
+    "Access-Control-Allow-Methods": "GET, HEAD, OPTIONS",
+    "Access-Control-Allow-Headers": "Range, If-Range",
+    "Access-Control-Allow-Private-Network": "true",
+    "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
+}
 #: More digits than the size of any file has.
 _MANY_DIGITS: Final = 20
 
@@ -57,36 +76,87 @@ class Limits:
     stall_s: float = 60.0
 
 
-class Server(ThreadingHTTPServer):
-    """Serves files and bytes under their names. ``port`` 0 is any free port.
+@dataclass(frozen=True)
+class Page:
+    """A page of ours or a file to download: ``content`` makes it when it is asked for, ``policy`` says what it may load
+    and run (a Content-Security-Policy). ``is_shared``: other origins may read it, as they may read files.
+    """
 
-    Raises McaptrackError if the port is taken.
+    content: Callable[[], bytes]
+    policy: str = "default-src 'none'"
+    kind: str = "text/html; charset=utf-8"
+    is_shared: bool = False
+
+
+#: What is served: a file, the content of one, or a page.
+Served = Path | bytes | Page
+
+
+class Server(ThreadingHTTPServer):
+    """Serves files, bytes and pages under their names, and ``index`` at ``/``. ``port`` 0 is any free port.
+
+    Raises McaptrackError if the port is taken, or if the machine has no such address as ``host``.
     """
 
     daemon_threads = True
     request_queue_size = 128
 
-    def __init__(self, served: Mapping[str, Path | bytes], port: int = 0, limits: Limits = Limits()) -> None:
+    def __init__(
+        self,
+        served: Mapping[str, Served],
+        port: int = 0,
+        limits: Limits = Limits(),
+        host: str = LOOPBACK,
+        index: Page | None = None,
+    ) -> None:
         self._word = secrets.token_urlsafe(12)
-        self.limits = limits
-        self.served = {f"/{self._word}/".encode() + os.fsencode(name): content for name, content in served.items()}
+        self.limits, self.host = limits, host
+        self.served: dict[bytes, Served] = {self.path(name): content for name, content in served.items()}
+        self.served |= {b"/": index} if index else {}
         self._lock = threading.Lock()
         #: The open connections, and the time since which each is idle; None while a request is answered.
         self._idle_since: dict[socket.socket, float | None] = {}
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
-            super().__init__((LOOPBACK, port), _Handler)
+            super().__init__((host, port), _Handler)
+        except socket.gaierror as error:
+            raise McaptrackError(f"this machine has no address {host}: {error.strerror}") from None
         except (OSError, OverflowError) as error:
             why = error.strerror if isinstance(error, OSError) else "there is no such port"
             raise McaptrackError(f"port {port} of this machine can't be used: {why}; choose another") from None
 
+    def server_bind(self) -> None:
+        """Bind the socket; the library would also ask for the name of the host, which may take long."""
+        TCPServer.server_bind(self)
+        self.server_name, self.server_port = self.host, self.server_address[1]
+
+    @property
+    def root(self) -> str:
+        """The address of the first page, as this machine opens it."""
+        shown = LOOPBACK if self.host in _ANY else f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{shown}:{self.server_port}/"
+
+    def path(self, name: str) -> bytes:
+        """The path of a file, with the secret word."""
+        return f"/{self._word}/".encode() + os.fsencode(name)
+
     def address(self, name: str) -> str:
         """The address of a file."""
-        return f"http://{LOOPBACK}:{self.server_port}/{self._word}/{quote(os.fsencode(name))}"
+        return f"{self.root}{self._word}/{quote(os.fsencode(name))}"
 
-    def add(self, name: str, content: bytes) -> str:
-        """Serve one more file; returns its address."""
-        self.served[f"/{self._word}/".encode() + os.fsencode(name)] = content
-        return self.address(name)
+    def is_host(self, name: str) -> bool:
+        """Return whether a request may name its host so.
+
+        A page from a name that resolves to this machine (DNS rebinding) sends that name, and never a number.
+        """
+        if name in _LOCAL:
+            return True
+        if self.host == LOOPBACK:
+            return False
+        try:
+            return bool(ipaddress.ip_address(name.strip("[]")))
+        except ValueError:
+            return name in (self.host.lower(), socket.gethostname().lower())
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answer in a thread, unless all connections are in use."""
@@ -132,11 +202,9 @@ class Server(ThreadingHTTPServer):
                 _end(connection)
 
 
-def _kind_of(name: str) -> dict[str, str]:
-    """The fields that say what a file is. Pages may load and run nothing, whoever made them."""
-    if name.endswith(".html"):
-        return {"Content-Type": "text/html; charset=utf-8", "Content-Security-Policy": _POLICY}
-    return {"Content-Type": "application/json" if name.endswith(".json") else "application/octet-stream"}
+def _kind_of(name: str) -> str:
+    """The kind of a file: nothing that a browser would show or run."""
+    return "application/json" if name.endswith(".json") else "application/octet-stream"
 
 
 def _end(connection: socket.socket) -> None:
@@ -230,9 +298,8 @@ class _Handler(BaseHTTPRequestHandler):
         lengths = [value.strip(" \t") for name, value in fields if name.lower() == "content-length"]
         if "Transfer-Encoding" in self.headers or any(not re.fullmatch("0+", length) for length in lengths):
             return HTTPStatus(413)
-        # A page from a name that resolves to this machine (DNS rebinding) sends that name.
-        is_local = named and all(name is not None and name[1].lower() in _LOCAL for name in named)
-        return None if is_local else HTTPStatus.NOT_FOUND
+        is_ours = named and all(name is not None and self.server.is_host(name[1].lower()) for name in named)
+        return None if is_ours else HTTPStatus.NOT_FOUND
 
     def do_GET(self) -> None:
         self._answer(with_body=True)
@@ -252,12 +319,18 @@ class _Handler(BaseHTTPRequestHandler):
         """Print nothing."""
 
     def _answer(self, with_body: bool) -> None:
-        content = self.server.served.get(unquote_to_bytes(self.path.partition("?")[0].encode("latin-1")))
+        name = self.path.partition("?")[0]
+        content = self.server.served.get(unquote_to_bytes(name.encode("latin-1")))
         if content is None:
             self._head(HTTPStatus.NOT_FOUND, {"Content-Length": "0"})
+        elif isinstance(content, Page):
+            body = content.content()
+            policy = f"{content.policy}; frame-ancestors 'self'"
+            about = {"Content-Type": content.kind, "Content-Security-Policy": policy, "Content-Length": str(len(body))}
+            self._head(HTTPStatus.OK, about, _SHARED if content.is_shared else _OURS)
+            self.wfile.write(body if with_body else b"")
         elif isinstance(content, bytes):
-            name = self.path.partition("?")[0]
-            self._head(HTTPStatus.OK, {**_kind_of(name), "Content-Length": str(len(content))})
+            self._head(HTTPStatus.OK, {"Content-Type": _kind_of(name), "Content-Length": str(len(content))})
             self.wfile.write(content if with_body else b"")
         else:
             try:
@@ -277,7 +350,7 @@ class _Handler(BaseHTTPRequestHandler):
         if with_body and self.headers.get("If-Range", tag).strip(" \t") == tag:  # only GET has ranges
             span, status = requested_range(self.headers.get_all("Range", []), status_of_file.st_size)
         headers = {
-            **_kind_of(path.name if path.suffix == ".json" else ""),
+            "Content-Type": _kind_of(path.name),
             "Content-Length": str(len(span)),
             "ETag": tag,
             "Last-Modified": formatdate(status_of_file.st_mtime, usegmt=True),
@@ -294,18 +367,10 @@ class _Handler(BaseHTTPRequestHandler):
                 sent = 0
             self.close_connection |= sent < len(span)  # the file became shorter
 
-    def _head(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
+    def _head(self, status: HTTPStatus, headers: Mapping[str, str], origins: Mapping[str, str] = _SHARED) -> None:
         self.send_response(status)
-        shared = {
-            "Accept-Ranges": "bytes",
-            "Access-Control-Allow-Origin": "*",
-            "Access-Control-Allow-Methods": "GET, HEAD, OPTIONS",
-            "Access-Control-Allow-Headers": "Range, If-Range",
-            "Access-Control-Allow-Private-Network": "true",
-            "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
-            "Cache-Control": "no-store",
-        }
-        for name, value in {**shared, **headers}.items():
+        always = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+        for name, value in {**origins, **always, **headers}.items():
             self.send_header(name, value)
         self.end_headers()
 

@@ -10,10 +10,12 @@ import json
 import zlib
 from base64 import b64encode
 from collections.abc import Sequence
-from hashlib import sha256
 from typing import Any, Final, NamedTuple
 
+from markupsafe import Markup
+
 from mcaptrack.foxglove.views import SUFFIXES
+from mcaptrack.transforms import FULL
 from mcaptrack.viewing.from_above import BACKGROUND
 from mcaptrack.viewing.notebook.pictures import Clip
 from mcaptrack.viewing.report.formatting import render
@@ -34,18 +36,19 @@ def still_html(jpeg: bytes, width_px: int, caption: str) -> str:
     return str(render("in_notebook.html", width=width_px, jpeg=jpeg, caption=caption, page=""))
 
 
-def player_html(
-    taken: Clip,
-    seconds: Sequence[float],
-    events: Sequence[tuple[float, str]],
-    opens_at: int,
-    still: Still,
-    caption: str,
-) -> str:
-    """Return the player of N pictures at times in seconds (N,), with events at times, each with a text.
+def player_html(page: str, still: Still, caption: str) -> str:
+    """Return a player in a frame, for a notebook, with the still below it."""
+    width = max(still.width_px, _LEAST_PX)
+    return str(render("in_notebook.html", width=width, jpeg=still.jpeg, caption=caption, page=page))
 
-    ``opens_at`` is the picture that it begins with, ``still``.
+
+def player_page(
+    taken: Clip, seconds: Sequence[float], events: Sequence[tuple[float, str, str]], opens_at: int, caption: str
+) -> str:
+    """Return the page of a player. ``events`` have a time in seconds, a text, and the topic of their tracks; those of
+    tracks that have no layer are left out.
     """
+    tracks = {topic: at for at, layer in enumerate(taken.layers) if (topic := _tracks_of(layer))}
     data = {
         "seconds": [round(second, 3) for second in seconds],
         "numbers": taken.numbers,
@@ -54,19 +57,21 @@ def player_html(
         "names": {topic: _name(topic) for topic in taken.layers if topic},
         "colours": taken.strokes.colours,
         "drawn": taken.drawn,
-        "events": [[round(at, 3), text] for at, text in events],
+        "tracks": tracks,
+        "hidden": [taken.layers.index(layer) for layer in taken.hidden],
+        "events": [[round(at, 3), text, tracks[topic]] for at, text, topic in events if topic in tracks],
         "open": opens_at,
         "ground": "#" + bytes(BACKGROUND[::-1]).hex(),
     }
-    page = render(
-        "player.html",
-        caption=caption,
-        pictures=" ".join(_base64(jpeg) for jpeg in taken.jpegs),
-        data=_base64(_packed(data)),
-        nonce=_base64(sha256(caption.encode("utf-8", "replace")).digest()[:12]),
-    )
-    width = max(still.width_px, _LEAST_PX)
-    return str(render("in_notebook.html", width=width, jpeg=still.jpeg, caption=caption, page=str(page)))
+    pictures = " ".join(_base64(jpeg) for jpeg in taken.jpegs)
+    return str(render("player.html", caption=caption, pictures=pictures, data=_base64(_packed(data))))
+
+
+def _tracks_of(layer: str) -> str:
+    """The channel of tracks that a layer draws; "" for predictions and the ground."""
+    for suffix in SUFFIXES:
+        layer = layer.partition(suffix)[0]
+    return "" if layer.endswith("/predictions") else layer.removesuffix(FULL)
 
 
 def _name(topic: str) -> str:
@@ -85,7 +90,7 @@ def _base64(data: bytes) -> str:
 
 
 def framed_html(page: str | None, caption: str) -> str:
-    """Return a page without scripts in a frame, with a caption; the caption alone without a page."""
+    """Return a page in a frame, without an origin, with a caption; the caption alone without a page."""
     return str(render("framed.html", page=page or "", caption=caption))
 
 
@@ -111,7 +116,7 @@ class ShownColumn(NamedTuple):
     texts: Sequence[str | None]
 
 
-def table_html(columns: Sequence[ShownColumn], rows: int) -> str:
+def table_html(columns: Sequence[ShownColumn], rows: int) -> Markup:
     """Return a table of some rows as HTML. ``columns`` hold all rows, or the first and the last ones of more."""
     shown = len(columns[0].texts) if columns else 0
     lines = [[_short(column.texts[row]) for column in columns] for row in range(shown)]
@@ -119,7 +124,7 @@ def table_html(columns: Sequence[ShownColumn], rows: int) -> str:
     caption = f"{rows:,} rows, {len(columns)} columns"
     if shown < rows:
         caption += f"; the first {FIRST} and the last {LAST} rows are shown"
-    return str(render("table.html", columns=columns, lines=lines, gap=gap, caption=caption))
+    return render("table.html", columns=columns, lines=lines, gap=gap, caption=caption)
 
 
 def _short(text: str | None) -> str | None:

@@ -26,6 +26,7 @@ from mcaptrack.schema import PREDICTIONS, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import has_any
 from mcaptrack.sources.camera_motion import path_of, tracks_topic
+from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.foreign import holds_pictures
 from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
@@ -139,10 +140,11 @@ class Clip:
     above, JPEG files, which may be smaller.
 
     ``drawn`` has for each picture the lines and texts of each of ``layers``, in pixels of that size. Layers are topics
-    of views; the ground that is seen from above is "".
+    of views; the ground that is seen from above is "". ``hidden`` are those that a player shows only if it is asked to.
     """
 
     layers: tuple[str, ...]
+    hidden: tuple[str, ...] = ()
     t_ns: list[int] = field(default_factory=list)
     numbers: list[int] = field(default_factory=list)
     sizes: list[tuple[int, int]] = field(default_factory=list)
@@ -153,7 +155,7 @@ class Clip:
     def half(self) -> Clip:
         """Every second picture."""
         parts = self.t_ns[::2], self.numbers[::2], self.sizes[::2], self.jpegs[::2], self.drawn[::2]
-        return Clip(self.layers, *parts, self.strokes)
+        return Clip(self.layers, self.hidden, *parts, self.strokes)
 
 
 # The views that a notebook shows: those in the log, or else drawings of rows that have no view yet.
@@ -216,6 +218,17 @@ def find_drawings(opened: log.Log, prefix: str, topics: Sequence[str]) -> ToShow
         return _drawn_now(opened, prefix, usable)
     t_ns = opened.times(shown.pictures or shown.views[0])
     return ToShow([_recorded(opened, topic) for topic in shown.views], shown.pictures, t_ns)
+
+
+def _other_tracks(opened: log.Log, view: str) -> list[ShownView]:
+    """Return the views of the tracker's tracks and of the ground truth in the same place as a view."""
+    suffix = next((name for name in views.SUFFIXES if name in view), "")
+    camera = next((each for each in cameras(opened) if view in each.topics), None)
+    if not suffix or camera is None:
+        return []
+    place = view.partition(suffix)[2]
+    topics = (f"{tracks}{suffix}{place}" for tracks in (f"{camera.prefix}/tracks", camera.truth))
+    return [_recorded(opened, topic) for topic in topics if topic in opened.channels and topic != view]
 
 
 def _has_view(opened: log.Log, topic: str) -> bool:
@@ -281,13 +294,16 @@ def _drawing(opened: log.Log, prefix: str, topic: str, is_above: bool) -> ShownV
 class PictureSource:
     """The pictures of a log, or its scenes seen from above, with the views that are drawn on them.
 
-    ``t_ns`` are their rising times (N,); ``noun`` is "pictures" or "scenes". Raises McaptrackError if there are none.
+    ``t_ns`` are their rising times (N,); ``noun`` is "pictures" or "scenes". With ``all_tracks`` those that aren't
+    shown at first are drawn, too; ``hidden`` are their views. Raises McaptrackError if there are none.
     """
 
-    def __init__(self, opened: log.Log, prefix: str, topics: Sequence[str]) -> None:
+    def __init__(self, opened: log.Log, prefix: str, topics: Sequence[str], all_tracks: bool = False) -> None:
         shown = find_drawings(opened, prefix, topics)
-        self._opened, self._prefix, self._views = opened, prefix, shown.views
-        self.views = tuple(view.topic for view in shown.views)
+        others = _other_tracks(opened, shown.views[0].topic) if all_tracks and shown.views else []
+        self._opened, self._prefix, self._views = opened, prefix, [*shown.views, *others]
+        self.views = tuple(view.topic for view in self._views)
+        self.hidden = tuple(view.topic for view in others)
         self._pictures = Pictures(opened, shown.pictures) if shown.pictures else None
         self.topic = shown.pictures or self.views[0]
         self.is_above = not shown.pictures
@@ -341,7 +357,7 @@ class PictureSource:
 
         Raises McaptrackError for pictures and views that are damaged.
         """
-        out = Clip(self.views if self._pictures is not None else ("", *self.views))
+        out = Clip(self.views if self._pictures is not None else ("", *self.views), self.hidden)
         for done, (number, size, image, drawings) in enumerate(self._drawn_on(numbers, width_px or PLAYER_PX), 1):
             out.t_ns.append(int(self.t_ns[number]))
             out.numbers.append(number)

@@ -6,8 +6,8 @@ page(reports)            the page, with all numbers inside
 data(reports)            the numbers alone: those of ``evaluate --json``, and more
 fleet_page(rows, ...)    the page about all logs of a folder of tables; its numbers are ``fleet_data(rows)``
 
-The same logs give the same bytes. The page loads nothing and runs nothing: its policy forbids both, in case a name in a
-log got past the escaping.
+The same logs give the same bytes. The page loads nothing, and runs only its own script, which sorts a table, lights a
+track that is clicked and shows values; its policy forbids all else, in case a name in a log got past the escaping.
 """
 
 from __future__ import annotations
@@ -244,6 +244,8 @@ def draw(report: LogReport, at: int, total: int) -> None:
         level=2 if total == 1 else 3,
         identities=identity_timeline(report),
         over_time=people_over_time(report),
+        tracks=figures.track_table(report),
+        warnings=report.warnings,
         scores=sections.scores(report),
         scene=figures.scene_map(report),
         heat=figures.heat(report),
@@ -255,7 +257,7 @@ def draw(report: LogReport, at: int, total: int) -> None:
         notes=report.notes,
         people=report.has_only_people,
     )
-    report.background, report.sequence, report.highlights = None, None, []
+    report.background, report.forecast_scene, report.sequence, report.highlights = None, None, None, []
     report.doubts, report.doubtful_tracks = [], []
     for track_set in report.track_sets.values():
         track_set.frames = []
@@ -308,7 +310,8 @@ def _comparison(reports: Sequence[LogReport]) -> dict[str, Any]:
             if scores and scores.tracked and scores.retracked
         ]
         if values:
-            axis = Axis(label, 1.0 if is_share else round_most([np.array([v[1:] for v in values]).ravel()]), is_share)
+            most = 1.0 if is_share else round_most([np.array([v[1:] for v in values]).ravel()], whole=True)
+            axis = Axis(label, most, is_share, whole=not is_share)
             chart = pairs_chart(f"{label} by log", values, axis, ("tracked", "re-tracked"))  # type: ignore[arg-type]
             charts.append(figure(chart, label, ""))
     ranges = [

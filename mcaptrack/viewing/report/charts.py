@@ -49,15 +49,16 @@ class Line:
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis from 0 to ``most`` with its label; ``percent`` prints shares in percent."""
+    """An axis from 0 to ``most`` with its label; ``percent`` prints shares in percent, ``whole`` counts."""
 
     label: str
     most: float
     percent: bool = False
+    whole: bool = False
 
     def ticks(self) -> list[tuple[float, str]]:
         """About five round numbers with their texts."""
-        step = round_step(self.most / 4.5)
+        step = _step(self.most, self.whole)
         values = np.arange(0, self.most + step * 1e-6, step).tolist()
         return [(value, f"{100 * value:.0f}" if self.percent else f"{value:g}") for value in values]
 
@@ -79,10 +80,18 @@ def round_step(least: float) -> float:
     return next((k * power for k in (1, 2, 2.5, 5) if k * power >= least * (1 - 1e-9)), 10 * power)
 
 
-def round_most(values: Iterable[Floats], least: float = 0.0) -> float:
-    """The round number at which an axis for these values ends."""
+def _step(most: float, whole: bool) -> float:
+    """The distance between about five ticks."""
+    step = round_step(most / 4.5) if most > 0 else 1.0
+    if not whole:
+        return step
+    return max(1.0, step if step.is_integer() else round_step(step * 1.1))
+
+
+def round_most(values: Iterable[Floats], least: float = 0.0, whole: bool = False) -> float:
+    """The round number at which an axis for these values ends; ``whole`` for counts."""
     top = max([least, *(float(np.nanmax(part)) for part in values if np.isfinite(part).any())])
-    step = round_step(top / 4.5) if top > 0 else 1.0
+    step = _step(top, whole)
     return max(math.ceil(top / step - 1e-9), 1) * step
 
 
@@ -99,7 +108,8 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
     bands, drawn, dots, ends = [], [], [], []
     if diagonal:
         top = min(x.most, y.most)
-        drawn.append({"points": points(np.array([0, top]), np.array([0, top])), "role": "truth", "dashed": True})
+        way = points(np.array([0, top]), np.array([0, top]))
+        drawn.append({"points": way, "role": "truth", "dashed": True, "name": ""})
         ends.append((bottom - top / y.most * height, diagonal, "truth"))
     for line in lines:
         kept = np.isfinite(line.x) & np.isfinite(line.y)
@@ -109,18 +119,43 @@ def line_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, diagonal: st
             around = np.concatenate([line.x[kept], line.x[kept][::-1]])
             band = np.concatenate([line.low[kept], line.high[kept][::-1]])
             bands.append({"points": points(around, band), "role": line.role})
-        drawn.append({"points": points(line.x[kept], line.y[kept]), "role": line.role, "dashed": line.dashed})
+        way = points(line.x[kept], line.y[kept])
+        drawn.append({"points": way, "role": line.role, "dashed": line.dashed, "name": line.name})
         if line.dot is not None:
             at = points(*(np.array([value]) for value in line.dot)).split(",")
             dots.append((*at, line.role))
         ends.append((bottom - min(float(line.y[kept][-1]) / y.most, 1) * height, line.name, line.role))
     return {
-        "kind": "lines", "title": title, "width": WIDTH, "height": HEIGHT,
+        "kind": "lines", "title": title, "width": WIDTH, "height": HEIGHT, "scale": _scale(x, y),
+        "box": f"{_LEFT} {_TOP} {_LEFT + width} {bottom}",
         "left": _LEFT, "right": _LEFT + width, "bottom": bottom,
         "x_ticks": [(_fixed(_LEFT + value / x.most * width), text) for value, text in x.ticks()],
         "y_ticks": [(_fixed(bottom - value / y.most * height), text) for value, text in y.ticks()],
         "x_label": x.label, "y_label": y.label, "x_middle": _LEFT + width / 2,
         "bands": bands, "lines": drawn, "dots": dots, "names": _names(ends, height), "names_x": _LEFT + width + 6,
+    }  # fmt: skip
+
+
+def _scale(x: Axis, y: Axis) -> str:
+    """Where both axes end, as texts show values: shares in percent."""
+    return " ".join(f"{axis.most * (100 if axis.percent else 1):.9g}" for axis in (x, y))
+
+
+def timeline_chart(title: str, lines: Sequence[Line], x: Axis, y: Axis, ticks: Sequence[Any]) -> Chart:
+    """A chart of lines as wide as its page, without text but for the ``ticks`` of its axis of time.
+
+    Lines are in thousandths of its width and hundredths of its height, which a page stretches.
+    """
+
+    def points(line: Line) -> str:
+        across, up = 1000 * np.clip(line.x / x.most, 0, 1), 100 - 100 * np.clip(line.y / y.most, 0, 1)
+        return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across.tolist(), up.tolist(), strict=True))
+
+    drawn = [{"points": points(line), "role": line.role, "dashed": line.dashed, "name": line.name} for line in lines]
+    return {
+        "title": title, "scale": _scale(x, y), "box": "0 0 1000 100", "x_ticks": ticks, "y_label": y.label,
+        "lines": drawn,
+        "y_ticks": [(f"{100 - 100 * value / y.most:.1f}%", text) for value, text in y.ticks()],
     }  # fmt: skip
 
 
@@ -188,6 +223,7 @@ def pairs_chart(title: str, rows: Sequence[tuple[str, float, float]], axis: Axis
                 "name": name if len(name) <= _MAX_NAME else name[: _MAX_NAME - 1] + "…",
                 "before": at(before),
                 "after": at(after),
+                "texts": [f"{100 * value:.1f} %" if axis.percent else f"{value:g}" for value in (before, after)],
             }
             for k, (name, before, after) in enumerate(rows)
         ],

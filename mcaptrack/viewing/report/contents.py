@@ -21,7 +21,7 @@ from mcaptrack.evaluation.zones import ZoneTotals
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
 from mcaptrack.geometry.zones import Zone
-from mcaptrack.schema import DECISIONS, EVENTS, TRACKS, ZONE_COUNTS, Frame
+from mcaptrack.schema import DECISIONS, EVENTS, PREDICTIONS, TRACKS, ZONE_COUNTS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import frame_times, joined_parts
 from mcaptrack.schema.provenance import Provenance
@@ -33,7 +33,7 @@ from mcaptrack.transforms import FULL
 from mcaptrack.viewing.comparing import tracker_name
 from mcaptrack.viewing.report import statistics
 from mcaptrack.viewing.report.charts import POINTS, Axis, Floats, Line, figure, line_chart, round_most
-from mcaptrack.viewing.report.formatting import NONE, number, plain, short
+from mcaptrack.viewing.report.formatting import NONE, clock, number, plain, short
 from mcaptrack.viewing.report.headline import AFTER, BEFORE, BeforeAfter, compared
 from mcaptrack.viewing.report.identity_events import (
     ChannelEvents,
@@ -46,7 +46,7 @@ from mcaptrack.viewing.report.identity_events import (
     most_important,
     summarize_events,
 )
-from mcaptrack.viewing.report.scene_map import SceneBackground, background_picture
+from mcaptrack.viewing.report.scene_map import SceneBackground, background_picture, forecast_map, moment_picture
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {
@@ -58,6 +58,8 @@ ROLES: Final = {
 }
 #: What is added to the name of tracks at the video rate, beside those at the prediction rate that are compared.
 EVERY_PICTURE: Final = ", every picture"
+#: The channels of forecasts below the name of a camera, the best first, and the roles of their tracks.
+_FORECASTS: Final = {"retracks/predictions": "online", "predictions": "samples"}
 #: The number of events with thumbnails.
 _THUMBNAILS: Final = 12
 
@@ -89,12 +91,14 @@ class LogReport:
     repairs: ChannelEvents | None = None
     planes: Planes = ()
     background: SceneBackground | None = None
+    forecast_scene: dict[str, Any] | None = None
     data: dict[str, Any] = field(default_factory=dict)
     people: dict[str, PersonScores] = field(default_factory=dict)
     doubts: list[Doubt] = field(default_factory=list)
     doubtful_tracks: list[DoubtfulTrack] = field(default_factory=list)
     missing: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     html: str = ""
     zones: dict[str, Any] = field(default_factory=dict)
     has_only_people: bool = True
@@ -227,7 +231,10 @@ def _inside(opened: log.Log, topic: str, zones: tuple[Zone, ...]) -> dict[str, t
 
 def _chart(name: str, lines: list[Line]) -> dict[str, Any]:
     last = max((float(line.x[-1]) for line in lines), default=1.0)
-    axes = Axis("time, s", max(last, 1e-3)), Axis("tracks inside", round_most([line.y for line in lines], 4.0))
+    axes = (
+        Axis("time, s", max(last, 1e-3)),
+        Axis("tracks inside", round_most([line.y for line in lines], 4.0, whole=True), whole=True),
+    )
     chart = line_chart(f"Tracks inside {name} over time", lines, *axes)
     return figure(chart, f"Inside {name}.", "The most at a time in each period.")
 
@@ -249,6 +256,9 @@ def gather(
     file, name = file or opened.path.name, name or opened.path.stem
     out = LogReport(file, name, prefix, opened.start_ns, opened.end_ns)
     _read(opened, out)
+    made = (Provenance.from_metadata(channel.metadata) for _, channel in sorted(opened.channels.items()))
+    messages = (message for provenance in made if provenance for _, message in provenance.warnings)
+    out.warnings = [text.replace(str(opened.path), opened.path.name) for text in dict.fromkeys(messages)]
     progress(f"{opened.path}: scores")
     _score(opened, out)
     progress(f"{opened.path}: events")
@@ -263,7 +273,10 @@ def gather(
     _read_pictures(opened, out)
     out.zones = zone_section(opened, prefix, {role: track_set.name for role, track_set in out.track_sets.items()})
     out.data = plain(
-        _recording(opened) | {"name": out.name, "camera": prefix} | _statistics(out) | {"notes": out.notes}
+        _recording(opened)
+        | {"name": out.name, "camera": prefix}
+        | _statistics(out)
+        | {"notes": out.notes, "warnings": out.warnings}
     )
     return out
 
@@ -414,6 +427,7 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
     try:
         pictures = Pictures(opened, topic)
         out.background = background_picture(pictures)
+        out.forecast_scene = _forecast_scene(opened, out, pictures)
         for channel, events in zip(out.channel_events, out.highlights, strict=True):
             add_thumbnails(events, _with_boxes(out, channel.topic), pictures, out.start_ns)
         if out.doubts and out.repairs is not None:
@@ -426,6 +440,30 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
         return
     if out.background is None:
         out.missing["pictures"] = f"{topic} holds no pictures"
+
+
+def _forecast_scene(opened: log.Log, out: LogReport, pictures: Pictures) -> dict[str, Any] | None:
+    """The forecasts of the time with the most of them, over its picture; None without forecasts or a ground plane."""
+    for below, role in _FORECASTS.items():
+        channel = opened.channels.get(f"{out.prefix}/{below}")
+        if channel is None or not channel.holds(PREDICTIONS):
+            continue
+        chosen = max(
+            opened.frames(channel.topic, PREDICTIONS),
+            key=lambda frame: len(np.unique(frame.rows["track_id"])),
+            default=None,
+        )
+        plane = plane_at(out.planes, chosen.t_ns) if chosen is not None and len(chosen.rows) else None
+        behind = moment_picture(pictures, chosen.t_ns) if chosen is not None and plane is not None else None
+        if chosen is None or plane is None or behind is None:
+            continue
+        past = out.track_sets.get(role)
+        future = out.track_sets["truth"].frames if "truth" in out.track_sets else []
+        drawn = forecast_map(chosen.rows, past.frames if past else [], future, chosen.t_ns, behind, plane)
+        names = {"name": short(past.name) if past else channel.topic, "role": role}
+        at = clock((chosen.t_ns - out.start_ns) / NS_PER_S)
+        return drawn | names | {"t_ns": chosen.t_ns, "clock": at, "has_truth": bool(future)}
+    return None
 
 
 def _with_boxes(out: LogReport, topic: str) -> list[Frame]:
@@ -452,6 +490,10 @@ def _statistics(out: LogReport) -> dict[str, Any]:
     return {
         "tracks": track_sets,
         "forecasts": statistics.forecast_statistics(out.sequence, out.results) if out.sequence else [],
+        "track_list": {
+            role: statistics.list_tracks(out.track_sets[role].frames, out.start_ns)
+            for role in [role for role in out.compared_roles if role in out.track_sets][-1:]
+        },
         "events": [channel.to_json() for channel in out.channel_events],
         "speed_m_per_s": statistics.histograms({t: statistics.speeds_m_per_s(frames) for t, frames in metric.items()}),
         "dwell_s": statistics.histograms(

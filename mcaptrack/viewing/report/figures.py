@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -15,9 +15,9 @@ from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import run_starts
-from mcaptrack.schema import Frame
+from mcaptrack.schema import EventKind, Frame
 from mcaptrack.schema.framing import frame_times, row_ends
-from mcaptrack.viewing.report.charts import POINTS, Axis, Line, figure, line_chart, round_most
+from mcaptrack.viewing.report.charts import POINTS, Axis, Line, figure, round_most, timeline_chart
 from mcaptrack.viewing.report.contents import LogReport, TrackSet, plane_of
 from mcaptrack.viewing.report.formatting import clock, counted, number, short, tick_marks
 from mcaptrack.viewing.report.headline import rule_text
@@ -51,9 +51,10 @@ def scene_map(report: LogReport) -> dict[str, Any]:
         drawn = _with_paths(sets, [pixel_paths(tracks.frames, plane) for tracks in sets])
         if drawn:
             maps = [
-                _map(tracks, paths, picture_map(paths, report.background, report.start_s)) for tracks, paths in drawn
+                _map(report, tracks, paths, picture_map(paths, report.background, report.start_s))
+                for tracks, paths in drawn
             ]
-            return {"missing": "", "maps": maps, "jpeg": report.background.jpeg, "plans": _plans(sets)}
+            return {"missing": "", "maps": maps, "jpeg": report.background.jpeg, "plans": _plans(report, sets)}
         why = "No track has a place in the picture"
     else:
         why = report.missing.get("pictures", "There are no pictures")
@@ -61,16 +62,16 @@ def scene_map(report: LogReport) -> dict[str, Any]:
     if not drawn:
         return {"missing": _NO_GROUND, "maps": [], "plans": []}
     span = ground_span([path.points for _, paths in drawn for path in paths])
-    maps = [_map(tracks, paths, ground_map(paths, span, report.start_s)) for tracks, paths in drawn]
+    maps = [_map(report, tracks, paths, ground_map(paths, span, report.start_s)) for tracks, paths in drawn]
     return {"missing": f"{why}; here is the ground instead.", "maps": maps, "jpeg": b"", "plans": []}
 
 
-def _plans(sets: Sequence[TrackSet]) -> list[dict[str, Any]]:
+def _plans(report: LogReport, sets: Sequence[TrackSet]) -> list[dict[str, Any]]:
     """Plans of the ground in metres: of re-tracked people, or of tracks, and of the ground truth."""
     chosen = {"truth" if tracks.role == "truth" else "tracks": tracks for tracks in sets}
     drawn = _with_paths([*chosen.values()], [ground_paths(tracks.frames) for tracks in chosen.values()])
     span = ground_span([path.points for _, paths in drawn for path in paths])
-    return [_map(tracks, paths, ground_map(paths, span, 0.0)) for tracks, paths in drawn]
+    return [_map(report, tracks, paths, ground_map(paths, span, 0.0)) for tracks, paths in drawn]
 
 
 def heat(report: LogReport) -> dict[str, Any] | None:
@@ -88,8 +89,60 @@ def _with_paths(sets: Sequence[TrackSet], paths: Sequence[list[TrackPath]]) -> l
     return [(tracks, own) for tracks, own in zip(sets, paths, strict=True) if own]
 
 
-def _map(tracks: TrackSet, paths: Sequence[TrackPath], values: dict[str, Any]) -> dict[str, Any]:
+def _map(report: LogReport, tracks: TrackSet, paths: Sequence[TrackPath], values: dict[str, Any]) -> dict[str, Any]:
+    joined = _joined(report)
+    for path in values["tracks"]:
+        path["key"] = "" if path["id"] is None else _keys(tracks.role, path["id"], joined)
     return values | {"name": short(tracks.name), "role": tracks.role, "count": counted(len(paths), "track")}
+
+
+# Elements of one track have a key in common: the page lights all of them where one is clicked.
+
+
+#: The roles of tracks that have the ids of the tracker.
+_TRACKER: Final = ("tracks", "samples")
+#: The largest number of rows of the table of tracks; those that last longest.
+_MOST_ROWS: Final = 200
+
+
+def track_key(role: str, identity: int) -> str:
+    """The key of a track. Samples of tracks have the same ids."""
+    return f"{'tracks' if role in _TRACKER else role}-{identity}"
+
+
+def _keys(role: str, identity: int, joined: Mapping[int, Sequence[str]]) -> str:
+    """The key of a track, and those of the re-tracked tracks that it is part of."""
+    return " ".join([track_key(role, identity), *(joined.get(identity, ()) if role in _TRACKER else ())])
+
+
+def _joined(report: LogReport) -> dict[int, list[str]]:
+    """The keys of the re-tracked tracks that a track of the tracker is part of, by its id."""
+    role = report.compared_roles[1]
+    if role not in report.track_sets:
+        return {}
+    rows, _ = rows_by_track(report.track_sets[role].frames)
+    rows = rows[rows["observed"] & (rows["source_id"] >= 0)]
+    out: dict[int, list[str]] = {}
+    for track, source in np.unique(np.stack([rows["track_id"], rows["source_id"]], axis=-1), axis=0).tolist():
+        out.setdefault(int(source), []).append(track_key(role, int(track)))
+    return out
+
+
+def track_table(report: LogReport) -> dict[str, Any] | None:
+    """The table of the re-tracked tracks, or those of the tracker; None without any."""
+    for role, listed in report.data["track_list"].items():
+        shown = sorted(listed, key=lambda track: -track["seconds"])[:_MOST_ROWS]
+        if shown:
+            return {
+                "name": short(report.track_sets[role].name),
+                "role": role,
+                "left_out": len(listed) - len(shown),
+                "rows": [
+                    track | {"key": track_key(role, track["id"])}
+                    for track in sorted(shown, key=lambda track: (track["from_s"], track["id"]))
+                ],
+            }
+    return None
 
 
 def identity_events(report: LogReport) -> dict[str, Any]:
@@ -102,22 +155,28 @@ def identity_events(report: LogReport) -> dict[str, Any]:
         "timelines": [_timeline(channel, shown, report) for channel, shown in pairs],
         "highlights": [_highlights(channel, shown, report) for channel, shown in pairs if channel.events],
         "doubts": [
-            _event(doubt.event, doubt.text(), report) | {"is_wrong": doubt.is_right is False} for doubt in report.doubts
+            _event(doubt.event, doubt.text(), report, report.compared_roles[1]) | {"is_wrong": doubt.is_right is False}
+            for doubt in report.doubts
         ],
         "have_odds": any(doubt.probability is not None for doubt in report.doubts),
         "doubtful_tracks": [
-            {"text": doubtful_track.text("person" if report.has_only_people else "object"), "t_ns": doubtful_track.t_ns}
-            | {"clock": clock((doubtful_track.t_ns - report.start_ns) / NS_PER_S), "is_wrong": False, "thumbnails": []}
+            {"text": doubtful_track.text("a person" if report.has_only_people else "an object")}
+            | {"t_ns": doubtful_track.t_ns, "clock": clock((doubtful_track.t_ns - report.start_ns) / NS_PER_S)}
+            | {"is_wrong": False, "thumbnails": [], "key": track_key("tracks", int(doubtful_track.row["source_id"]))}
             for doubtful_track in report.doubtful_tracks
         ],
         "view": command("view", Path(report.file)),
     }
 
 
-def _event(event: IdentityEvent, text: str, report: LogReport) -> dict[str, Any]:
-    """An event with its time for a viewer: in ns since 1970, and in seconds of the log."""
+def _event(event: IdentityEvent, text: str, report: LogReport, role: str) -> dict[str, Any]:
+    """An event with its time for a viewer: in ns since 1970, and in seconds of the log; ``role`` is of its tracks."""
     seconds = (event.t_ns - report.start_ns) / NS_PER_S
+    is_join = int(event.row["kind"]) == EventKind.JOINED
+    others = [(role, "track_id"), ("tracks" if is_join else role, "previous_id")]
+    others += [("tracks", "source_id")] if is_join else []
     return {
+        "key": " ".join(track_key(kind, int(event.row[column])) for kind, column in others if event.row[column] >= 0),
         "text": _WHEN.sub("", text, count=1),  # the time stands before the text
         "is_wrong": False,
         "t_ns": event.t_ns,
@@ -164,10 +223,11 @@ def _highlights(channel: ChannelEvents, shown: Sequence[IdentityEvent], report: 
     most = "the most important event" if len(shown) == 1 else f"the {len(shown)} most important events"
     has_pictures = any(event.before or event.after for event in shown)
     why = report.missing.get("pictures", "The events have no place in the picture")
+    role = _set_of(report, channel).role
     return {
         "title": f"{short(_set_of(report, channel).name)}: {most}" + (f", and {number(rest)} more" if rest else ""),
         "missing": "" if has_pictures else f"{why}; they are listed without.",
-        "events": [_event(event, f"{event.text[:1].upper()}{event.text[1:]}.", report) for event in shown],
+        "events": [_event(event, f"{event.text[:1].upper()}{event.text[1:]}.", report, role) for event in shown],
     }
 
 
@@ -193,8 +253,6 @@ _MOST: Final = 40
 _PAUSE: Final = 1.6
 #: Pieces are at least this part of the width, in percent, and those with ids printed in them this part.
 _LEAST, _WIDE = 0.15, 4.5
-#: Logs longer than this are shown in minutes.
-_MINUTES: Final = 600.0
 
 
 class IdentitySpan(NamedTuple):
@@ -224,11 +282,11 @@ def identity_timeline(report: LogReport) -> dict[str, Any]:
     """The values of the section."""
     span_s = max((report.end_ns - report.start_ns) / NS_PER_S, 1e-9)
     scored = [(report.track_sets[role], report.people[role]) for role in report.compared_roles if role in report.people]
-    rows = _of_people(report, [people for _, people in scored]) if scored else _of_tracks(report)
+    rows = _of_people(report, [(side.role, people) for side, people in scored]) if scored else _of_tracks(report)
     kept = sorted(sorted(rows, key=lambda row: -row["seconds"])[:_MOST], key=lambda row: row["begins"])
-    headline = report.headline
+    headline, joined = report.headline, _joined(report)
     return {
-        "rows": [{**row, "lanes": [_lane(lane, span_s) for lane in row["lanes"]]} for row in kept],
+        "rows": [{**row, "lanes": [_lane(lane, span_s, joined) for lane in row["lanes"]]} for row in kept],
         "left_out": len(rows) - len(kept),
         "has_truth": bool(scored),
         "lanes": [
@@ -244,18 +302,19 @@ def _switches(people: PersonScores) -> str:
     return counted(int(people.switches.sum()), "identity switch", "identity switches")
 
 
-def _of_people(report: LogReport, sides: Sequence[PersonScores]) -> list[dict[str, Any]]:
+def _of_people(report: LogReport, sides: Sequence[tuple[str, PersonScores]]) -> list[dict[str, Any]]:
     """A row for each true person, with a lane for each kind of tracks."""
     truth, t_ns = rows_by_track(report.track_sets["truth"].frames)
     interval_ns = _interval_ns(np.unique(t_ns))
     out = []
     for person, low, high in _groups(truth["track_id"]):
-        lanes = [("truth", pieces(np.zeros(high - low, np.int64), t_ns[low:high], report.start_ns, interval_ns))]
-        for side in sides:
+        whole = np.full(high - low, person, np.int64)
+        lanes = [("truth", pieces(whole, t_ns[low:high], report.start_ns, interval_ns))]
+        for role, side in sides:
             low_match, high_match = np.searchsorted(side.person, [person, person + 1])
             own = slice(int(low_match), int(high_match))
             step_ns = _interval_ns(side.frame_ns)
-            lanes.append(("ids", pieces(side.track[own], side.t_ns[own], report.start_ns, step_ns)))
+            lanes.append((role, pieces(side.track[own], side.t_ns[own], report.start_ns, step_ns)))
         out.append(_row(person, lanes))
     return out
 
@@ -269,7 +328,10 @@ def _of_tracks(report: LogReport) -> list[dict[str, Any]]:
     interval_ns = _interval_ns(frame_times(report.track_sets[role].frames))
     sources = rows["source_id"].astype(np.int64)
     return [
-        _row(track, [("ids", pieces(_known(sources[low:high], track), t_ns[low:high], report.start_ns, interval_ns))])
+        _row(
+            track,
+            [("tracks", pieces(_known(sources[low:high], track), t_ns[low:high], report.start_ns, interval_ns))],
+        )
         for track, low, high in _groups(rows["track_id"])
     ]
 
@@ -302,9 +364,12 @@ def _interval_ns(t_ns: Ints) -> float:
     return float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else NS_PER_S / 10
 
 
-def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float) -> dict[str, Any]:
-    """A lane as coordinates in percent; pieces that are too short to be seen are drawn a little longer."""
-    kind, spans = lane
+def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float, joined: Mapping[int, Sequence[str]]) -> dict[str, Any]:
+    """A lane as coordinates in percent; pieces that are too short to be seen are drawn a little longer.
+
+    ``joined`` are the keys of the re-tracked tracks that a track of the tracker is part of.
+    """
+    role, spans = lane
     out = []
     for piece in spans:
         left = 100 * piece.first_s / span_s
@@ -315,12 +380,13 @@ def _lane(lane: tuple[str, list[IdentitySpan]], span_s: float) -> dict[str, Any]
                 "x": f"{left:.2f}%",
                 "width": f"{width:.2f}%",
                 "colour": piece.identity % COLOURS,
+                "key": _keys(role, piece.identity, joined),
                 "title": f"{piece.identity}: {seconds}",
                 "label": str(piece.identity) if width >= _WIDE else "",
                 "label_x": f"{left + 0.4:.2f}%",
             }
         )
-    return {"kind": kind, "pieces": out}
+    return {"kind": "truth" if role == "truth" else "ids", "pieces": out}
 
 
 def people_over_time(report: LogReport) -> dict[str, Any] | None:
@@ -328,21 +394,18 @@ def people_over_time(report: LogReport) -> dict[str, Any] | None:
     roles = [*filter(None, report.compared_roles), "truth"]
     sets = [report.track_sets[role] for role in roles if role in report.track_sets]
     span_s = max((report.end_ns - report.start_ns) / NS_PER_S, 1e-9)
-    scale, unit = (60.0, "minutes") if span_s > _MINUTES else (1.0, "seconds")
     lines = []
     for tracks in sets:
         at_s, count = counts_over_time(tracks.frames, report.start_ns, span_s)
         if len(at_s):
-            lines.append(Line(short(tracks.name), tracks.role, at_s / scale, count, dashed=tracks.role == "truth"))
+            lines.append(Line(short(tracks.name), tracks.role, at_s, count, dashed=tracks.role == "truth"))
     if not lines:
         return None
     noun = "people" if report.has_only_people else "objects"
-    axes = (
-        Axis(f"{unit} since the start", span_s / scale),
-        Axis(f"{noun} at a time", round_most(line.y for line in lines)),
-    )
+    most = round_most((line.y for line in lines), whole=True)
+    axes = Axis("seconds since the start", span_s), Axis(noun, most, whole=True)
     title = f"{noun} over time".capitalize()
-    return figure(line_chart(title, lines, *axes), f"{title}.", mean_numbers(lines, unit))
+    return figure(timeline_chart(title, lines, *axes, tick_marks(span_s)), f"{title}.", mean_numbers(lines, "seconds"))
 
 
 def mean_numbers(lines: Sequence[Line], unit: str) -> str:

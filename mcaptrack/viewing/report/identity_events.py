@@ -254,6 +254,8 @@ _MOST: Final = 6
 _LEAST_M: Final = 0.5
 #: Decisions that are right with at least this probability are not shown.
 _UNSURE: Final = 0.8
+#: From this probability on, an estimate says that a decision is right.
+_EVEN: Final = 0.5
 #: The velocity before a gap is that of the last so many seconds.
 _PAST_S: Final = 2.0
 #: A track belongs to the person that it matches at most so long before, or after, a repair.
@@ -277,14 +279,16 @@ class Doubt(NamedTuple):
         """The repair in words."""
         start = f"{self.event.text[:1].upper()}{self.event.text[1:]}"
         if self.probability is None:
-            where = f"{start}. It appears {number(self.away_m, 1, 'm')} from where it was expected"
-        else:
-            before, after = int(self.event.row["previous_id"]), self.alternative_id
-            other = f"{before} goes on as {after}" if after >= 0 else f"{before} ended, and another came"
-            if after == before:  # the join left an input track that went on
-                other = f"{before} goes on as it did"
-            where = f"{start}. Right with {percent(self.probability, 0)}; otherwise {other}"
-        return f"{where}. {self.verdict}" if self.verdict else f"{where}."
+            text = f"{start}. It appears {number(self.away_m, 1, 'm')} from where it was expected."
+            return f"{text} {self.verdict}".rstrip()
+        before, after = int(self.event.row["previous_id"]), self.alternative_id
+        other = f"{before} goes on as {after}" if after >= 0 else f"{before} ended, and another came"
+        if after == before:  # the join left an input track that went on
+            other = f"{before} goes on as it did"
+        text = f"{start}. Its estimated probability is {percent(self.probability, 0)}; otherwise {other}."
+        is_surprise = self.is_right is not None and self.is_right != (self.probability >= _EVEN)
+        verdict = f"All the same, t{self.verdict[1:]}" if is_surprise else self.verdict
+        return f"{text} {verdict}".rstrip()
 
 
 class DoubtfulTrack(NamedTuple):
@@ -294,12 +298,15 @@ class DoubtfulTrack(NamedTuple):
     row: Any
 
     def text(self, noun: str) -> str:
-        """The decision in words; ``noun`` is that of what is tracked."""
-        row, likely = self.row, percent(float(self.row["probability"]), 0)
-        long = f"{number(float(row['duration_s']), 1, 's')} long"
-        if int(row["kind"]) == DecisionKind.KEPT:
-            return f"track {row['track_id']} is kept: a {noun} with {likely}, {long}"
-        return f"the tracker's {row['source_id']} is left out: no {noun} with {likely}, {long}"
+        """The decision in words; ``noun`` is that of what is tracked, with its article."""
+        row = self.row
+        is_kept = int(row["kind"]) == DecisionKind.KEPT
+        track = f"track {row['track_id']}" if is_kept else f"the tracker's {row['source_id']}"
+        chance = float(row["probability"]) if is_kept else 1 - float(row["probability"])
+        seen = f"seen for {number(float(row['duration_s']), 1, 's')}" if row["duration_s"] > 0 else "seen once"
+        done = f"{track} is {'kept' if is_kept else 'left out'}, {seen}"
+        but = ": the" if is_kept == (chance >= _EVEN) else ", although the"
+        return f"{done}{but} probability of being {noun} is {percent(chance, 0)}"
 
 
 def find_doubts(

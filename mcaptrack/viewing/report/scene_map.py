@@ -11,9 +11,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.foxglove.palette import COUNT as COLOURS
+from mcaptrack.foxglove.views.people import CHI2_95, ellipse_points, ellipses
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.schema import Frame, Rows
@@ -36,6 +37,10 @@ _MAX_NAMED: Final = 600
 #: The largest width and height of a map of the ground, and the room for the labels of its axes.
 _GROUND: Final = (460, 520)
 _AXIS_PX: Final = 34
+#: The time before a forecast from which its track is drawn.
+_PAST_S: Final = 4.0
+#: The size of an ellipse that holds half of a normal distribution, in that of one that holds 95 %.
+_HALF: Final = (2 * np.log(2) / CHI2_95) ** 0.5
 #: The colour of a heat map, red, green and blue.
 _HEAT: Final = (224, 84, 0)
 
@@ -83,6 +88,79 @@ def background_picture(pictures: Pictures, is_still: bool = True) -> SceneBackgr
     grey = 0.55 * (still @ [0.114, 0.587, 0.299]) + 70
     image = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
     return SceneBackground(encode_image(image, "jpeg", _QUALITY), image.shape[1], image.shape[0], scale)
+
+
+def moment_picture(pictures: Pictures, t_ns: int) -> SceneBackground | None:
+    """The picture that is shown at a time; None if it can't be decoded."""
+    import cv2
+
+    at = max(int(np.searchsorted(pictures.t_ns, t_ns, "right")) - 1, 0)
+    for frame in pictures.readable([at]):
+        high, wide = frame.rows.shape[:2]
+        scale = min(1.0, _WIDTH_PX / wide)
+        size = (max(1, round(wide * scale)), max(1, round(high * scale)))
+        small = np.asarray(cv2.resize(frame.rows, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return SceneBackground(encode_image(small, "jpeg", _QUALITY), *size, scale)
+    return None
+
+
+def forecast_map(
+    forecasts: Rows,
+    past: Sequence[Frame],
+    future: Sequence[Frame],
+    t_ns: int,
+    behind: SceneBackground,
+    plane: GroundPlane,
+) -> dict[str, Any]:
+    """The values of a map over a picture: where tracks came from, where they are expected, and where people went.
+
+    ``forecasts`` are those of one time, ``past`` the tracks, ``future`` the ground truth, if there is any.
+    """
+
+    def way(points_m: Floats) -> str:
+        px = plane.metres_to_pixels(np.asarray(points_m, np.float64)) * behind.scale
+        px = px[np.isfinite(px).all(axis=1)]
+        return _way(np.clip(px, -behind.width, 2 * behind.width)) if len(px) else ""
+
+    def walked(frames: Sequence[Frame], first_ns: int, last_ns: int) -> dict[int, Floats]:
+        rows, at_ns = rows_by_track([frame for frame in frames if first_ns <= frame.t_ns <= last_ns])
+        del at_ns
+        return {
+            int(track): np.stack([own["x_m"], own["y_m"]], axis=-1)
+            for track in np.unique(rows["track_id"])
+            if np.isfinite((own := rows[rows["track_id"] == track])["x_m"]).all()
+        }
+
+    ahead_ns = seconds_to_ns(float(forecasts["ahead_s"].max()))
+    before = walked(past, t_ns - seconds_to_ns(_PAST_S), t_ns)
+    tracks = []
+    for track in np.unique(forecasts["track_id"]).tolist():
+        rows = forecasts[forecasts["track_id"] == track]
+        rows = rows[np.argsort(rows["step"])]
+        mean_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+        last = rows[-1]
+        spread = np.array([[[last["cov_xx_m2"], last["cov_xy_m2"]], [last["cov_xy_m2"], last["cov_yy_m2"]]]])
+        half, turn = ellipses(spread)
+        outline = ellipse_points(mean_m[-1:], half * _HALF, turn, 32)[0]
+        start = before.get(track, np.empty((0, 2)))
+        tracks.append(
+            {
+                "id": track,
+                "colour": track % COLOURS,
+                "past": way(start),
+                "ahead": way(np.concatenate([start[-1:], mean_m])),
+                "outline": way(outline) if np.isfinite(outline).all() else "",
+            }
+        )
+    went = walked(future, t_ns, t_ns + ahead_ns)
+    return {
+        "width": behind.width,
+        "height": behind.height,
+        "jpeg": behind.jpeg,
+        "tracks": tracks,
+        "future": "".join(way(points) for points in went.values()),
+        "ahead": number(ahead_ns / NS_PER_S, 1, "s"),
+    }
 
 
 def pixel_paths(frames: Sequence[Frame], plane: GroundPlane | None) -> list[TrackPath]:
@@ -142,12 +220,15 @@ def ground_map(paths: Sequence[TrackPath], span: tuple[Floats, Floats], start_s:
     size = np.maximum(high - low, 1e-6)
     scale = float(((np.array(_GROUND) - 2 * _MARGIN) / size).min())
     width, height = (size * scale + 2 * _MARGIN).round().astype(int).tolist()
-    points = [(path.points - low) * [scale, -scale] + [_MARGIN, height - _MARGIN] for path in paths]
+    far = 3 * max(_GROUND)  # what is farther away is outside of the panel all the same
+    points = [np.clip((path.points - low) * [scale, -scale] + [_MARGIN, height - _MARGIN], -far, far) for path in paths]
+    outside = sum(bool(((at < 0) | (at > [width, height])).any()) for at in points)
     bar_m = round_step(float(size.max()) / 6)
     return {
-        "width": width, "height": height, "view_width": _GROUND[0], "left": _MARGIN,
-        "bar_end": f"{_MARGIN + bar_m * scale:.1f}", "bar_label_x": f"{_MARGIN + bar_m * scale + 6:.1f}",
-        "bar_label": f"{bar_m:g} m", **_lines(paths, simplified(points, 0.5), start_s),
+        "width": width, "height": height, "view_width": _GROUND[0], "left": _MARGIN, "outside": outside,
+        "bar_end": f"{_MARGIN + bar_m * scale:.1f}", "bar_label": f"{bar_m:g} m",
+        "scale": f"{low[0] - _MARGIN / scale:.6g} {low[1] - (_MARGIN) / scale:.6g} {1 / scale:.6g}",
+        **_lines(paths, simplified(points, 0.5), start_s),
     }  # fmt: skip
 
 
@@ -203,12 +284,12 @@ def _lines(paths: Sequence[TrackPath], drawn: Sequence[Floats], start_s: float) 
         colours = [path.track_id % COLOURS for path in paths]
         for colour in sorted(set(colours)):
             joined = "".join(way for way, own in zip(ways, colours, strict=True) if own == colour)
-            tracks.append({"way": joined, "colour": colour, "title": ""})
+            tracks.append({"way": joined, "colour": colour, "title": "", "id": None})
     else:
         for path, way in zip(paths, ways, strict=True):
             seconds = f"{number(path.first_s - start_s, 1)} to {number(path.last_s - start_s, 1, 's')}"
             colour = path.track_id % COLOURS
-            tracks.append({"way": way, "colour": colour, "title": f"{path.track_id}: {seconds}"})
+            tracks.append({"way": way, "colour": colour, "title": f"{path.track_id}: {seconds}", "id": path.track_id})
     return {"halo": "".join(ways), "tracks": tracks}
 
 

@@ -15,7 +15,7 @@ from mcaptrack.evaluation.metrics.displacement import LEVELS
 from mcaptrack.viewing.report.charts import Axis, Bars, Line, figure, histogram_chart, line_chart, round_most
 from mcaptrack.viewing.report.contents import LogReport
 from mcaptrack.viewing.report.formatting import counted, number, percent, short
-from mcaptrack.viewing.report.headline import rule_text, rules_text
+from mcaptrack.viewing.report.headline import result_of, rule_text, rules_text
 
 #: The columns of the table of scores: whether a column is a share, and whether its lowest value is the best.
 _SCORES: Final = {"IDF1": True, "MOTA": True, "HOTA": True, "IDSW": False, "Frag": False, "FP": False, "FN": False}
@@ -23,6 +23,9 @@ _LOWEST: Final = ("IDSW", "Frag", "FP", "FN", "AMOTP_m")
 #: Further columns, where they are known: averages over recalls, of 3D tracks with scores. Their numbers of digits, or
 #: None for shares.
 _AVERAGES: Final = {"AMOTA": None, "AMOTP_m": 2, "AMOTP": 2}
+
+#: The least change of a share that is called one.
+_LEAST_FALL: Final = 0.001
 
 Figure = dict[str, Any]
 
@@ -49,10 +52,28 @@ def scores(report: LogReport) -> dict[str, Any]:
         "has_averages": any(row.averages for row in report.results),
         "other_rules": rules_text(rules),
         "is_at_prediction_rate": bool(beside),
+        "falls": _falls(report, of_all),
         "missing": report.missing.get("scores", ""),
         "tracks": _track_rows(report),
         "no_tracks": f"There are no tracks here; {command('run', Path(report.file))} makes them.",
     }
+
+
+def _falls(report: LogReport, results: Sequence[EvaluationRow]) -> list[str]:
+    """Which scores are worse after re-tracking, by which rule; shares by at least a tenth of a point."""
+    before, after = (report.track_sets[role].topic if role else "" for role in report.compared_roles)
+    out = []
+    for row in results:
+        other = result_of(results, after, row.similarity, row.gate) if row.tracks == before else None
+        if other is None:
+            continue
+        was, now = summary(row.score), summary(other.score)
+        for key, is_share in (("IDF1", True), ("MOTA", True), ("HOTA", True), ("IDSW", False)):
+            worse = was[key] - now[key] >= _LEAST_FALL if is_share else now[key] > was[key]
+            if worse:
+                change = " → ".join(_score_text(key, values[key]) for values in (was, now))
+                out.append(f"{key} {change} {rule_text(row.similarity, row.gate)}")
+    return out
 
 
 def _columns(results: Sequence[EvaluationRow]) -> list[str]:
@@ -122,7 +143,8 @@ def forecasts(report: LogReport) -> dict[str, Any]:
         reason = "the log has no ground truth" if "truth" not in report.track_sets else "none have a known future"
         if not any(channel["schema"] == "mcaptrack.Predictions" for channel in report.data["channels"]):
             reason = f"the log holds none; {command('predict', Path(report.file))} makes them"
-        return {"figures": [], "missing": [f"There are no forecasts that could be scored: {reason}."]}
+        missing = [f"There are no forecasts that could be scored: {reason}."]
+        return {"figures": [], "missing": missing, "scene": report.forecast_scene}
     names = {track_set.topic: (track_set.name, track_set.role) for track_set in report.track_sets.values()}
     members = [(entry, *names.get(entry["tracks"], (entry["tracks"], "truth"))) for entry in errors]
     figures = [_by_recall(members)]
@@ -131,9 +153,10 @@ def forecasts(report: LogReport) -> dict[str, Any]:
     figures += [_by_horizon(entry, name, role, most) for entry, name, role in members if entry["by_horizon"]["n"]]
     with_covariance = [member for member in members if member[0]["calibration"]]
     if with_covariance:
-        return {"figures": [*figures, _reliability(with_covariance)], "missing": []}
+        figures = [*figures, _reliability(with_covariance)]
+        return {"figures": figures, "missing": [], "scene": report.forecast_scene}
     why = "The reliability of the ellipses is not known: the forecasts have no covariance."
-    return {"figures": figures, "missing": [why]}
+    return {"figures": figures, "missing": [why], "scene": report.forecast_scene}
 
 
 def _by_recall(members: Sequence[tuple[dict[str, Any], str, str]]) -> Figure:
@@ -157,6 +180,8 @@ def _by_horizon(errors: dict[str, Any], name: str, role: str, most: float) -> Fi
         mean_m = np.array(baseline["mean_m"])
         lines.append(Line("constant velocity", "truth", np.array(baseline["ahead_s"]), mean_m, dashed=True))
         text += f"; constant velocity has {number(baseline['mean_m'][-1], 2, 'm')}"
+        if part["mean_m"][-1] >= baseline["mean_m"][-1]:
+            text += ", so these forecasts don't help at that distance"
     title = f"Error of the forecasts of {name} by how far ahead they look"
     axes = Axis("seconds ahead", float(ahead[-1])), Axis("distance from the ground truth, m", most)
     caption = f"{text}. Line: mean of {counted(part['n'], 'forecast')}; band: the middle half."

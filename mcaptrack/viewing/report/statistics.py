@@ -64,6 +64,35 @@ def speeds_m_per_s(frames: Sequence[Frame]) -> Floats:
     return np.asarray(far[kept] / step_s[kept])
 
 
+def list_tracks(frames: Sequence[Frame], start_ns: int) -> list[dict[str, Any]]:
+    """Each track in numbers: when it is there in seconds of the log, how far it goes, and the share of observed rows.
+
+    A gap counts with its shortest way. ``metres`` is None without positions.
+    """
+    rows, t_ns = rows_by_track(frames)
+    starts = run_starts(rows["track_id"])
+    first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
+    if not len(first):
+        return []
+    x_m, y_m = rows["x_m"], rows["y_m"]
+    has_place = np.isfinite(x_m) & np.isfinite(y_m)
+    step_m = np.zeros(len(rows))
+    placed = np.flatnonzero(has_place)
+    same = rows["track_id"][placed[1:]] == rows["track_id"][placed[:-1]]
+    step_m[placed[1:]] = np.where(same, np.hypot(np.diff(x_m[placed]), np.diff(y_m[placed])), 0.0)
+    counts = last - first + 1
+    columns = {
+        "id": rows["track_id"][first].astype(np.int64),
+        "from_s": (t_ns[first] - start_ns) / NS_PER_S,
+        "to_s": (t_ns[last] - start_ns) / NS_PER_S,
+        "seconds": (t_ns[last] - t_ns[first]) / NS_PER_S,
+        "metres": np.where(np.add.reduceat(has_place, first) > 0, np.add.reduceat(step_m, first), np.nan),
+        "observed": np.add.reduceat(rows["observed"].astype(np.float64), first) / counts,
+    }
+    values = [column.round(3).tolist() for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
+
+
 def track_statistics(frames: Sequence[Frame]) -> dict[str, Any]:
     """Counts and durations of tracks."""
     rows = join_frames(TRACKS, frames).rows
