@@ -36,8 +36,6 @@ from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
-#: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
-_CONFIRMED_SHARE: Final = 0.25
 #: Identities are decided so often, each time with the motion of the tracks that were decided before.
 _SWEEPS: Final = 2
 #: The number of times that encounters are examined again after identities were swapped.
@@ -494,10 +492,10 @@ def offline_tracks(
             )
         else:
             odds = log_odds_in_log(model, trajectories, smoothed, (steps[0], steps[-1]))
-    min_track_s = options.min_track_s * (_CONFIRMED_SHARE if movers.on_ground else 1.0)
+    is_person = PERSON.probability(odds[:, None])
     of_row = np.searchsorted(ids, rows.track)
-    is_long = np.bincount(of_row, minlength=len(ids)) >= round(min_track_s * options.rate_hz) + 1
-    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & is_long)
+    is_long = np.bincount(of_row, minlength=len(ids)) >= round(options.min_track_s * options.rate_hz) + 1
+    keeps = is_fixed | ((is_person >= options.track_confidence) & is_long)
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
     left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))

@@ -518,7 +518,7 @@ PRESENT_FEATURES: Final = (
 PRESENT_KINDS: Final = ("new", "confirmed", "lost", "lasting lost")
 #: The log odds from which each kind is written. A track that is seen has to be surer than a lost one, above all when it
 #: begins, because it may be written under an id that it turns out not to have. (Chosen on synthetic crowds.)
-_LEAST_LOG_ODDS: Final = np.array([1.5, 0.5, 0.0, 0.0])
+_LEAST_LOG_ODDS: Final = np.array([1.0, 0.0, 0.0, 0.0])
 #: A track has lasted once it was observed for so many times as long as its confirmation takes.
 _LASTING: Final = 3
 #: An older track is beside another one up to this distance; the border counts up to the other one.

@@ -111,7 +111,7 @@ class RetrackOptions:
     same_id_bonus: float = setting(12.0, least=0.0, theme=_ASSOCIATION)
     max_age_s: float = option(2.0, least=0.0, theme=_LIFE)
     interpolated: bool = setting(False, theme=_ASSOCIATION)
-    min_track_s: float = setting(2.0, least=0.0, theme=_LIFE)
+    min_track_s: float = setting(0.0, least=0.0, theme=_LIFE)
     link_s: float = option(20.0, least=0.0, theme=_OFFLINE)
     link_confidence: float = setting(0.5, least=0.01, most=0.99, theme=_OFFLINE)
     resolve_swaps: bool = setting(True, theme=_OFFLINE)
