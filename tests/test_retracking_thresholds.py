@@ -34,7 +34,7 @@ FEW = replace(
     resolve_swaps=False,
     smooth=False,
     track_confidence=0.0,
-    min_track_s=0.0,
+    adapt_online=False,
 )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tests.references.false_tracks import log_odds_in_log
 from tests.references.hypotheses import Claim, swept
-from tests.references.offline import Motion, exchanged, sigmoid, smoothed_in_log
+from tests.references.offline import FITTED, Motion, exchanged, sigmoid, smoothed_in_log
 
 Point = tuple[float, float]
 Row = dict[str, float]
@@ -156,9 +156,16 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         if o.smooth:
             for step, state in smoothed[track].items():
                 move_to(tracks[track][step], state.mean[:, 0], () if step in paths[track] else o.ground_planes)
-        if len(tracks[track]) < round(o.min_track_s * o.rate_hz) + 1 or sigmoid(odds[track]) < o.track_confidence:
+        least_s = min(o.min_track_s, (steps[-1] - steps[0]) / o.rate_hz / 3) if o.track_confidence else o.min_track_s
+        if len(tracks[track]) < round(least_s * o.rate_hz) + 1 or person(odds[track]) < o.track_confidence:
             del tracks[track]
     return [[tracks[track][step] for track in sorted(tracks) if step in tracks[track]] for step in steps]
+
+
+def person(odds: float) -> float:
+    """The probability that a track is a person."""
+    decided = FITTED["decided"]
+    return sigmoid(decided["weights"]["log odds"] * odds + decided["bias"])
 
 
 def places_of(paths: dict[int, dict[int, Row]]) -> dict[int, dict[int, Point]]:

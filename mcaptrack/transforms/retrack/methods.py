@@ -257,7 +257,6 @@ _PAPER: Final = RetrackByConsistency(
     beta=0.5,
     min_history=4,
     min_hits=2,
-    min_track_s=2.0,
     interpolated=True,
     link_s=0.0,
     resolve_swaps=False,

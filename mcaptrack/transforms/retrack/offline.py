@@ -32,10 +32,14 @@ from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.linking import TrackEnds, chains, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
-from mcaptrack.transforms.retrack.weights import Logistic, probability
+from mcaptrack.transforms.retrack.weights import Logistic
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
+#: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
+_CONFIRMED_SHARE: Final = 0.25
+#: The log odds of tracks that are too short are no larger.
+_SHORT: Final = -1.5
 #: Identities are decided so often, each time with the motion of the tracks that were decided before.
 _SWEEPS: Final = 2
 #: The number of times that encounters are examined again after identities were swapped.
@@ -492,10 +496,13 @@ def offline_tracks(
             )
         else:
             odds = log_odds_in_log(model, trajectories, smoothed, (steps[0], steps[-1]))
-    is_person = PERSON.probability(odds[:, None])
     of_row = np.searchsorted(ids, rows.track)
-    is_long = np.bincount(of_row, minlength=len(ids)) >= round(options.min_track_s * options.rate_hz) + 1
-    keeps = is_fixed | ((is_person >= options.track_confidence) & is_long)
+    least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
+    least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
+    is_short = np.bincount(of_row, minlength=len(ids)) < round(least_s * options.rate_hz) + 1
+    odds = np.where(is_short, np.minimum(odds, _SHORT), odds)
+    is_likely = PERSON.probability(odds[:, None]) >= options.track_confidence
+    keeps = is_fixed | (is_likely & ~is_short)
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
     left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))

@@ -32,6 +32,8 @@ _MOTION: Final = "Motion model"
 _PREDICTIONS: Final = "Predictions"
 _LIFE: Final = "Begin and end of tracks"
 _OFFLINE: Final = "With the whole log known (offline)"
+#: Tracks of a short log last at least this share of it.
+_SHARE_OF_LOG: Final = 1 / 3
 #: The output that is written on request.
 APPEARANCE_OUTPUT: Final = "appearance"
 #: The longest gap of a link where tracks are only linked in the picture, in seconds.
@@ -80,7 +82,7 @@ class RetrackOptions:
     interpolated : bool
         Use interpolated samples as observations, too.
     min_track_s : float
-        Leave out tracks that last less than this many seconds (probation).
+        Leave out tracks that last less than this many seconds, or than a third of a shorter log (probation).
     link_s : float
         Link the end of a track with the beginning of another up to this many seconds later, by likelihood also
         online, from the past alone; 0 for never.
@@ -111,7 +113,7 @@ class RetrackOptions:
     same_id_bonus: float = setting(12.0, least=0.0, theme=_ASSOCIATION)
     max_age_s: float = option(2.0, least=0.0, theme=_LIFE)
     interpolated: bool = setting(False, theme=_ASSOCIATION)
-    min_track_s: float = setting(0.0, least=0.0, theme=_LIFE)
+    min_track_s: float = setting(2.0, least=0.0, theme=_LIFE)
     link_s: float = option(20.0, least=0.0, theme=_OFFLINE)
     link_confidence: float = setting(0.5, least=0.01, most=0.99, theme=_OFFLINE)
     resolve_swaps: bool = setting(True, theme=_OFFLINE)
@@ -159,12 +161,19 @@ class RetrackOptions:
         """Whether boxes keep their tracks, because positions in metres are too wrong to repair these."""
         return self.poor_scale and not self.side_view
 
+    def shortest_s(self, log_s: float) -> float:
+        """The seconds that tracks of a log of some seconds last at least.
+
+        Where tracks are kept by how likely they are people, those of a short log may be shorter.
+        """
+        return self.min_track_s if self.track_confidence <= 0 else min(self.min_track_s, _SHARE_OF_LOG * log_s)
+
     def why_empty(self, given: Sequence[Frame], made: Sequence[Frame]) -> str:
         """Why no rows came of frames, for a warning."""
         longest_s = longest_track_s(given)
-        if longest_s < self.min_track_s:
-            least_s = f"{self.min_track_s:g} s"
-            return f"the longest track lasts {longest_s:.3g} s; those under {least_s} are left out (min_track_s)"
+        least_s = self.shortest_s((given[-1].t_ns - given[0].t_ns) / NS_PER_S)
+        if longest_s < least_s:
+            return f"the longest track lasts {longest_s:.3g} s; those under {least_s:.3g} s are left out (min_track_s)"
         return "no track is likely enough to be a person (track_confidence)"
 
 
