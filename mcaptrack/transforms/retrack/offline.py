@@ -32,14 +32,14 @@ from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.linking import TrackEnds, chains, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
-from mcaptrack.transforms.retrack.weights import Logistic
+from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
 #: The log odds of tracks that are too short are no larger.
-_SHORT: Final = -1.5
+_SHORT: Final = -0.7
 #: Identities are decided so often, each time with the motion of the tracks that were decided before.
 _SWEEPS: Final = 2
 #: The number of times that encounters are examined again after identities were swapped.
@@ -232,7 +232,7 @@ def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     rows["track_id"] = np.where(decided.kept, track[first], _NO_ID)
     rows["previous_id"] = rows["alternative_id"] = _NO_ID
     rows["source_id"] = _usual(track, source)
-    is_person = PERSON.probability(decided.log_odds[:, None])
+    is_person = probability(decided.log_odds)
     rows["probability"] = np.where(decided.kept, is_person, 1 - is_person)
     rows["duration_s"] = (step[last] - step[first]) * step_s
     rows["frames"] = last - first + 1
@@ -495,14 +495,14 @@ def offline_tracks(
                 model.step_s,
             )
         else:
-            odds = log_odds_in_log(model, trajectories, smoothed, (steps[0], steps[-1]))
+            values = log_odds_in_log(model, trajectories, smoothed, (steps[0], steps[-1]))
+            odds = PERSON.log_odds(values[:, None])
     of_row = np.searchsorted(ids, rows.track)
     least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
     least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
     is_short = np.bincount(of_row, minlength=len(ids)) < round(least_s * options.rate_hz) + 1
     odds = np.where(is_short, np.minimum(odds, _SHORT), odds)
-    is_likely = PERSON.probability(odds[:, None]) >= options.track_confidence
-    keeps = is_fixed | (is_likely & ~is_short)
+    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short)
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
     left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
