@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -20,6 +21,7 @@ from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_od
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 from mcaptrack.transforms.retrack.methods import KeptIds
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
+from mcaptrack.transforms.retrack.online_tracker import GrowingHull
 from tests.commands import call
 from tests.references.false_tracks import log_odds_in_log as in_log
 from tests.references.false_tracks import person_features
@@ -286,6 +288,38 @@ def test_tracks_in_metres_keep_what_they_are_under_numbers_of_their_own(part_row
     assert source.tolist() == [4, 9, 4, 9, 7, 7, 9]
     assert row.tolist() == [*range(7)]
     assert kept.samples.column("track_id").tolist() == source.tolist()
+
+
+# Which online tracks are written: what the log said so far of how long tracks last, and where they were seen
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=20)
+def test_a_growing_hull_is_the_hull_of_all_points(seed):
+    """Compared with Qhull; points inside are those that don't change its area."""
+    rng = np.random.default_rng(seed)
+    hull, seen = GrowingHull(), np.empty((0, 2))
+    for count in rng.integers(1, 6, 8):
+        new = np.round(rng.normal(0, 3, (count, 2)), int(rng.integers(0, 3)))
+        hull.add(new.T)
+        seen = np.concatenate([seen, new])
+        if np.linalg.matrix_rank(seen - seen[0]) < 2:
+            assert not hull.holds(seen.T).any()
+            continue
+        wanted = ConvexHull(seen)
+        x, y = hull.vertices.T
+        assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(wanted.volume)
+        assert hull.holds(seen.T).all()
+        others = rng.normal(0, 4, (10, 2))
+        larger = [ConvexHull([*seen, other]).volume > wanted.volume + 1e-5 for other in others]
+        assert hull.holds(others.T).tolist() == [not one for one in larger]
+
+
+def test_a_hull_leaves_out_what_is_no_place():
+    hull = GrowingHull()
+    hull.add(np.array([[0.0, 1.0, 0.0, np.nan], [0.0, 0.0, 1.0, 5.0]]))
+    assert len(hull.vertices) == 3
+    assert hull.holds(np.array([[0.2, np.nan], [0.2, 0.2]])).tolist() == [True, False]
 
 
 # Which tracks are people, and which follow nobody: by what is known of the whole log

@@ -27,8 +27,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 import fit_pictures
-from corruptions import CORRUPTIONS, crowds, with_people
-from crowds import drawn, faults
+from corruptions import with_people
+from crowds import drawn
 from regression import Chosen, logistic, multinomial, shift, show_reliability
 from reproduce import on_clock
 
@@ -39,7 +39,7 @@ from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline, online_tracker
+from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
 from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
@@ -55,12 +55,6 @@ SEEDS, HELD, STEPS = (101, 102), (201,), 300
 MORE = (103, 104)
 #: Joins are judged in scenes of these seeds and so many steps.
 JUDGED, JUDGED_STEPS = (111, 112, 113), 100
-#: How strongly weights of what is written online are drawn to 0.
-PRESENT_RIDGE: float = 5e-4
-#: What is written online is told in scenes of these seeds, which weigh less, and in crowds of these with each kind of
-#: corruption, and with faults of any strength.
-PRESENT, PRESENT_WEIGHT = (101, 102), 0.2
-CORRUPTED, CORRUPTED_STEPS, ANY_FAULTS = (41, 42), 400, range(60)
 #: A track is that of a person who is as near, by most of its first or last so many rows.
 GATE_M, ROWS = 1.0, 8
 #: A tracklet is that of the person of most of its first or last so many samples.
@@ -278,92 +272,6 @@ def decisions_of(run: Run) -> tuple[Judged, Judged]:
     return joins, Judged(decided.log_odds[:, None], np.bincount(track, people >= 0) * 2 >= count)
 
 
-class Present(NamedTuple):
-    """Tracks at the steps of a scene (R,): features (R, F), kinds, which are people who are there, and weights."""
-
-    features: np.ndarray
-    kind: np.ndarray
-    is_right: np.ndarray
-    weight: np.ndarray
-
-
-def present_scenes() -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
-    """The rows of the truth and of a tracker, and the weight, of scenes that tell what to write online."""
-    for seed in PRESENT:
-        for number, (truth, how) in enumerate(drawn(seed, STEPS)):
-            yield truth, with_people(truth, how, np.random.default_rng([seed, number, 2])), PRESENT_WEIGHT
-    for seed in CORRUPTED:
-        for how in CORRUPTIONS.values():
-            for number, truth in enumerate(crowds(3, CORRUPTED_STEPS, seed)):
-                yield truth, with_people(truth, how, np.random.default_rng([seed, number])), 1.0
-    for number in ANY_FAULTS:
-        rng = np.random.default_rng([number, 5])
-        truth = crowds(2, int(rng.integers(150, 500)), CORRUPTED[0] * 100 + number)[number % 2]
-        # few people, and more false tracks than elsewhere: hardly any other scene is like that
-        people = np.unique(truth[:, 1])
-        truth = truth[np.isin(truth[:, 1], people[rng.random(len(people)) < rng.uniform(0.2, 1)])]
-        how = replace(faults(rng), flicker=float(np.exp(rng.uniform(np.log(0.02), np.log(0.3)))))
-        yield truth, with_people(truth, how, rng), 1.0
-
-
-def present_of(truth: np.ndarray, made: np.ndarray, weight: float) -> Present:
-    """What is known online of the tracks of a scene, and which of them are people who are there."""
-    seen: list[tuple[np.ndarray, ...]] = []
-    features = online_tracker.PresentTracks.features
-
-    def keep(self: Any, tick: np.ndarray, tracks: np.ndarray, *others: Any) -> np.ndarray:
-        found = features(self, tick, tracks, *others)
-        seen.append((tick, tracks, others[1], found, self.kinds(tracks)))
-        return found
-
-    online_tracker.PresentTracks.features = keep  # type: ignore[method-assign]
-    try:
-        run = prepare(truth, made)
-    finally:
-        online_tracker.PresentTracks.features = features  # type: ignore[method-assign]
-    first = np.cumsum([0, *(tick.max(initial=-1) + 1 for tick, *_ in seen)])
-    step = np.concatenate([tick + low for (tick, *_), low in zip(seen, first, strict=False)])
-    tracks, xy_m = (np.concatenate([part[at] for part in seen], axis=1) for at in (1, 2))
-    values, kind = (np.concatenate([part[at] for part in seen]) for at in (3, 4))
-    rows = sum(len(frame.rows) for frame in run.true)
-    return Present(values, kind, present(run, step, tracks, xy_m), np.full(len(step), weight / rows))
-
-
-def present(run: Run, step: np.ndarray, tracks: np.ndarray, xy_m: np.ndarray) -> np.ndarray:
-    """Which tracks at steps (R,) are people who are there: each person is one of the tracks within ``GATE_M``, rather
-    the one that it was before, then the one that is observed more often.
-    """
-    ids, most = tracks[online_tracker.IDS], np.zeros(int(tracks[online_tracker.IDS].max(initial=0)) + 1)
-    np.maximum.at(most, ids, tracks[online_tracker.HITS])
-    rather = 1 - np.minimum(most[ids], 30) / 30 + 0.3 * (tracks[online_tracker.MISSED] > 0)
-    was: dict[int, int] = {}
-    out = np.zeros(len(step), bool)
-    bounds = np.searchsorted(step, np.arange(len(run.true) + 1))
-    for frame, low, high in zip(run.true, bounds, bounds[1:], strict=False):
-        names = frame.rows["track_id"]
-        off = np.hypot(*(xy_m[k, low:high, None] - frame.rows[name] for k, name in enumerate(("x_m", "y_m"))))
-        before = np.array([was.get(one, -1) for one in ids[low:high].tolist()], int)[:, None] == names
-        row, column = assign(np.where(off < GATE_M, off + rather[low:high, None] - before + 1, np.inf), 10.0)
-        out[low + row] = True
-        was |= dict(zip(ids[low + row].tolist(), names[column].tolist(), strict=True))
-    return out
-
-
-def fit_present(parts: list[Present]) -> dict[str, Any]:
-    """The weights of what is written online, for each kind of track."""
-    features, kind, is_right, weight = (np.concatenate(members) for members in zip(*parts, strict=True))
-    fitted = {}
-    for number, name in enumerate(online_tracker.PRESENT_KINDS):
-        here = kind == number
-        varies = np.append(features[here].std(axis=0) > 1e-6, True)  # what is observed now was not missed
-        chosen = features[here][:, varies[:-1]]
-        weights = np.zeros(len(varies))
-        weights[varies] = logistic(chosen, is_right[here].astype(float), weight[here], ridge=PRESENT_RIDGE)
-        names = online_tracker.PRESENT_FEATURES
-        fitted[f"online {name}"] = {"weights": named(names, weights[:-1]), "bias": round(float(weights[-1]), 3)}
-    return fitted
-
-
 def told(find: Callable[[Run], Found], scenes: list[Run], what: str) -> Iterator[Found]:
     """What is found in each scene; progress goes to stderr."""
     for number, run in enumerate(scenes, 1):
@@ -475,17 +383,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=STEPS, help="how many steps of each scene")
     either = parser.add_mutually_exclusive_group()
     either.add_argument("--check", action="store_true", help="compare the file with what comes out now")
-    either.add_argument("--online", action="store_true", help="fit only what is written online; keep all else")
     either.add_argument("--held", action="store_true", help="score the weights of the file on other scenes")
     given = parser.parse_args()
     seeds = given.seeds or list(HELD if given.held else SEEDS)
     if given.held:
         held(seeds, given.steps)
-        return
-    if given.online:
-        kept = json.loads(WEIGHTS.read_text(encoding="utf-8"))
-        kept |= fit_present([present_of(*scene) for scene in present_scenes()])
-        WEIGHTS.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
         return
     scenes = list(runs(seeds, given.steps))
     pairs = list(told(pairs_of, scenes, "links"))
@@ -503,7 +405,6 @@ def main() -> None:
     for name in ("mean", "spread"):
         setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))
     judged = fit_decisions(others)
-    online = fit_present([present_of(*scene) for scene in present_scenes()])
     card = {
         "made_by": f"tools/fit_retrack.py --seeds {' '.join(map(str, seeds))} --steps {given.steps}, "
         f"mcaptrack {__version__}",
@@ -513,7 +414,7 @@ def main() -> None:
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }
     pictures = fit_pictures.fitted(fit_pictures.read(fit_pictures.SEEDS))
-    fitted = {"card": card, "links": links, "choices": choices, "people": people} | judged | online | pictures
+    fitted = {"card": card, "links": links, "choices": choices, "people": people} | judged | pictures
     text = json.dumps(fitted, indent=1) + "\n"
     if given.check:
         print("the same" if WEIGHTS.read_text(encoding="utf-8") == text else text)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from math import ceil, cos, exp, floor, hypot, inf, log, log10, pi, sin, sqrt
+from math import exp, floor, hypot, inf, log, log10, pi, sqrt
 
 import numpy as np
 
 from tests.references.offline import (
-    FITTED,
     LINK_BIAS,
     LINK_LEAST,
     LINK_WEIGHTS,
@@ -47,11 +46,6 @@ class Person:
     missed: int = 0
     merged: int = 0
     row: Row | None = None
-    steps: int = 1
-    changes: int = 0
-    gap: int = 0
-    begun: np.ndarray | None = None
-    rough: float = 0.0
 
     @property
     def here(self) -> np.ndarray:
@@ -69,76 +63,96 @@ class Person:
         self.cov = self.cov - np.outer(gain, self.cov[0])
 
 
-class Evidence:
-    """What tells people who are here from other tracks: of each track, of those around it, and of the log so far."""
+class Lives:
+    """What became of the tracks so far, and the area in which confirmed ones were seen."""
 
-    def __init__(self, confirm: int, max_age: int, step_s: float) -> None:
-        self.confirm, self.max_age, self.step_s = confirm, max_age, step_s
-        self.lasting, self.young_age = 3 * (confirm - 1) + 1, min(confirm, max_age)
+    LASTS, RETURNS, COUNTS = 0.6, 0.8, 2
+
+    def __init__(self, confirm: int, max_age: int) -> None:
+        self.lasting, self.max_age = 3 * (confirm - 1) + 1, max_age
+        self.went_on, self.ended = Counter(), Counter()
+        self.back, self.stayed = Counter(), Counter()
         self.places: list[Point] = []
-        self.counts, self.gaps = Counter(), Counter()
+        self.before: dict[int, tuple[int, int, bool]] = {}
 
-    def level(self, steps: int) -> int:
-        """Gaps have up to ten lengths."""
-        return ceil(min(steps, self.max_age) * min(self.max_age, 10) / self.max_age)
+    def learn(self, now: dict[int, tuple[int, int, bool]], passed: int) -> None:
+        """``now`` has the observations, steps without one, and whether outside, of each track."""
+        for name, (hits, missed, outside) in self.before.items() if passed == 1 else ():
+            then = now.get(name)
+            if hits < self.lasting and then is None:
+                self.ended[hits] += 1
+            elif hits < self.lasting and then[0] > hits:
+                self.went_on[hits] += 1
+            if missed and (hits < self.lasting or outside):
+                if then is not None and then[1] == 0:
+                    self.back[outside, missed] += 1
+                elif then is None or then[1] > missed:  # one that is merged with another grows no older
+                    self.stayed[outside, missed] += 1
+        self.before = now
 
-    def outside_m(self, at: np.ndarray) -> float:
-        """How far a place is beyond the others in one of 16 directions."""
-        if not self.places:
-            return 3.0
-        off = at - np.array(self.places)
-        turns = (pi * k / 8 for k in range(16))
-        return float(np.clip(max((off @ (cos(turn), sin(turn))).min() for turn in turns), -3, 3))
-
-    def log_odds(self, people: list[Person], has: dict[int, Row], noise_m: float) -> dict[int, float]:
-        """The log odds that each track is a person who is here now."""
-        at = {p.name: place(has[p.name]) if p.name in has else p.here for p in people}
-        outside = {p.name: self.outside_m(at[p.name]) for p in people}
-        for p in people:
-            p.begun = at[p.name] if p.begun is None else p.begun
-            p.rough += ((at[p.name] - p.here) ** 2).sum() / noise_m**2
-            missed, lasts = 0 if p.name in has else p.missed, p.hits >= self.lasting
-            is_over = missed == (self.max_age if p.hits >= self.confirm else self.young_age) and outside[p.name] <= 0
-            self.counts["lasting" if lasts else "new"] += 1
-            self.counts["born"] += p.steps == 1
-            self.counts["lasting missed"] += lasts and missed > 0
-            self.counts["lost"] += not lasts and missed == 1
-            self.counts["back"] += not lasts and missed == 0 and p.gap > 0
-            self.counts["lasting over" if lasts else "over"] += is_over
-            if missed == 0 and p.gap > 0:
-                self.gaps[self.level(p.gap)] += 1
-        count, out = self.counts, {}
-        false = count["over"] - (count["lasting over"] + 1) / (count["lasting"] + 50) * count["new"]
-        false = min(max(max(false, 0.3) / (count["born"] + 1), 0.01), 0.97)
-        for p in people:
-            missed = 0 if p.name in has else p.missed
-            near = [hypot(*(at[o.name] - at[p.name])) for o in people if o.name in has and o.name < p.name]
-            as_long = sum(n for level, n in self.gaps.items() if level >= max(self.level(missed), 1))
-            values = {
-                "log hits": log(p.hits),
-                "log missed": log(missed * self.step_s + 0.1),
-                "log distance": log(hypot(*(at[p.name] - p.begun)) + 0.3),
-                "log roughness": log(p.rough / max(p.hits - 1, 1) + 0.05),
-                "changes": p.changes / p.hits,
-                "beside": max(1 - (min(near, default=inf) / 1.5) ** 2, 0.0),
-                "outside": outside[p.name] > 0,
-                "outside by": outside[p.name],
-                "lasting missed": log((count["lasting missed"] + 1) / (count["lasting"] + 10)),
-                "new came back": log((count["back"] + 1) / (count["lost"] + 1)),
-                "new over": log((count["over"] + 0.5) / (count["lasting over"] + 0.5)),
-                "new steps": log((count["new"] + 1) / (count["lasting"] + 10)),
-                "log odds of false births": log(false / (1 - false)),
-                "rare gap": -log((as_long + 0.5) / (self.gaps.total() + 3)) if missed else 0.0,
-            }
-            young = "lost" if missed else "new"
-            kind = young if p.hits < (self.lasting if missed else self.confirm) else OLD[young]
-            model = FITTED[f"online {kind}"]
-            out[p.name] = model["bias"] + sum(model["weights"][name] * value for name, value in values.items())
-        self.places += [at[p.name] for p in people if p.name in has and p.hits >= self.confirm]
+    def lasts(self, hits: int) -> float:
+        each = self.LASTS ** (1 / max(self.lasting - 1, 1))
+        out = 1.0
+        for k in range(hits, self.lasting):
+            total = self.went_on[k] + self.ended[k]
+            out *= (self.went_on[k] + self.COUNTS * each) / (total + self.COUNTS)
         return out
 
+    def comes_back(self, missed: int, outside: bool) -> float:
+        each = (1 - self.RETURNS) ** (1 / self.max_age)
+        away = 1.0
+        for age in range(missed, self.max_age + 1):
+            total = self.back[outside, age] + self.stayed[outside, age]
+            away *= (self.stayed[outside, age] + self.COUNTS * each) / (total + self.COUNTS)
+        return 1 - away
 
-OLD = {"new": "confirmed", "lost": "lasting lost"}
+    def is_outside(self, at: np.ndarray) -> bool:
+        """Whether the places so far are on one side of a line through a place, or on a line."""
+        off = np.array(self.places).reshape(-1, 2) - at
+        if len(off) < 3 or np.linalg.matrix_rank(off - off[0], tol=1e-9) < 2:
+            return True
+        angle = np.sort(np.arctan2(off[:, 1], off[:, 0]))
+        return bool(max(np.diff(angle).max(), angle[0] + 2 * pi - angle[-1]) > pi)
+
+
+class Places:
+    """What became of the last 2000 tracks that were lost."""
+
+    def __init__(self) -> None:
+        self.all: list[tuple[np.ndarray, bool]] = []
+
+    def ratio(self, at: np.ndarray) -> float:
+        """The odds that it goes well within 2 m, compared with everywhere; 8 more are as everywhere."""
+        ended = self.all[-2000:]
+        well = (sum(good for _, good in ended) + 1) / (len(ended) + 2)
+        near = [good for there, good in ended if hypot(*(there - at)) <= 2]
+        return (near.count(True) / well + 8) / (near.count(False) / (1 - well) + 8)
+
+
+def at_odds(probability: float, ratio: float) -> float:
+    return probability * ratio / (1 - probability + probability * ratio)
+
+
+class Losses:
+    """Places where tracks were lost, of those that are lost, and the odds that these come back."""
+
+    def __init__(self) -> None:
+        self.lost = Places()
+        self.now: dict[int, tuple[np.ndarray, float]] = {}
+
+    def learn(self, people: list[Person], has: dict[int, Row], passed: int) -> None:
+        for name in [one for one in self.now if one not in {person.name for person in people}]:
+            place, _ = self.now.pop(name)
+            if passed == 1:
+                self.lost.all.append((place, False))
+        for name in [one for one in self.now if one in has]:
+            self.lost.all.append((self.now.pop(name)[0], True))
+        for p in people:
+            if p.name not in has and p.name not in self.now:
+                self.now[p.name] = (p.here, self.lost.ratio(p.here))
+
+    def ratio(self, name: int) -> float:
+        return self.now[name][1] if name in self.now else 1.0
 
 
 @dataclass
@@ -290,8 +304,9 @@ class OnlineTracker:
             raise Undecided  # offline tracks are made in another unit, which is tested by itself
         online, predictions = [], []
         places: dict[tuple[int, int], Point] = {}
-        evidence = Evidence(self.confirm, self.max_age, 1 / o.rate_hz)
+        lives = Lives(self.confirm, self.max_age)
         bends = Bends(1 / o.rate_hz)
+        losses = Losses()
         motion = Motion(self.noise_m, max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
         returns = Returns(motion, o, self.confirm)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
@@ -301,9 +316,15 @@ class OnlineTracker:
                 self.most_noise_m = bends.limit(step, seen)
                 self.noise_m = min(self.noise_m, self.most_noise_m)
             has = self.step(seen, passed)
-            odds = evidence.log_odds(self.people, has, self.noise_m)
+            now = {
+                one.name: (one.hits, 0 if one.name in has else one.missed, lives.is_outside(one.here))
+                for one in self.people
+            }
+            lives.learn(now, passed)
+            lives.places += [one.here for one in self.people if one.name in has and one.hits >= self.confirm]
+            losses.learn(self.people, has, passed)
             returns.learn(self.people, has, step)
-            written = [one for one in self.people if self.is_written(one, one.name in has, odds[one.name])]
+            written = [one for one in self.people if self.is_written(one, now[one.name], lives, losses)]
             written += returns.name(written, step, has, self.people)
             shown = []
             for person in self.people:
@@ -332,14 +353,20 @@ class OnlineTracker:
             )
         return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
 
-    def is_written(self, person: Person, is_seen: bool, odds: float) -> bool:
+    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives, losses: Losses) -> bool:
         """Whether a track is written online."""
-        o = self.options
-        if o.adapt_online:
-            return odds >= (1 if is_seen and person.hits < self.confirm else 0)
-        if is_seen:
-            return person.hits >= self.confirm
-        return person.hits >= 1.5 * self.confirm and person.missed <= round(o.coast_s * o.rate_hz)
+        o, (hits, missed, outside) = self.options, now
+        if not o.adapt_online:
+            enough = self.confirm if missed == 0 else 1.5 * self.confirm
+            return hits >= enough and missed <= round(o.coast_s * o.rate_hz)
+        if missed == 0:
+            return hits >= self.confirm or lives.lasts(hits) >= 0.5
+        if missed > round(o.coast_s * o.rate_hz):
+            return False
+        if hits >= lives.lasting and not outside:
+            return True
+        comes_back = at_odds(lives.comes_back(missed, outside), losses.ratio(person.name))
+        return comes_back * lives.lasts(hits + 1) >= 0.5
 
     def forecast(self, row: Row, name: int, step: int, places: dict[tuple[int, int], Point]):
         past = [places.get((step - back, name)) for back in range(self.past - 1, 0, -1)]
@@ -351,7 +378,6 @@ class OnlineTracker:
         young = min(self.confirm, self.max_age)
         for person in self.people:
             person.missed += passed
-            person.steps += passed
         self.people = [p for p in self.people if p.missed <= (self.max_age if p.hits >= self.confirm else young)]
         for person in self.people:
             person.predict(passed / o.rate_hz, o.drift_m_per_s, o.drift_ratio)
@@ -365,10 +391,8 @@ class OnlineTracker:
                 row = has[person.name]
                 host = person.name in hosts
                 person.correct(place(row), o.merge_distance_m / 2 if host else self._noise_before)
-                source = -1 if host else row["track_id"]
-                person.changes += source != person.source
-                person.source, person.gap = source, person.missed - 1
                 person.hits, person.missed, person.merged = person.hits + 1, 0, 0
+                person.source = -1 if host else row["track_id"]
         for row in rows:
             if not any(row is other for other in has.values()):
                 self.born += 1

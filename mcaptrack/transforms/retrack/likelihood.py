@@ -22,15 +22,7 @@ from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State, StateRows
 from mcaptrack.transforms.retrack.offline import move_rows
-from mcaptrack.transforms.retrack.online_tracker import (
-    HITS,
-    IDS,
-    MISSED,
-    Association,
-    OnlineLinks,
-    OnlineTracker,
-    PresentTracks,
-)
+from mcaptrack.transforms.retrack.online_tracker import HITS, IDS, Association, OnlineLinks, OnlineTracker, ShownTracks
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
 
 #: So many frames are read at once, and online tracks written, or fewer with so many samples.
@@ -246,8 +238,7 @@ class LikelihoodPass(OnlinePass):
             max_age_tentative=min(confirm_hits, max_age),
             estimate_noise=options.noise_m is None,
         )
-        self._present = PresentTracks(confirm_hits, max_age, 1 / rate) if options.adapt_online else None
-        self._coast = round(options.coast_s * rate)
+        self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
         self._links = OnlineLinks(self._tracker.model, options.link_s, options.link_confidence, confirm_hits)
         self._frames: list[Frame] = []  # those that are not read yet, and their number of samples
         self._unread = 0
@@ -313,29 +304,22 @@ class LikelihoodPass(OnlinePass):
         passed = np.diff(steps, prepend=before)
         most_m = self._input.most_m(passed, steps, tick, source, xy_m.T) if self._input else [np.inf] * len(frames)
         each = zip(bounds.tolist(), bounds[1:].tolist(), passed.tolist(), most_m, strict=False)
-        results, noise_m = [], np.empty(len(frames))
-        for at, (low, high, steps_passed, limit) in enumerate(each):
-            results.append(self._tracker.step(xy_m[:, low:high], source[low:high], steps_passed, limit))
-            noise_m[at] = self._tracker.noise_m
+        results = [
+            self._tracker.step(xy_m[:, low:high], source[low:high], steps_passed, limit)
+            for low, high, steps_passed, limit in each
+        ]
         tracks, row, mean, cov = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
         tick = group_index([len(result.row) for result in results])
-        has, place = row >= 0, mean[:2].copy()
-        place[:, has] = xy_m[:, bounds[tick[has]] + row[has]]
+        has = row >= 0
         row[has] = observed[bounds[tick[has]] + row[has]]
         self.assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
-        state = StateRows(mean, cov)
-        if self._present is None:
-            is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
-            is_shown = np.where(has, tracks[HITS] >= self._confirm_hits, (tracks[MISSED] <= self._coast) & is_old)
-        else:
-            is_shown = self._present(tick, tracks, state, place, noise_m)
-        self._write(_Read(t_ns, numbers, steps, samples), tick, row, tracks, state, is_shown)
+        self._write(_Read(t_ns, numbers, steps, passed, samples), tick, row, tracks, StateRows(mean, cov))
 
-    def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, state: StateRows, is_shown: Bools) -> None:
+    def _write(self, read: _Read, tick: Ints, row: Ints, tracks: Ints, state: StateRows) -> None:
         """Make the rows of online tracks, and their predictions, of some steps.
 
         Of the tracks alive at each of the steps, end to end: the index of the step, the row that each has, or -1; whole
-        numbers and states as in ``Step``, and which are written in any case.
+        numbers and states as in ``Step``.
         """
         steps = read.steps
         ids = tracks[IDS]
@@ -350,7 +334,7 @@ class LikelihoodPass(OnlinePass):
         last_sample[order] = earlier[order][last]
         last_sample = last_sample[before:]
         place = state.mean[:2]
-        is_shown &= np.isfinite(place[0])
+        is_shown = self._shown(read.passed, tick, row >= 0, tracks, place) & np.isfinite(place[0])
         names, is_shown = self._links(steps, tick, tracks, State(state.mean.T, state.cov.T), row >= 0, is_shown)
         shown = np.flatnonzero(is_shown)
         shown = shown[np.lexsort((names[shown], tick[shown]))]
@@ -379,11 +363,12 @@ class LikelihoodPass(OnlinePass):
 
 
 class _Read(NamedTuple):
-    """Frames that were read: times in ns, numbers and steps; and their samples, end to end."""
+    """Frames that were read: times in ns, numbers, steps, and how many passed; and their samples, end to end."""
 
     t_ns: Ints
     numbers: Ints
     steps: Ints
+    passed: Ints
     samples: Rows
 
 

@@ -13,17 +13,17 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from itertools import pairwise
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.neighbours import Pairing, near_pairs
-from mcaptrack.geometry.ragged import run_starts
+from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, StateRows, update
-from mcaptrack.transforms.retrack.weights import Logistic
 
 #: Limits of the estimated noise of measured positions, in metres.
 NOISE_M: Final = (0.03, 0.8)
@@ -33,10 +33,8 @@ _MIN_RATE: Final = 0.01
 #: The squared radius of that circle, for a variance of 1.
 _CIRCLE: Final = -2 * np.log(_OUTSIDE)
 #: The rows of the whole numbers of tracks: id, input id of the last observation (-1: of a merged detection), number of
-#: observations, steps since the last one, steps for which the track is merged into the detection of another one, all
-#: of its steps, how many of its observations have another input id than the one before, and how many steps were missed
-#: before the last one.
-IDS, SOURCE, HITS, MISSED, MERGED, STEPS, CHANGES, GAP = range(8)
+#: observations, steps since the last one, and steps for which the track is merged into the detection of another one.
+IDS, SOURCE, HITS, MISSED, MERGED = range(5)
 
 
 # Online links: which new track continues a lost one, decided when the new one is first written, or before.
@@ -125,7 +123,7 @@ class OnlineLinks:
         """The ids under which the tracks alive at each of F steps are written, (R,), and whether they are, (R,).
 
         ``steps`` (F,) are the numbers of the steps, ``tick`` (R,) the index of the step of each track, rising;
-        ``tracks`` (8, R) and ``state`` (R,) are as in ``Step``. ``is_written`` (R,) says which are written in any case.
+        ``tracks`` (5, R) and ``state`` (R,) are as in ``Step``. ``is_written`` (R,) says which are written in any case.
         Nothing is known at a step that was not known then.
         """
         if self._max_gap_s <= 0:
@@ -278,7 +276,7 @@ class Association:
 class Step(NamedTuple):
     """The tracks alive after a step.
 
-    ``tracks`` (8, K) are their whole numbers (``IDS`` to ``GAP``), ``row`` (K,) is the observation that each has, or
+    ``tracks`` (5, K) are their whole numbers (``IDS`` to ``MERGED``), ``row`` (K,) is the observation that each has, or
     -1, and ``mean`` (4, K) and ``cov`` (3, K) are their states, as in ``StateRows``.
     """
 
@@ -303,7 +301,7 @@ class OnlineTracker:
     confirm_hits: int
     max_age_tentative: int
     estimate_noise: bool = True
-    tracks: Ints = field(default_factory=lambda: np.empty((8, 0), np.int64))
+    tracks: Ints = field(default_factory=lambda: np.empty((5, 0), np.int64))
     state: StateRows = field(default_factory=lambda: StateRows(np.empty((4, 0)), np.empty((3, 0))))
     next_id: int = 1
     judged: int = 0
@@ -320,7 +318,6 @@ class OnlineTracker:
         """
         self._limit_noise(most_noise_m)
         self.tracks[MISSED] += passed
-        self.tracks[STEPS] += passed
         is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
         is_over = is_over < self.tracks[MISSED]
         if is_over.any():
@@ -408,11 +405,9 @@ class OnlineTracker:
         update(state, xy_m, noise_m)
         self.state.mean[:, track], self.state.cov[:, track] = state
         source[occluder] = -1
-        self.tracks[CHANGES, track] += self.tracks[SOURCE, track] != source
         self.tracks[SOURCE, track] = source
         self.tracks[HITS, track] += 1
-        self.tracks[GAP, track] = self.tracks[MISSED, track] - 1
-        self.tracks[MISSED : MERGED + 1, track] = 0
+        self.tracks[MISSED:, track] = 0
 
     def _adapt_noise(self, before: StateRows, xy_m: Floats, usable: Bools) -> None:
         """Estimate the noise of positions: a share ``_OUTSIDE`` of them lies outside a circle if it is right."""
@@ -454,9 +449,9 @@ class OnlineTracker:
     def _start(self, xy_m: Floats, source: Ints) -> None:
         """Birth: start a track for each observation (2, N) that was not matched."""
         count = len(source)
-        born = np.zeros((8, count), np.int64)
+        born = np.zeros((5, count), np.int64)
         born[IDS] = range(self.next_id, self.next_id + count)
-        born[SOURCE], born[HITS], born[STEPS] = source, 1, 1
+        born[SOURCE], born[HITS] = source, 1
         self.next_id += count
         self.tracks = np.concatenate([self.tracks, born], axis=1)
         new = self.model.initial(xy_m, self.noise_m)
@@ -480,199 +475,307 @@ def _squared(off: Floats) -> Floats:
     return out
 
 
-# Which online tracks are written, step by step: those that are likelier than not a person who is here now.
+# Which online tracks are written, step by step, by what the log says so far of how long tracks last.
 #
-# The probability is a logistic regression over what is known of a track so far, fitted on synthetic scenes (see
-# ``weights``). What tells a person from a false detection is another matter for a track that has just begun than for
-# one that has lasted or is lost, so each of these has weights of its own.
+# A track is confirmed once it was observed for a while, because false detections flicker. But if all tracks of a
+# tracker follow people, this delay hides people; and if many are false, even those that were confirmed are soon
+# over. Both are seen in the log: for each number of observations, how many of the tracks so far were observed again
+# (the estimator of E. L. Kaplan and P. Meier, 1958, which also counts tracks that are not over yet). A track that
+# lasts with a probability of at least a half is written from its first observation.
 #
-# Letters: F steps, R tracks alive at these steps, end to end; V values, E features, D directions.
+# A track that is lost is written for a while, because most come back. Those that don't have left, or were false.
+# Which is likelier is learned in the same way, for each number of steps without an observation, for tracks that
+# have not lasted yet, and for those that would be outside of the area in which tracks were seen so far: most of
+# these have left it. It also depends on where the track was lost (``PlacesOfLosses``).
+#
+# Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have
+# lasted; A levels of steps without an observation.
 
 
-#: The features of a track at a step. Of itself: logarithms of the number of its observations, of the seconds since the
-#: last one, of how far it is from where it began, and of how far its observations are from its filter, as a ratio to
-#: the noise; and the share of them that have another input id than the one before. Among others: how near the nearest
-#: older track is that was observed; whether it is outside of the area in which confirmed tracks were seen, and how far.
-#: Of this log so far, as logarithms: the share of steps at which lasting tracks were missed; the share of other ones,
-#: here called new, that came back when they were lost; how many new ones were over inside of the area, and how many
-#: steps they had, as ratios to lasting ones; the odds that what begins is false; and how rare gaps are that are as long
-#: as this one.
-PRESENT_FEATURES: Final = (
-    "log hits",
-    "log missed",
-    "log distance",
-    "log roughness",
-    "changes",
-    "beside",
-    "outside",
-    "outside by",
-    "lasting missed",
-    "new came back",
-    "new over",
-    "new steps",
-    "log odds of false births",
-    "rare gap",
-)
-#: The kinds of tracks that have weights of their own: observed before and after confirmation, and lost, before and
-#: after they lasted.
-PRESENT_KINDS: Final = ("new", "confirmed", "lost", "lasting lost")
-#: The log odds from which each kind is written. A track that is seen has to be surer than a lost one, above all when it
-#: begins, because it may be written under an id that it turns out not to have. (Chosen on synthetic crowds.)
-_LEAST_LOG_ODDS: Final = np.array([1.0, 0.0, 0.0, 0.0])
 #: A track has lasted once it was observed for so many times as long as its confirmation takes.
 _LASTING: Final = 3
-#: An older track is beside another one up to this distance; the border counts up to the other one.
-_BESIDE_M, _BORDER_M = 1.5, 3.0
-#: Gaps are counted by so many lengths.
-_GAP_LEVELS: Final = 10
-#: The area in which tracks were seen is bounded in so many directions.
-_ANGLES: Final = 2 * np.pi * np.arange(16) / 16
-_DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+#: Before anything is known: the probability that a track lasts, and that a lost one comes back; and for how many tracks
+#: this counts at each number of observations and steps.
+_LASTS, _RETURNS, _WEIGHT = 0.6, 0.8, 2.0
+#: Numbers of observations, and of steps without one, are counted in at most so many levels.
+_LEVELS: Final = 200
 
 
-class PresentTracks:
-    """Tells which tracks are likely a person who is here now: called with the steps of a log, some at a time.
+# Where lost tracks come back and where they don't, as far as the log has shown.
+#
+# People go out at some places, and are missed for a moment at others. Whether a lost track comes back is told by
+# what became of those that were lost nearby, compared with the whole log. (Where a track began tells less of
+# whether it will last: people who are soon occluded look like false detections.)
+#
+# Letters: F steps; R tracks alive at these steps, end to end.
+
+
+Place: TypeAlias = tuple[float, float]
+
+#: Places are as near as this to be one.
+_NEAR_M: Final = 2.0
+#: Each place counts as if so many tracks like all others had been there before.
+_USUAL: Final = 8.0
+#: So many of the last tracks count.
+_LAST: Final = 2000
+#: What happens to tracks, in the order in which it is looked at within a step.
+_OVER, _BACK, _LOST = range(3)
+
+
+class PlaceOdds:
+    """The odds that something turns out well at places, compared with everywhere."""
+
+    def __init__(self) -> None:
+        self._xy_m = np.empty((2, _LAST))
+        self._is_good = np.zeros(_LAST, bool)
+        self._count = 0
+
+    def add(self, place: Place, is_good: bool) -> None:
+        """Count what became of something that was at a place."""
+        at = self._count % _LAST
+        self._xy_m[:, at], self._is_good[at] = place, is_good
+        self._count += 1
+
+    def ratio(self, place: Place) -> float:
+        """The odds that something at a place turns out well, as a ratio to those everywhere."""
+        count = min(self._count, _LAST)
+        is_good = self._is_good[:count]
+        share = (int(is_good.sum()) + 1) / (count + 2)
+        (x, y), (x_m, y_m) = place, self._xy_m[:, :count]
+        near = is_good[(x_m - x) ** 2 + (y_m - y) ** 2 <= _NEAR_M**2]
+        good = int(near.sum())
+        return (good / share + _USUAL) / ((len(near) - good) / (1 - share) + _USUAL)
+
+
+class PlacesOfLosses:
+    """Where tracks were lost, and what became of them: called with the steps of a log, some at a time."""
+
+    def __init__(self) -> None:
+        self._odds = PlaceOdds()
+        self._lost: dict[int, tuple[Place, float]] = {}  # where each lost track was lost, and the ratio there
+
+    def __call__(self, passed: Ints, tick: Ints, ids: Ints, is_observed: Bools, xy_m: Floats) -> Floats:
+        """The odds that lost tracks (R,) come back, as ratios to those of the whole log; 1 for others.
+
+        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the index of the step of each track, rising,
+        and ``xy_m`` (2, R) where it is. Nothing is known at a step that was not known then.
+        """
+        order = np.lexsort((tick, ids))
+        ids, tick, missed = ids[order], tick[order], ~is_observed[order]
+        starts = run_starts(ids)
+        first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
+        names = ids[first].tolist()
+        for name in self._lost.keys() - set(names):
+            self._end(name, is_told=bool(passed[0] == 1))
+        was_missed = np.append(False, missed[:-1])[: len(ids)]
+        was_missed[first] = [name in self._lost for name in names]
+        happened = (
+            last[missed[last] & (tick[last] < len(passed) - 1)],
+            np.flatnonzero(was_missed & ~missed),
+            np.flatnonzero(missed & ~was_missed),
+        )
+        row, what = np.concatenate(happened), np.repeat(range(len(happened)), [len(rows) for rows in happened])
+        when = tick[row] + (what == _OVER)
+        x_m, y_m = xy_m[:, order[row]].tolist()
+        ratio = np.ones(len(ids))  # at the row from which on it holds
+        ratio[first] = [self._lost[name][1] if name in self._lost else 1.0 for name in names]
+        events = zip(when.tolist(), what.tolist(), row.tolist(), ids[row].tolist(), x_m, y_m, strict=True)
+        for step, event, at, name, x, y in sorted(events):
+            if event == _OVER:
+                self._end(name, is_told=bool(passed[step] == 1))
+            elif event == _BACK:
+                self._odds.add(self._lost.pop(name)[0], True)
+                ratio[at] = 1.0
+            else:
+                ratio[at] = self._odds.ratio((x, y))
+                self._lost[name] = (x, y), float(ratio[at])
+        changes = np.union1d(first, row[what != _OVER])
+        out = np.empty(len(order))
+        out[order] = np.repeat(ratio[changes], np.diff(np.append(changes, len(order))))
+        return out
+
+    def _end(self, name: int, is_told: bool) -> None:
+        """A lost track is over; a gap of the log ends tracks without telling anything of them."""
+        place, _ = self._lost.pop(name)
+        if is_told:
+            self._odds.add(place, False)
+
+
+# Convex hulls that grow. Letters: N points, V vertices.
+
+
+#: Points so little outside are taken for inside, in units of length.
+_SLACK: Final = 1e-6
+
+
+@dataclass
+class GrowingHull:
+    """The convex hull of all points so far.
+
+    Attributes
+    ----------
+    vertices : (V, 2) of float
+        Its vertices, anticlockwise; fewer than three if no area was seen yet, which has no inside.
+
+    Examples
+    --------
+    >>> hull = GrowingHull()
+    >>> hull.add(np.array([[0.0, 4.0, 4.0, 0.0, 2.0], [0.0, 0.0, 4.0, 4.0, 2.0]]))
+    >>> hull.vertices.tolist()
+    [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
+    >>> hull.holds(np.array([[1.0, 5.0], [1.0, 1.0]])).tolist()
+    [True, False]
+    """
+
+    vertices: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    _normals: Floats = field(init=False, default_factory=lambda: np.empty((0, 2)))
+    _limits: Floats = field(init=False, default_factory=lambda: np.empty((0, 1)))
+
+    def holds(self, xy: Floats) -> Bools:
+        """Which points (2, N) are inside, (N,); those that are NaN are not."""
+        if not len(self._normals):
+            return np.zeros(xy.shape[1], bool)
+        return np.asarray((self._normals @ xy <= self._limits).all(axis=0))
+
+    def add(self, xy: Floats) -> None:
+        """Add points (2, N); those that are NaN are left out."""
+        new = xy[:, np.isfinite(xy).all(axis=0) & ~self.holds(xy)]
+        if not new.shape[1]:
+            return
+        points = sorted({(x, y) for x, y in [*self.vertices.tolist(), *new.T.tolist()]})
+        ring = [*_chain(points), *_chain(points[::-1])]
+        self.vertices = np.array(ring)
+        if len(ring) > 2:
+            edges = np.roll(self.vertices, -1, axis=0) - self.vertices
+            outwards = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+            self._normals = outwards / np.hypot(*outwards.T)[:, None]
+            self._limits = (self._normals * self.vertices).sum(axis=1)[:, None] + _SLACK
+
+
+def _chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """One side of the hull of sorted points, without the last one (A. M. Andrew, 1979)."""
+    out: list[tuple[float, float]] = []
+    for x, y in points:
+        while len(out) > 1:
+            (ax, ay), (bx, by) = out[-2:]
+            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                break
+            out.pop()
+        out.append((x, y))
+    return out[:-1] if len(out) > 1 else out
+
+
+class ShownTracks:
+    """Which tracks are written: called with the steps of a log, some at a time.
 
     Parameters
     ----------
     confirm_hits : int
-        Tracks are confirmed by so many observations.
+        A track with so many observations is written in any case.
+    coast : int
+        A lost track is written for at most so many steps.
     max_age : int
         Tracks terminate after so many steps without an observation.
-    step_s : float
-        The seconds of a step.
+    adapts : bool
+        Whether it follows the log. Otherwise tracks are written once they are confirmed, and if they are lost once they
+        were observed half as often again.
     """
 
-    def __init__(self, confirm_hits: int, max_age: int, step_s: float) -> None:
-        self._confirm_hits, self._max_age, self._step_s = confirm_hits, max_age, step_s
+    def __init__(self, confirm_hits: int, coast: int, max_age: int, adapts: bool) -> None:
+        self._adapts = adapts
+        self._confirm_hits, self._coast, self._max_age = confirm_hits, coast, max_age
         self._lasting = _LASTING * (confirm_hits - 1) + 1
-        self._models = [Logistic.of(f"online {kind}", PRESENT_FEATURES) for kind in PRESENT_KINDS]
-        # of the tracks alive at the last step: ids, rising, and totals of what is added up over their steps
-        self._ids, self._totals = np.empty(0, np.int64), np.empty((0, 3))
-        self._border = np.full(len(_DIRECTIONS.T), -np.inf)
-        self._levels = min(max_age, _GAP_LEVELS)
-        self._counts = np.zeros(8 + self._levels)
+        self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
+        self._seen = GrowingHull()
+        self._places = PlacesOfLosses()
+        # By level of observations: tracks that reached the next one or terminated, and those that terminated. By inside
+        # and outside and level of steps without an observation: tracks that went on from there, and that came back.
+        self._counts = np.zeros((2, self._levels + 1))
+        self._returns = np.zeros((2, 2, self._ages + 1))
+        self._prior = _WEIGHT * (1 - _LASTS ** (1 / max(self._levels - 1, 1)))
+        self._prior_returns = _WEIGHT * (1 - (1 - _RETURNS) ** (1 / self._ages))
+        #: Of the last step: id, levels of observations and of steps without one, and whether outside, (4, K).
+        self._last: Ints = np.empty((4, 0), np.int64)
 
-    def __call__(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Bools:
-        """Mask the tracks (R,) alive at F steps that are written, because each is likely a person who is here now.
+    def __call__(self, passed: Ints, tick: Ints, is_observed: Bools, tracks: Ints, xy_m: Floats) -> Bools:
+        """Which of the tracks alive at each of F steps are written, (R,).
 
-        ``noise_m`` (F,) is the noise of positions at each step, ``tick`` (R,) the index of the step of each track,
-        rising; ``tracks`` (8, R) and ``state`` (R,) are as in ``Step``, and ``xy_m`` (2, R) the observations, or where
-        the others are expected. Nothing is known at a step that was not known then.
+        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the number of the step of each row, rising;
+        ``tracks`` (5, R) and ``xy_m`` (2, R) are as in ``Step``. Nothing is known at a step that was not known then.
         """
-        values, kind = self.features(tick, tracks, state, xy_m, noise_m), self.kinds(tracks)
-        log_odds = np.empty(len(tick))
-        for number, model in enumerate(self._models):
-            here = kind == number
-            log_odds[here] = model.log_odds(values[here])
-        return np.asarray(log_odds >= _LEAST_LOG_ODDS[kind])
+        is_confirmed, may_coast = tracks[HITS] >= self._confirm_hits, tracks[MISSED] <= self._coast
+        if not self._adapts:
+            is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
+            return np.asarray(np.where(is_observed, is_confirmed, may_coast & is_old))
+        outside = ~self._inside(len(passed), tick, is_observed & is_confirmed, xy_m)
+        level, next_level = (self._level(tracks[HITS] + more) for more in (0, 1))
+        age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
+        lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
+        lasting, where = level >= self._levels, outside.astype(np.intp)
+        ratio = self._places(passed, tick, tracks[IDS], is_observed, xy_m)
+        early = lasts[tick, level] >= 0.5
+        comes_back = _at_odds(returns[tick, where, age], ratio) * lasts[tick, next_level] >= 0.5
+        stays = may_coast & ((lasting & ~outside) | comes_back)
+        return np.asarray(np.where(is_observed, early | is_confirmed, stays))
 
-    def kinds(self, tracks: Ints) -> Ints:
-        """The kind of each track (R,), an index into ``PRESENT_KINDS``."""
-        hits, is_lost = tracks[HITS], tracks[MISSED] > 0
-        return np.where(is_lost, 2 + (hits >= self._lasting), hits >= self._confirm_hits)
+    def _level(self, hits: Ints) -> Ints:
+        return -(-np.minimum(hits, self._lasting) * self._levels // self._lasting)
 
-    def features(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Floats:
-        """The features of each track at each step, (R, E): see ``PRESENT_FEATURES``. The arguments are those above."""
-        hits, missed = tracks[HITS], tracks[MISSED]
-        off = _squared(xy_m - state.mean[:2]) / noise_m[tick] ** 2
-        begins = np.where(tracks[STEPS] == 1, xy_m, 0.0)
-        rough, *begin_m = self._added_up(tick, tracks[IDS], np.stack([off, *begins]))
-        outside_m = self._outside(tick, hits >= self._confirm_hits, missed == 0, xy_m, len(noise_m))
-        return np.stack(
-            [
-                np.log(hits),
-                np.log(missed * self._step_s + 0.1),
-                np.log(np.hypot(*(xy_m - begin_m)) + 0.3),
-                np.log(rough / np.maximum(hits - 1, 1) + 0.05),
-                tracks[CHANGES] / hits,
-                self._beside(tick, tracks, xy_m),
-                outside_m > 0,
-                outside_m,
-                *self._of_log(tick, tracks, outside_m > 0, len(noise_m)),
-            ],
-            axis=-1,
-        )
+    def _inside(self, count: int, tick: Ints, is_sure: Bools, xy_m: Floats) -> Bools:
+        """Which tracks (R,) are in the area in which others, or they themselves, were seen before."""
+        bounds = np.searchsorted(tick, np.arange(count + 1)).tolist()
+        inside = np.zeros(len(tick), bool)
+        for low, high in pairwise(bounds):
+            here = xy_m[:, low:high]
+            inside[low:high] = self._seen.holds(here)
+            if (is_sure[low:high] & ~inside[low:high]).any():
+                self._seen.add(here[:, is_sure[low:high]])
+        return inside
 
-    def _added_up(self, tick: Ints, ids: Ints, values: Floats) -> Floats:
-        """The sums (V, R) of values (V, R) of each track over its steps so far."""
-        order = np.lexsort((tick, ids))
-        first = np.flatnonzero(run_starts(ids[order]))
-        each = values.T[order]
-        at = np.minimum(np.searchsorted(self._ids, ids[order][first]), max(len(self._ids) - 1, 0))
-        had = np.zeros((len(first), len(values)))
-        if len(self._ids):
-            had = np.where((self._ids[at] == ids[order][first])[:, None], self._totals[at], had)
-        total = each.cumsum(axis=0)
-        before = had - total[first] + each[first]
-        total += np.repeat(before, np.diff(np.append(first, len(order))), axis=0)
-        out = np.empty_like(total)
-        out[order] = total
-        last = np.flatnonzero(tick == tick.max(initial=0))
-        last = last[np.argsort(ids[last])]
-        self._ids, self._totals = ids[last], out[last]
-        return out.T
+    def _learn(self, passed: Ints, tick: Ints, now: Ints) -> tuple[Floats, Floats]:
+        """Learn from what became of tracks, of which ``now`` (4, R) is known at each step.
 
-    def _beside(self, tick: Ints, tracks: Ints, xy_m: Floats) -> Floats:
-        """The nearness of the nearest older track that was observed, (R,): from 0 at ``_BESIDE_M`` on to 1."""
-        ids, is_seen = tracks[IDS], tracks[MISSED] == 0
-        place = np.where(np.isfinite(xy_m), xy_m, np.inf).T
-        pair = np.stack(near_pairs(tick, place, _BESIDE_M))
-        older, younger = np.where(ids[pair[0]] < ids[pair[1]], pair, pair[::-1])
-        older, younger = older[is_seen[older]], younger[is_seen[older]]
-        out = np.zeros(len(ids))
-        np.maximum.at(out, younger, 1 - _squared(xy_m[:, older] - xy_m[:, younger]) / _BESIDE_M**2)
-        return out
+        Returns the probability that a track lasts at each step by its level of observations, (F, H + 1), and that a
+        lost one comes back, by whether it is outside and the level of steps without an observation, (F, 2, A + 1).
+        """
+        count, levels = len(passed), self._levels + 1
+        all_, at = np.concatenate([self._last, now], axis=1), np.append(np.full(self._last.shape[1], -1), tick)
+        order = np.lexsort((at, all_[0]))
+        (ids, level, age, outside), at = all_[:, order], at[order]
+        goes_on = np.append(ids[1:] == ids[:-1], False)[: len(ids)]
+        is_judged = goes_on | (at < count - 1)  # what became of those of the last step is not known yet
+        then = np.minimum(at + 1, count - 1)
+        is_judged &= passed[then] == 1  # a gap of the log ends tracks, and says nothing about them
+        next_level, next_age = (np.append(values[1:], 0)[: len(ids)] for values in (level, age))
+        lasting, back = level >= self._levels, goes_on & (next_age == 0)
+        is_new = is_judged & ~lasting & (~goes_on | (next_level > level))
+        is_lost = is_judged & (age > 0) & (~lasting | (outside > 0)) & (~goes_on | back | (next_age > age))
+        place = then * levels + level
+        counts = np.stack([_counted(place[which], count, (levels,)) for which in (is_new, is_new & ~goes_on)])
+        shape = 2, self._ages + 1
+        place = (then * 2 + outside) * shape[1] + age
+        returns = np.stack([_counted(place[which], count, shape) for which in (is_lost, is_lost & back)])
+        counts[:, 0] += self._counts
+        returns[:, 0] += self._returns
+        counts, returns = counts.cumsum(axis=1), returns.cumsum(axis=1)
+        self._counts, self._returns, self._last = counts[:, -1], returns[:, -1], now[:, tick == count - 1]
+        survives: Floats = 1 - (counts[1] + self._prior) / (counts[0] + _WEIGHT)
+        survives[:, -1] = 1.0
+        stays_lost: Floats = 1 - (returns[1] + self._prior_returns) / (returns[0] + _WEIGHT)
+        return _from_here_on(survives), 1 - _from_here_on(stays_lost)
 
-    def _outside(self, tick: Ints, confirmed: Bools, is_seen: Bools, xy_m: Floats, count: int) -> Floats:
-        """The metres by which tracks (R,) are outside of the area in which confirmed ones were seen before."""
-        along = _DIRECTIONS.T @ xy_m
-        counts = np.flatnonzero(confirmed & is_seen & np.isfinite(xy_m[0]))
-        reached = np.full((len(self._border), count + 1), -np.inf)
-        reached[:, 0] = self._border
-        np.maximum.at(reached.T, tick[counts] + 1, along.T[counts])
-        reached = np.maximum.accumulate(reached, axis=1)
-        self._border = reached[:, -1]
-        return np.clip(np.nan_to_num((along - reached[:, tick]).max(axis=0), nan=np.inf), -_BORDER_M, _BORDER_M)
 
-    def _of_log(self, tick: Ints, tracks: Ints, is_outside: Bools, count: int) -> Floats:
-        """The features that say how tracks (R,) fared so far in this log, (6, R)."""
-        hits, missed = tracks[HITS], tracks[MISSED]
-        lasts, is_lost = hits >= self._lasting, missed > 0
-        # the same as in ``OnlineTracker``: those that are not observed at the next step are over
-        longest = np.where(hits >= self._confirm_hits, self._max_age, min(self._confirm_hits, self._max_age))
-        is_over = (missed == longest) & ~is_outside
-        returned = np.where(is_lost, 0, self._level(tracks[GAP]))
-        happened = [
-            lasts,
-            lasts & is_lost,
-            ~lasts & (missed == 1),
-            ~lasts & (returned > 0),
-            lasts & is_over,
-            ~lasts & is_over,
-            ~lasts,
-            tracks[STEPS] == 1,
-            *(returned >= np.arange(1, self._levels + 1)[:, None]),
-        ]
-        counts = np.stack([np.bincount(tick[rows], minlength=count) for rows in happened])
-        counts = self._counts[:, None] + counts.cumsum(axis=1)
-        self._counts = counts[:, -1]
-        lasting, lasting_missed, lost, back, over, new_over, new, born, gaps, *_ = counts[:, tick]
-        # people are lost at any time: new tracks that are over more often than lasting ones were false
-        false = new_over - (over + 1) / (lasting + 50) * new
-        false_share = np.clip(np.maximum(false, 0.3) / (born + 1), 0.01, 0.97)
-        as_long = counts[7 + np.maximum(self._level(missed), 1), tick]
-        return np.stack(
-            [
-                np.log((lasting_missed + 1) / (lasting + 10)),
-                np.log((back + 1) / (lost + 1)),
-                np.log((new_over + 0.5) / (over + 0.5)),
-                np.log((new + 1) / (lasting + 10)),
-                np.log(false_share / (1 - false_share)),
-                np.where(is_lost, -np.log((as_long + 0.5) / (gaps + 3)), 0.0),
-            ]
-        )
+def _at_odds(probability: Floats, ratio: Floats) -> Floats:
+    """Probabilities (R,) with odds multiplied by ``ratio`` (R,)."""
+    return np.asarray(probability * ratio / (1 - probability + probability * ratio))
 
-    def _level(self, steps: Ints) -> Ints:
-        """The level (R,) of gaps of so many steps (R,), from 1 on; 0 for none."""
-        return -(-np.minimum(steps, self._max_age) * self._levels // self._max_age)
+
+def _counted(place: Ints, count: int, shape: tuple[int, ...]) -> Floats:
+    """Count each of the places of ``count`` tables, laid end to end."""
+    size = count * int(np.prod(shape))
+    return np.bincount(place, minlength=size).reshape(count, *shape).astype(np.float64)
+
+
+def _from_here_on(survives: Floats) -> Floats:
+    """The products of the last elements along the last axis, from each of them on."""
+    return np.asarray(np.cumprod(survives[..., ::-1], axis=-1)[..., ::-1], np.float64)

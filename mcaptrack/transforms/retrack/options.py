@@ -204,12 +204,13 @@ class LikelihoodOptions(RetrackOptions):
     merge_timeout_s : float
         Longest time that tracks stay merged into one detection, in seconds.
     confirm_s : float
-        Online, a track is confirmed, and predicted, once it was observed for this many seconds.
+        Online, a track is confirmed once it was observed for this many seconds: predicted, and written if it
+        was not before.
     coast_s : float
-        Online, without adapt_online, a track is written for up to this many seconds without an observation.
+        Online, a track is written for up to this many seconds without an observation.
     adapt_online : bool
-        Online, write tracks as long as they are likely a person who is there, by what the log says so far;
-        otherwise from their confirmation on, and lost ones for coast_s.
+        Online, follow the log so far: write new tracks at once if most tracks last, and lost ones only as long
+        as it is likely that they come back.
     appearance : bool or None
         Compare the colours of what people wear before and after gaps and encounters; by default where the log
         has pictures that tell people apart.
