@@ -40,7 +40,7 @@ _SWAP_COST: Final = 2.0
 _SAME_ID_COST: Final = 1.0
 _LEAST_COST: Final = 1.0
 #: Steps of encounters that are computed with at once.
-_CELLS: Final = 2**18
+_CELLS: Final = 2**16
 #: The least gain in log likelihood of swaps over none.
 _MIN_GAIN: Final = 1.0
 
@@ -318,22 +318,21 @@ def find_swaps(
     else is known. The gain (C,) is a difference of log likelihoods.
     """
     swapped = np.zeros(len(relative_m)) if evidence is None else evidence
-    by_drift = (_viterbi(model, relative_m, swap_cost, swapped, drift**2) for drift in DRIFTS_M_PER_S)
-    best, best_gain, likelihood = next(by_drift)
-    for path, gain, total in by_drift:
-        better = total > likelihood
-        likelihood = np.where(better, total, likelihood)
-        best = np.where(better[:, None], path, best)
-        best_gain = np.where(better, gain, best_gain)
-    return best, best_gain
+    drifts = len(DRIFTS_M_PER_S)  # all at once: a step of few encounters takes as long as one of many
+    power = np.repeat(np.square(DRIFTS_M_PER_S), len(relative_m))
+    paths, gain, likelihood = _viterbi(
+        model, np.tile(relative_m, (drifts, 1, 1)), np.tile(swap_cost, (drifts, 1)), np.tile(swapped, drifts), power
+    )
+    best = np.argmax(likelihood.reshape(drifts, -1), axis=0) * len(relative_m) + np.arange(len(relative_m))
+    return paths[best], gain[best]
 
 
 def _viterbi(
-    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats, power: float
+    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats, power: Floats
 ) -> tuple[Bools, Floats, Floats]:
-    """Swaps (C, T), their gain (C,) and log likelihood (C,) for one drift of the relative velocity."""
+    """Swaps (C, T), their gain (C,) and log likelihood (C,) for drifts of the relative velocity, squared (C,)."""
     count, steps = relative_m.shape[:2]
-    r, step_s = 2 * model.noise_m**2, model.step_s
+    r, step_s, power = 2 * model.noise_m**2, model.step_s, power[:, None]
     mean = np.zeros((count, 3, 4))  # hypotheses: as labelled, swapped, and never swapped at all
     cov = np.tile([r, 0.0, 2 * model.speed_m_per_s**2], (count, 3, 1))
     total = np.tile([0.0, -np.inf, 0.0], (count, 1))
