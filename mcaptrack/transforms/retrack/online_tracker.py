@@ -516,8 +516,8 @@ PRESENT_FEATURES: Final = (
 #: The kinds of tracks that have weights of their own: observed before and after confirmation, and lost, before and
 #: after they lasted.
 PRESENT_KINDS: Final = ("new", "confirmed", "lost", "lasting lost")
-#: The log odds from which each kind is written. A track that is seen has to be surer than a lost one, above all when it
-#: begins, because it may be written under an id that it turns out not to have. (Chosen on synthetic crowds.)
+#: The log odds from which each kind is written. A new track has to be surer, because it may be written under an id that
+#: it turns out not to have. (Chosen on synthetic crowds.)
 _LEAST_LOG_ODDS: Final = np.array([1.0, 0.0, 0.0, 0.0])
 #: A track has lasted once it was observed for so many times as long as its confirmation takes.
 _LASTING: Final = 3
@@ -570,7 +570,8 @@ class PresentTracks:
     def kinds(self, tracks: Ints) -> Ints:
         """The kind of each track (R,), an index into ``PRESENT_KINDS``."""
         hits, is_lost = tracks[HITS], tracks[MISSED] > 0
-        return np.where(is_lost, 2 + (hits >= self._lasting), hits >= self._confirm_hits)
+        kinds: Ints = np.where(is_lost, 2 + (hits >= self._lasting), hits >= self._confirm_hits)
+        return kinds
 
     def features(self, tick: Ints, tracks: Ints, state: StateRows, xy_m: Floats, noise_m: Floats) -> Floats:
         """The features of each track at each step, (R, E): see ``PRESENT_FEATURES``. The arguments are those above."""
@@ -633,7 +634,8 @@ class PresentTracks:
         np.maximum.at(reached.T, tick[counts] + 1, along.T[counts])
         reached = np.maximum.accumulate(reached, axis=1)
         self._border = reached[:, -1]
-        return np.clip(np.nan_to_num((along - reached[:, tick]).max(axis=0), nan=np.inf), -_BORDER_M, _BORDER_M)
+        outside_m: Floats = np.nan_to_num((along - reached[:, tick]).max(axis=0), nan=np.inf)
+        return outside_m.clip(-_BORDER_M, _BORDER_M)
 
     def _of_log(self, tick: Ints, tracks: Ints, is_outside: Bools, count: int) -> Floats:
         """The features that say how tracks (R,) fared so far in this log, (6, R)."""
