@@ -336,7 +336,7 @@ class OnlineTracker:
         """Whether a track is written online."""
         o = self.options
         if o.adapt_online:
-            return odds >= (0 if not is_seen else 1.5 if person.hits < self.confirm else 0.5)
+            return odds >= (1 if is_seen and person.hits < self.confirm else 0)
         if is_seen:
             return person.hits >= self.confirm
         return person.hits >= 1.5 * self.confirm and person.missed <= round(o.coast_s * o.rate_hz)
