@@ -42,6 +42,11 @@ class Terminal(io.StringIO):
         return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.getvalue())
 
 
+def press_ctrl_c(*_: object, **__: object) -> None:
+    """Take the place of what would last until Ctrl-C, such as serving a log."""
+    raise KeyboardInterrupt
+
+
 def call(*words: object, folder: Path | None = None, environment: Mapping[str, str] | None = None) -> Outcome:
     """Run a command in this process, which is quicker than in one of its own."""
     out, err = io.StringIO(), io.StringIO()

@@ -17,7 +17,8 @@ from mcaptrack.cli.demo import _next_commands
 from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from mcaptrack.sources import demo
 from mcaptrack.sources.demo import read_scores
-from tests.commands import call, printed
+from mcaptrack.viewing.serving import Server
+from tests.commands import call, press_ctrl_c, printed
 from tests.worlds import small_scene, write_clip
 
 LAYOUTS = [".comparing.layout.json", ".layout.json"]
@@ -319,7 +320,7 @@ def test_the_demonstration(tmp_path, monkeypatch):
         f"layouts  {'  '.join(f'{folder}/demo{end}.layout.json' for end in ('', '.comparing', '.predictions'))}",
         f"tables   {folder / 'demo.tables'}",
     ]
-    assert (more[0].split()[0], more[1], len(more)) == ("Open", "See more:", 6)
+    assert (more[0].split()[0], more[1], len(more)) == ("Open", "See more:", 7)
     scored = json.loads(
         printed("evaluate", folder / "demo.mcap", "--similarity", "metres", "--gate-m", "1", "--json")[0]
     )
@@ -332,8 +333,9 @@ def test_the_demonstration(tmp_path, monkeypatch):
         [str(one[name]), str(other[name])] for name in ("IDSW", "FP", "FN", "Frag")
     ]
     proposed = [shlex.split(line) for line in shown.partition("See more:\n")[2].splitlines()]
-    assert len(proposed) == 4
-    subprocess.run(proposed[0], capture_output=True, check=True, env=os.environ | {"PATH": "/usr/bin:/bin"})
+    assert [words[3] for words in proposed] == ["view", "info", "evaluate", "report", "query"]
+    subprocess.run(proposed[1], capture_output=True, check=True, env=os.environ | {"PATH": "/usr/bin:/bin"})
+    monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)
     for words in proposed:  # works as it stands, where the demonstration was called
         assert words[:3] == proposed[0][:3]
         assert any(printed(*words[3:]))
@@ -356,9 +358,9 @@ def test_the_demonstration_proposes_commands_as_the_shell_finds_them(tmp_path, m
         "": ".venv/bin/mcaptrack",
     }.items():
         monkeypatch.setenv("PATH", str(tmp_path / path) if path else "/nowhere")
-        assert _next_commands(Path("a b.mcap"))[0] == f"{called} info 'a b.mcap'"
+        assert _next_commands(Path("a b.mcap"))[0] == f"{called} view 'a b.mcap'"
     monkeypatch.chdir(tmp_path / "other")
-    assert _next_commands(Path("a.mcap"))[0] == f"{tmp_path}/.venv/bin/mcaptrack info a.mcap"
+    assert _next_commands(Path("a.mcap"))[0] == f"{tmp_path}/.venv/bin/mcaptrack view a.mcap"
 
 
 def test_check_lists_findings_in_a_table(finished, tmp_path):

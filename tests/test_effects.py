@@ -30,7 +30,7 @@ from mcaptrack.sources import demo
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.serving import Server
 from tests.bags import plain
-from tests.commands import GROUP, call, done
+from tests.commands import GROUP, call, done, press_ctrl_c
 from tests.effects.commands import CASES
 from tests.models import DATA, stocked
 from tests.tiers import one_in
@@ -213,7 +213,7 @@ def see(work, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     """Run a command line in a folder that is as the template."""
     monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
     monkeypatch.setitem(demo.SCENES, "crowd", lambda seed: small_scene(1.0, seed=seed))
-    monkeypatch.setattr(Server, "serve_forever", _interrupted)
+    monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)
     monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
     monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))
 
@@ -232,10 +232,6 @@ def see(work, tmp_path, monkeypatch) -> Callable[[str], Seen]:
         return Seen(code, out, err, work.changed())
 
     return run
-
-
-def _interrupted(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
 
 
 #: What came of command lines without the option that is looked at.

@@ -201,12 +201,36 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     assert made_by(path, "/camera/retracks").parameters["side_view"] is True
 
 
-def test_a_sequence_that_is_too_short_gives_a_warning(tmp_path):
-    (tmp_path / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
-    path = ingested(tmp_path / "a.mcap", downwards(15), "--ground-plane", tmp_path / "plane.txt")
-    (said,) = json.loads(done("run", path, "--no-tables", "--json", "-q").out)["warnings"]
+@pytest.fixture(scope="module")
+def short(tmp_path_factory) -> Path:
+    """A log of 14 pictures, 1.3 s, of two people seen from above, with their samples."""
+    folder = tmp_path_factory.mktemp("short")
+    (folder / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
+    path = ingested(folder / "a.mcap", downwards(15), "--ground-plane", folder / "plane.txt")
+    done("sample", path, "-q")
+    return path
+
+
+def test_a_short_sequence_keeps_its_people(short, tmp_path):
+    path = shutil.copy(short, tmp_path / "a.mcap")
+    assert json.loads(done("retrack", path, "--json", "-q").out)["warnings"] == []
+    with log.read(path) as opened:
+        kept_people = np.unique(opened.rows("/camera/retracks", TRACKS).rows["track_id"])
+    assert len(kept_people) == 2
+
+
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [
+        ("min_track_s=2", "the longest track lasts 1.2 s; those under 2 s are left out (min_track_s)"),
+        ("track_confidence=1", "no track is likely enough to be a person (track_confidence)"),
+    ],
+)
+def test_why_nobody_is_kept_is_said(setting, reason, short, tmp_path):
+    path = shutil.copy(short, tmp_path / "a.mcap")
+    (said,) = json.loads(done("retrack", path, "--set", setting, "--json", "-q").out)["warnings"]
     assert said["code"] == "nothing-found"
-    assert "the longest track lasts 1.2 s; those under 2 s are left out (min_track_s)" in said["message"]
+    assert reason in said["message"]
 
 
 # Cameras that move

@@ -18,7 +18,7 @@ from mcap.writer import Writer
 from mcaptrack.cli.text import printable
 from mcaptrack.sources import demo
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, Outcome, call, done
+from tests.commands import GROUP, Outcome, call, done, press_ctrl_c
 from tests.effects.commands import CASES
 from tests.tiers import one_in
 from tests.worlds import small_scene
@@ -89,7 +89,7 @@ def _replaced(text: str) -> str:
 def run(template, tmp_path, monkeypatch):
     """Run a command line in a fresh copy of the template, with evil names for its files and channels."""
     monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
-    monkeypatch.setattr(Server, "serve_forever", _interrupted)
+    monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)
     folders = (tmp_path / str(number) for number in itertools.count())
 
     def tried(line: str) -> Outcome:
@@ -102,10 +102,6 @@ def run(template, tmp_path, monkeypatch):
         return call(*words, *(["--camera", EVIL] if is_of_camera else []))
 
     return tried
-
-
-def _interrupted(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
 
 
 def _evil(word: str) -> str:

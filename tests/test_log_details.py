@@ -253,12 +253,9 @@ def test_channels_that_were_made_from_each_other_may_be_many(tmp_path, shallow):
             made = Provenance("sample", {}, source)
             writer.add_channel(topic, SCHEMA, "json", made.to_metadata())
     done("report", path, "-o", tmp_path / "a.html")
-    page = (tmp_path / "a.html").read_text()
-    shown = re.findall(r"(?<=>)/[a-z/0-9]+(?=<)", page)
-    assert [topic for topic in dict.fromkeys(shown) if topic != "/round/b"] == [
-        *(f"/c{n:04}" for n in range(count)),
-        "/round/a",
-    ]
+    page = (tmp_path / "a.html").read_text().replace("<wbr>", "")  # where names may be broken over lines
+    shown = re.findall(r"<th scope=.row.[^>]*><bdi><code>(/[^<]+)<", page)
+    assert shown == [*(f"/c{n:04}" for n in range(count)), "/round/a", "/round/b"]
     shown = done("info", path).out
     assert f"/c{count - 1:04}" in shown
 

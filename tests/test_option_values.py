@@ -361,7 +361,7 @@ def test_progress_is_shown_on_a_terminal_only(monkeypatch, terminal):
             talk.progress("track", 7, 7)
             talk.say("a line")
             talk.progress("sample", 2, 2)
-            talk._stop()
+            talk.clear()
             shown[name] = sys.stderr.getvalue()
     assert (shown["pipe"], shown["quiet"]) == ("a line\n", "")
     before, after = terminal.shown().split("a line\n")

@@ -13,7 +13,7 @@ import pytest
 
 from mcaptrack.log.journal import journal_of
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, ONLY_READ, call, done, made_log
+from tests.commands import GROUP, ONLY_READ, call, done, made_log, press_ctrl_c
 from tests.effects.commands import CASES
 from tests.interrupted import everything, interrupt
 from tests.logs import READING
@@ -159,17 +159,13 @@ NAMES_BESIDE = (
 SURROUNDINGS = {"nothing": None, "noise": os.urandom(4096), "emptiness": b""}
 
 
-def _interrupted(*_: object, **__: object) -> None:
-    raise KeyboardInterrupt
-
-
 @pytest.mark.usefixtures("never_waits")
 @pytest.mark.parametrize(
     ("beside", "command"),  # train needs torch, and calibrate several cameras
     one_in(2, product(SURROUNDINGS, sorted(set(GROUP.commands) - {"calibrate", "demo", "models", "train"}))),
 )
 def test_commands_that_read_change_nothing(command: str, beside: str, template: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(Server, "serve_forever", _interrupted)
+    monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)
     folder = tmp_path / "work"
     shutil.copytree(template, folder)
     for path in folder.glob("*.layout.json"):

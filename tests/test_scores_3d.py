@@ -185,9 +185,12 @@ def test_a_log_of_3d_labels_is_evaluated_on_the_command_line(tmp_path):
         assert {"IDSW": rows[name]["IDSW"], "AMOTA": rows[name]["AMOTA"]} == pytest.approx(
             {"IDSW": wanted["metres", 2.0, name]["IDSW"], "AMOTA": wanted["metres", 2.0, name]["AMOTA"]}
         )
-    printed = call("evaluate", log, "--gate-m", "1,2").out.splitlines()
-    assert printed[0].split()[-2:] == ["AMOTA", "sAMOTA"]
-    assert call("evaluate", log, "--similarity", "3d-iou", "--min-iou", "0.3").out.count("3D IoU 0.3") == 5
+    verdict, _, columns, *_ = call("evaluate", log, "--gate-m", "1,2").out.splitlines()
+    assert verdict.startswith("within 2 m: ")
+    assert columns.split()[-2:] == ["AMOTA", "sAMOTA"]
+    by_overlap = call("evaluate", log, "--similarity", "3d-iou", "--min-iou", "0.3").out.splitlines()
+    assert by_overlap[0].startswith("with 3D IoU 0.3: ")
+    assert [line.split()[1] for line in by_overlap[3:]] == ["all", "mean", *NAMES.values()]
     table = call("evaluate", log, "--gate-m", "1,2", "--csv").out.splitlines()
     assert "AMOTA" in table[0].split(",")
     assert len(table) == 9

@@ -153,8 +153,8 @@ def test_the_transforms_of_a_stage_read_and_write_what_it_declares(stage):
 #: Algorithm 1 as in the paper; numbers that the paper doesn't give are those of the authors' program.
 PAPER = {
     "predictor": "cv", "distance": "mean", "covariance": "paper", "noise_m": 0.5, "gate_m": None, "same_id_bonus": 0.0,
-    "max_age_s": 3.2, "alpha": 0.5, "beta": 0.5, "min_history": 4, "min_hits": 2, "link_s": 0.0, "resolve_swaps": False,
-    "track_confidence": 0.0, "across_classes": False, "smooth": False, "interpolated": True,
+    "max_age_s": 3.2, "alpha": 0.5, "beta": 0.5, "min_history": 4, "min_hits": 2, "min_track_s": 2.0, "link_s": 0.0,
+    "resolve_swaps": False, "track_confidence": 0.0, "across_classes": False, "smooth": False, "interpolated": True,
 }  # fmt: skip
 AUTHORS = PAPER | {
     "distance": "max",

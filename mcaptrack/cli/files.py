@@ -77,7 +77,7 @@ def _print_check(checked: CheckResult, quiet: bool) -> None:
     findings = [finding for finding in checked.findings if not quiet or finding.level == "error"]
     if not findings:
         return
-    rows = [
+    rows: list[list[str | Text]] = [
         [Text(f.level, "red" if f.level == "error" else "yellow"), str(f.where), str(f.times), f.kind, f.words]
         for f in findings
     ]

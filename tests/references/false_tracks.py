@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from tests.references.offline import FITTED, Motion, Path, State
 
 PEOPLE, PERSON_BIAS = FITTED["people"]["weights"], FITTED["people"]["bias"]
+DECIDED, DECIDED_BIAS = FITTED["decided"]["weights"]["log odds"], FITTED["decided"]["bias"]
 THROUGHOUT = FITTED["people"]["stands throughout"]
 DUPLICATE_M, BESIDE_M, BESIDE_SAMPLES, GOES_M = 1.2, 1.8, 4, 3.0
 

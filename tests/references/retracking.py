@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from tests.references.false_tracks import log_odds_in_log
+from tests.references.false_tracks import DECIDED, DECIDED_BIAS, log_odds_in_log
 from tests.references.hypotheses import Claim, swept
 from tests.references.offline import FITTED, Motion, exchanged, sigmoid, smoothed_in_log
 
@@ -151,7 +151,10 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
             break
     tracks = {track: filled(path, track) for track, path in paths.items()}
     smoothed = smoothed_in_log(motion, places_of(paths), o.noise_m is not None) if paths else {}
-    odds = log_odds_in_log(motion, places_of(paths), (steps[0], steps[-1]))
+    odds = {
+        track: DECIDED_BIAS + DECIDED * value
+        for track, value in log_odds_in_log(motion, places_of(paths), (steps[0], steps[-1])).items()
+    }
     for track in list(tracks):
         if o.smooth:
             for step, state in smoothed[track].items():
