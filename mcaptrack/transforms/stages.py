@@ -367,6 +367,7 @@ _STAGES: Final = (
             "predictions": PREDICTIONS,
             "decisions": DECISIONS,
             "appearance": APPEARANCE,
+            "worlds": WORLDS,
         },
         input_topic="samples",
         output_topic="retracks",
@@ -376,9 +377,13 @@ _STAGES: Final = (
         repairs_tracks=True,
         profiles_place="mcaptrack.transforms.retrack:PROFILES",
         modes=MappingProxyType(
-            {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}
+            {
+                "both": (),
+                "offline": ("", "decisions", "appearance", "worlds"),
+                "online": ("online", "predictions"),
+            }
         ),
-        beside=("decisions", "appearance"),
+        beside=("decisions", "appearance", "worlds"),
     ),
 )
 

@@ -1,0 +1,142 @@
+"""Plausible worlds: who is who, and who is a person, as it may be where offline re-tracking is not sure.
+
+Each world is the best set of links under scores with noise of Gumbel's distribution (perturb and MAP: Papandreou and
+Yuille 2011), by the same solver. What was decided for reasons that no single link has (encounters, corrections of
+people, the sweep before) counts for its links as much as it takes for them to be the best ones without noise.
+
+Letters: W worlds, C assignments, K tracklets, E candidate links, P tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.schema import WORLDS, Rows
+from mcaptrack.transforms.retrack.hypotheses import Hypotheses, best_next, following, named
+from mcaptrack.transforms.retrack.linking import chains
+from mcaptrack.transforms.retrack.weights import Logistic
+
+#: The scale of the noise of scores, with which links hold in as many worlds as are right. (Chosen on synthetic crowds.)
+NOISE: Final = 1.5
+#: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
+PERSON: Final = Logistic.of("decided", ("log odds",))
+#: Worlds are drawn with this seed: the same log has the same ones.
+_SEED: Final = 2011
+#: What was decided is better than anything else by so much at least, without noise.
+_LEAST: Final = 1e-3
+#: Certain log odds.
+_CERTAIN: Final = 50.0
+
+
+class Worlds(NamedTuple):
+    """The track of each tracklet in each world (W, K), and whether it is kept as a person (W, K)."""
+
+    track: Ints
+    kept: Bools
+
+
+def draw_worlds(
+    count: int,
+    hypotheses: Hypotheses,
+    track: Ints,
+    log_odds: Floats,
+    kept: Bools,
+    min_confidence: float,
+    least_steps: int,
+    seed: int = 0,
+    noise: float = NOISE,
+    person_noise: float = 1.0,
+) -> Worlds:
+    """Draw worlds; the first ones are the same whatever the ``count``.
+
+    Parameters
+    ----------
+    count : int
+        The number of worlds W.
+    hypotheses : Hypotheses
+        Those about the tracks that were decided.
+    track : (K,) of int
+        The track of each tracklet as it was decided.
+    log_odds : (P,) of float
+        Of each of these tracks to be a person, by the test of false tracks; infinite for certain.
+    kept : (P,) of bool
+        Which were kept.
+    min_confidence : float
+        As for the decision.
+    least_steps : int
+        What begins and ends within fewer steps is no person, unless that is certain.
+    seed : int
+        Worlds of other tracks have another seed.
+    noise, person_noise : float
+        The scales of the noise of scores and of the log odds of people; without any, worlds are what was decided.
+    """
+    tracklets, before, after, *_ = hypotheses
+    size = len(tracklets.first)
+    decided = np.flatnonzero(following(track, tracklets.begins)[before] == after)
+    gain = _favouring(decided, hypotheses, hypotheses.scored().gain(min_confidence))
+    of = np.unique(track, return_inverse=True)[1]
+    is_person = np.clip(PERSON.log_odds(log_odds[:, None]), -_CERTAIN, _CERTAIN)
+    is_person = np.where(kept, np.maximum(is_person, _LEAST), np.minimum(is_person, -_LEAST))
+    out = Worlds(np.empty((count, size), np.int64), np.empty((count, size), bool))
+    for world in range(count):
+        random = np.random.default_rng([_SEED, seed, world])
+        leaves, comes = random.gumbel(size=(2, size))
+        off = random.gumbel(size=(2, len(gain))).sum(axis=0) - leaves[before] - comes[after]
+        root = chains(best_next(before, after, gain + noise * off / 2, size), tracklets.begins)
+        out.track[world] = named(root, track)
+        odds = (is_person + person_noise * random.logistic(size=len(is_person)))[of]
+        total = np.bincount(root, odds * tracklets.samples, minlength=size)
+        first, last = np.full((2, size), [[np.iinfo(np.int64).max], [0]])
+        np.minimum.at(first, root, tracklets.begins)
+        np.maximum.at(last, root, tracklets.ends)
+        certain = np.bincount(root, is_person[of] >= _CERTAIN, minlength=size) > 0
+        out.kept[world] = ((total > 0) & (certain | (last - first >= least_steps)))[root]
+    return out
+
+
+def world_rows(worlds: Worlds, hypotheses: Hypotheses, step_s: float, steps: Sequence[int]) -> Iterator[Rows]:
+    """The rows of Worlds at each of ``steps``: those of the tracklets that begin there, by world and input id."""
+    tracklets, count = hypotheses.tracklets, len(worlds.track)
+    for low, high in pairwise(np.append(0, np.searchsorted(tracklets.begins, steps, "right")).tolist()):
+        here = low + np.argsort(tracklets.source[low:high], kind="stable")
+        rows = WORLDS.empty(count * len(here))
+        rows["world"] = np.repeat(np.arange(1, count + 1), len(here))
+        rows["kept"] = kept = worlds.kept[:, here].ravel()
+        rows["track_id"] = np.where(kept, worlds.track[:, here].ravel(), -1)
+        rows["source_id"] = np.tile(tracklets.source[here], count)
+        rows["duration_s"] = np.tile((tracklets.ends - tracklets.begins)[here] * step_s, count)
+        rows["frames"] = np.tile(tracklets.samples[here], count)
+        yield WORLDS.check(rows)
+
+
+def _favouring(decided: Ints, hypotheses: Hypotheses, gain: Floats) -> Floats:
+    """Gains (E,) with which the links ``decided`` are the best set.
+
+    They are raised by as little as possible in all: a linear programme over the prices of ends and of beginnings, the
+    dual one of the assignment. Links between ends and beginnings that have none are lowered.
+    """
+    from scipy.optimize import linprog
+    from scipy.sparse import csr_array
+
+    _, before, after, *_ = hypotheses
+    size = len(hypotheses.tracklets.first)
+    gain = gain.copy()
+    ends, begins = np.zeros((2, size), bool)
+    ends[before[decided]] = begins[after[decided]] = True
+    is_free = ~ends[before] & ~begins[after]
+    gain[is_free] = np.minimum(gain[is_free], -_LEAST)
+    need = gain + _LEAST
+    need[decided] = np.maximum(gain[decided], _LEAST)
+    counts = np.flatnonzero(~is_free & (need > 0))
+    has_price = np.stack([ends[before[counts]], begins[after[counts]]])
+    at = np.stack([before[counts], size + after[counts]])[has_price]
+    limits = csr_array((-np.ones(len(at)), (np.nonzero(has_price)[1], at)), shape=(len(counts), 2 * size))
+    cost = np.concatenate([ends, begins]).astype(np.float64)
+    price = linprog(cost, A_ub=limits, b_ub=-need[counts], method="highs").x
+    gain[decided] = np.maximum(price[before[decided]] + price[size + after[decided]], _LEAST)
+    return gain
