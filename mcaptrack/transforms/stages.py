@@ -27,6 +27,7 @@ from mcaptrack.schema import (
     SIGHTINGS,
     TRACKS,
     VIDEO,
+    WORLDS,
     Schema,
 )
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
