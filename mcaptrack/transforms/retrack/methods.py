@@ -193,7 +193,10 @@ def _keep_ids(
     linked: Iterator[Rows] | None = None
     stored: Iterator[Rows] = repeat(APPEARANCE.empty())
     if options.drawn_worlds:
-        warn("`worlds=` finds nothing to write: without a measured ground plane tracks are not decided", "option-not-used")
+        warn(
+            "`worlds=` finds nothing to write: without a measured ground plane tracks are not decided",
+            "option-not-used",
+        )
     if options.links_in_picture:
         frames = collect(TRACKS, frames)
         limits = options.link_s, options.link_confidence, options.across_classes

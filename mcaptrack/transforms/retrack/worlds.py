@@ -23,6 +23,10 @@ from mcaptrack.transforms.retrack.weights import Logistic
 
 #: The scale of the noise of scores, with which links hold in as many worlds as are right. (Chosen on synthetic crowds.)
 NOISE: Final = 1.5
+#: Tracks of one log are people or clutter together: so many log odds in all worlds of synthetic crowds (a standard
+#: deviation), and by how much log odds are larger once that is known (Zeger, Liang and Albert 1988).
+_OF_LOG: Final = 2.0
+_KNOWN: Final = np.sqrt(1 + 0.346 * _OF_LOG**2)
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
 PERSON: Final = Logistic.of("decided", ("log odds",))
 #: Worlds are drawn with this seed: the same log has the same ones.
@@ -80,7 +84,7 @@ def draw_worlds(
     decided = np.flatnonzero(following(track, tracklets.begins)[before] == after)
     gain = _favouring(decided, hypotheses, hypotheses.scored().gain(min_confidence))
     of = np.unique(track, return_inverse=True)[1]
-    is_person = np.clip(PERSON.log_odds(log_odds[:, None]), -_CERTAIN, _CERTAIN)
+    is_person = np.clip(_KNOWN * PERSON.log_odds(log_odds[:, None]), -_CERTAIN, _CERTAIN)
     is_person = np.where(kept, np.maximum(is_person, _LEAST), np.minimum(is_person, -_LEAST))
     out = Worlds(np.empty((count, size), np.int64), np.empty((count, size), bool))
     for world in range(count):
@@ -89,7 +93,8 @@ def draw_worlds(
         off = random.gumbel(size=(2, len(gain))).sum(axis=0) - leaves[before] - comes[after]
         root = chains(best_next(before, after, gain + noise * off / 2, size), tracklets.begins)
         out.track[world] = named(root, track)
-        odds = (is_person + person_noise * random.logistic(size=len(is_person)))[of]
+        shift = _OF_LOG * random.normal() + random.logistic(size=len(is_person))
+        odds = (is_person + person_noise * shift)[of]
         total = np.bincount(root, odds * tracklets.samples, minlength=size)
         first, last = np.full((2, size), [[np.iinfo(np.int64).max], [0]])
         np.minimum.at(first, root, tracklets.begins)
