@@ -4,7 +4,7 @@ Each world is the best set of links under scores with noise of Gumbel's distribu
 Yuille 2011), by the same solver. What was decided for reasons that no single link has (encounters, corrections of
 people, the sweep before) counts for its links as much as it takes for them to be the best ones without noise.
 
-Letters: W worlds, C assignments, K tracklets, E candidate links, P tracks.
+Letters: W worlds, K tracklets, E candidate links, P tracks.
 """
 
 from __future__ import annotations
@@ -21,19 +21,21 @@ from mcaptrack.transforms.retrack.hypotheses import Hypotheses, best_next, follo
 from mcaptrack.transforms.retrack.linking import chains
 from mcaptrack.transforms.retrack.weights import Logistic
 
-#: The scale of the noise of scores, with which links hold in as many worlds as are right. (Chosen on synthetic crowds.)
-NOISE: Final = 1.5
-#: Tracks of one log are people or clutter together: so many log odds in all worlds of synthetic crowds (a standard
-#: deviation), and by how much log odds are larger once that is known (Zeger, Liang and Albert 1988).
+#: The scale of the noise of scores: joins hold in as many worlds as are right. (Chosen on synthetic crowds.)
+NOISE = 1.35
+#: The scale of the noise of the log odds that tracks are people.
+PERSON_NOISE = 1.0
+#: Tracks of one log are people or clutter together: so many log odds in all tracks of a world of synthetic crowds (a
+#: standard deviation), and by how much log odds are larger once that is known (Zeger, Liang and Albert 1988).
 _OF_LOG: Final = 2.0
-_KNOWN: Final = np.sqrt(1 + 0.346 * _OF_LOG**2)
+_KNOWN: Final = (1 + 0.346 * _OF_LOG**2) ** 0.5
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
 PERSON: Final = Logistic.of("decided", ("log odds",))
-#: Worlds are drawn with this seed: the same log has the same ones.
-_SEED: Final = 2011
+#: Worlds are drawn with this seed, so the same log has the same ones; links and people have noise of their own.
+_SEED, _OF_LINKS, _OF_PEOPLE = 2011, 0, 1
 #: What was decided is better than anything else by so much at least, without noise.
 _LEAST: Final = 1e-3
-#: Certain log odds.
+#: Log odds of what is certain, with or without noise.
 _CERTAIN: Final = 50.0
 
 
@@ -53,8 +55,6 @@ def draw_worlds(
     min_confidence: float,
     least_steps: int,
     seed: int = 0,
-    noise: float = NOISE,
-    person_noise: float = 1.0,
 ) -> Worlds:
     """Draw worlds; the first ones are the same whatever the ``count``.
 
@@ -73,35 +73,48 @@ def draw_worlds(
     min_confidence : float
         As for the decision.
     least_steps : int
-        What begins and ends within fewer steps is no person, unless that is certain.
+        What lasts fewer steps is no person, unless that is certain.
     seed : int
-        Worlds of other tracks have another seed.
-    noise, person_noise : float
-        The scales of the noise of scores and of the log odds of people; without any, worlds are what was decided.
+        Worlds of other tracks of the log have another seed.
     """
     tracklets, before, after, *_ = hypotheses
     size = len(tracklets.first)
     decided = np.flatnonzero(following(track, tracklets.begins)[before] == after)
     gain = _favouring(decided, hypotheses, hypotheses.scored().gain(min_confidence))
     of = np.unique(track, return_inverse=True)[1]
-    is_person = np.clip(_KNOWN * PERSON.log_odds(log_odds[:, None]), -_CERTAIN, _CERTAIN)
+    is_person = PERSON.log_odds(log_odds[:, None])
     is_person = np.where(kept, np.maximum(is_person, _LEAST), np.minimum(is_person, -_LEAST))
+    is_certain = is_person > _CERTAIN
+    is_person = np.clip(is_person, -_CERTAIN, _CERTAIN)
     out = Worlds(np.empty((count, size), np.int64), np.empty((count, size), bool))
-    for world in range(count):
-        random = np.random.default_rng([_SEED, seed, world])
-        leaves, comes = random.gumbel(size=(2, size))
-        off = random.gumbel(size=(2, len(gain))).sum(axis=0) - leaves[before] - comes[after]
-        root = chains(best_next(before, after, gain + noise * off / 2, size), tracklets.begins)
+    for world, root in enumerate(draw_links(count, hypotheses, gain, seed)):
         out.track[world] = named(root, track)
-        shift = _OF_LOG * random.normal() + random.logistic(size=len(is_person))
-        odds = (is_person + person_noise * shift)[of]
-        total = np.bincount(root, odds * tracklets.samples, minlength=size)
+        total = np.bincount(root, draw_people(world, is_person, seed)[of] * tracklets.samples, minlength=size)
         first, last = np.full((2, size), [[np.iinfo(np.int64).max], [0]])
         np.minimum.at(first, root, tracklets.begins)
         np.maximum.at(last, root, tracklets.ends)
-        certain = np.bincount(root, is_person[of] >= _CERTAIN, minlength=size) > 0
-        out.kept[world] = ((total > 0) & (certain | (last - first >= least_steps)))[root]
+        certain = np.bincount(root, is_certain[of], minlength=size) > 0
+        out.kept[world] = (certain | ((total > 0) & (last - first >= least_steps)))[root]
     return out
+
+
+def draw_links(count: int, hypotheses: Hypotheses, gain: Floats, seed: int = 0) -> Iterator[Ints]:
+    """For each world the first tracklet of the chain that each one (K,) is in; links have ``gain`` (E,) without noise."""
+    tracklets, before, after, *_ = hypotheses
+    size = len(tracklets.first)
+    for world in range(count):
+        random = np.random.default_rng([_SEED, _OF_LINKS, seed, world])
+        leaves, comes = random.gumbel(size=(2, size))
+        out, into = random.gumbel(size=(2, len(gain)))
+        off = (out - leaves[before] + into - comes[after]) / 2
+        yield chains(best_next(before, after, gain + NOISE * off, size), tracklets.begins)
+
+
+def draw_people(world: int, log_odds: Floats, seed: int = 0) -> Floats:
+    """The log odds (P,) that tracks are people in a world: above 0 with the probability that ``log_odds`` (P,) say."""
+    random = np.random.default_rng([_SEED, _OF_PEOPLE, seed, world])
+    noise = _OF_LOG * random.normal() + random.logistic(size=len(log_odds))
+    return np.asarray(_KNOWN * log_odds + PERSON_NOISE * noise)
 
 
 def world_rows(worlds: Worlds, hypotheses: Hypotheses, step_s: float, steps: Sequence[int]) -> Iterator[Rows]:
@@ -143,5 +156,5 @@ def _favouring(decided: Ints, hypotheses: Hypotheses, gain: Floats) -> Floats:
     limits = csr_array((-np.ones(len(at)), (np.nonzero(has_price)[1], at)), shape=(len(counts), 2 * size))
     cost = np.concatenate([ends, begins]).astype(np.float64)
     price = linprog(cost, A_ub=limits, b_ub=-need[counts], method="highs").x
-    gain[decided] = np.maximum(price[before[decided]] + price[size + after[decided]], _LEAST)
+    gain[decided] = price[before[decided]] + price[size + after[decided]]
     return gain

@@ -1,0 +1,125 @@
+"""Plausible worlds of re-tracking: the same ones again, what they hold, and that they are the decision without noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import Retrack
+from mcaptrack.transforms.retrack import offline, worlds
+from tests.worlds import crossing_tracks, noisy_tracks
+
+QUICK = [Phase.explicit, Phase.generate]
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def scene(seed: int) -> list[Frame]:
+    """Walkers with faults of trackers, or two pairs of people who cross."""
+    rng = np.random.default_rng(seed)
+    return crossing_tracks(rng) if rng.random() < 0.4 else noisy_tracks(rng, people=6, ticks=60, hidden=0.03)
+
+
+def outputs_of(frames: list[Frame], **options: object) -> dict[str, list[Frame]]:
+    made = Retrack(**options)
+    return dict(zip(made.writes, map(list, zip(*made(frames), strict=True)), strict=True))
+
+
+def rows_of(frames: list[Frame]) -> list[tuple]:
+    """All rows with their times."""
+    return [(frame.t_ns, *row) for frame in frames for row in frame.rows.tolist()]
+
+
+@given(seed=SEEDS)
+@settings(max_examples=4, phases=QUICK)
+def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_no_other_output_changes(seed):
+    frames = scene(seed)
+    five, again = outputs_of(frames, worlds=5), outputs_of(frames, worlds=5)
+    two, none = outputs_of(frames, worlds=2), outputs_of(frames)
+    assert rows_of(five["worlds"]) == rows_of(again["worlds"])
+    assert rows_of(two["worlds"]) == [row for row in rows_of(five["worlds"]) if row[1] <= 2]
+    assert "worlds" not in none
+    for name, wanted in none.items():
+        for found, frame in zip(five[name], wanted, strict=True):
+            assert found.rows.tobytes() == frame.rows.tobytes()
+
+
+@given(seed=SEEDS)
+@settings(max_examples=6, phases=QUICK)
+def test_each_sample_has_one_track_in_each_world_and_no_track_is_at_two_places_at_once(seed):
+    """Each sample is in one tracklet: those of one input id don't overlap, and have as many samples as it has."""
+    frames = scene(seed)
+    rows = [row for frame in outputs_of(frames, worlds=4)["worlds"] for row in frame.rows]
+    begins = [frame.t_ns for frame in outputs_of(frames, worlds=4)["worlds"] for _ in frame.rows]
+    spans: dict[tuple, list[tuple[int, int]]] = {}
+    count: dict[tuple[int, int], int] = {}
+    for t_ns, row in zip(begins, rows, strict=True):
+        world, source, track = (int(row[name]) for name in ("world", "source_id", "track_id"))
+        assert (track < 0) == (not row["kept"])
+        span = t_ns, t_ns + round(float(row["duration_s"]) * 1e9)
+        count[world, source] = count.get((world, source), 0) + int(row["frames"])
+        spans.setdefault((world, "source", source), []).append(span)
+        if row["kept"]:
+            spans.setdefault((world, "track", track), []).append(span)
+    for own in spans.values():
+        own.sort()
+        assert all(end < begin for (_, end), (begin, _) in zip(own, own[1:], strict=False))
+    sources = {source for _, source in count}
+    assert all(count[world, source] == count[1, source] for world in (2, 3, 4) for source in sources)
+
+
+@given(seed=SEEDS)
+@settings(max_examples=6, phases=QUICK)
+def test_without_noise_a_world_is_what_was_decided(seed):
+    frames = scene(seed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worlds, "NOISE", 0.0)
+        patch.setattr(worlds, "PERSON_NOISE", 0.0)
+        made = outputs_of(frames, worlds=1)
+    decided = {
+        (frame.t_ns, int(row["source_id"])): int(row["track_id"])
+        for frame in made[""]
+        for row in frame.rows
+        if row["source_id"] >= 0
+    }
+    found = {}
+    for frame in made["worlds"]:
+        for row in frame.rows:
+            found[frame.t_ns, int(row["source_id"])] = int(row["track_id"])
+    assert found
+    for at, track in found.items():
+        assert decided.get(at, -1) == track
+
+
+def test_links_hold_in_as_many_worlds_as_are_likely():
+    """One end that may go on as one beginning: the noise of a gain g makes the link hold where g + noise > 0."""
+    frames = scene(7)
+    args = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(offline, "draw_worlds", lambda *given: args.append(given) or worlds.draw_worlds(*given))
+        outputs_of(frames, worlds=1)
+    (_, hypotheses, *_), *_ = args
+    tracklets, before, after, *_ = hypotheses
+    pair = hypotheses._replace(
+        tracklets=tracklets._replace(
+            of=np.array([0, 1]), first=np.array([0, 1]), last=np.array([0, 1]), begins=np.array([0, 20]),
+            ends=np.array([10, 30]), samples=np.array([9, 9]), source=np.array([1, 2]), online=np.array([1, 2]),
+        ),
+        before=np.array([0]), after=np.array([1]),
+    )  # fmt: skip
+    count = 4000
+    random = np.random.default_rng(5)
+    for gain in (0.5, 1.0, 2.0):
+        drawn = np.stack(list(worlds.draw_links(count, pair, np.array([gain]))))
+        share = (drawn[:, 0] == drawn[:, 1]).mean()
+        noise = worlds.NOISE * (random.gumbel(size=(4, 200_000)) * [[1], [1], [-1], [-1]]).sum(axis=0) / 2
+        assert share == pytest.approx((gain + noise > 0).mean(), abs=0.03)
+
+
+def test_people_are_kept_in_as_many_worlds_as_is_likely():
+    for probability in (0.2, 0.5, 0.8, 0.95):
+        odds = np.log(probability / (1 - probability))
+        kept = np.array([worlds.draw_people(world, np.array([odds]))[0] > 0 for world in range(4000)])
+        assert kept.mean() == pytest.approx(probability, abs=0.03)
