@@ -99,7 +99,7 @@ def draw_worlds(
 
 
 def draw_links(count: int, hypotheses: Hypotheses, gain: Floats, seed: int = 0) -> Iterator[Ints]:
-    """For each world the first tracklet of the chain that each one (K,) is in; links have ``gain`` (E,) without noise."""
+    """For each world the first tracklet of the chain that each one (K,) is in; ``gain`` (E,) is that without noise."""
     tracklets, before, after, *_ = hypotheses
     size = len(tracklets.first)
     for world in range(count):
