@@ -51,25 +51,26 @@ def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_no_other_output_
 @given(seed=SEEDS)
 @settings(max_examples=6, phases=QUICK)
 def test_each_sample_has_one_track_in_each_world_and_no_track_is_at_two_places_at_once(seed):
-    """Each sample is in one tracklet: those of one input id don't overlap, and have as many samples as it has."""
+    """The tracklets of a track follow each other, and those of an input id have no more samples than it has."""
     frames = scene(seed)
-    rows = [row for frame in outputs_of(frames, worlds=4)["worlds"] for row in frame.rows]
-    begins = [frame.t_ns for frame in outputs_of(frames, worlds=4)["worlds"] for _ in frame.rows]
-    spans: dict[tuple, list[tuple[int, int]]] = {}
+    made = outputs_of(frames, worlds=4)["worlds"]
+    begins, rows = [frame.t_ns for frame in made for _ in frame.rows], [row for frame in made for row in frame.rows]
+    spans: dict[tuple[int, int], list[tuple[int, int]]] = {}
     count: dict[tuple[int, int], int] = {}
     for t_ns, row in zip(begins, rows, strict=True):
         world, source, track = (int(row[name]) for name in ("world", "source_id", "track_id"))
         assert (track < 0) == (not row["kept"])
         span = t_ns, t_ns + round(float(row["duration_s"]) * 1e9)
         count[world, source] = count.get((world, source), 0) + int(row["frames"])
-        spans.setdefault((world, "source", source), []).append(span)
         if row["kept"]:
-            spans.setdefault((world, "track", track), []).append(span)
+            spans.setdefault((world, track), []).append(span)
     for own in spans.values():
         own.sort()
         assert all(end < begin for (_, end), (begin, _) in pairwise(own))
-    sources = {source for _, source in count}
-    assert all(count[world, source] == count[1, source] for world in (2, 3, 4) for source in sources)
+    samples = np.concatenate([frame.rows["track_id"] for frame in frames]).tolist()
+    for (_, source), number in count.items():
+        assert number == count[1, source] <= samples.count(source)
+    assert count
 
 
 @given(seed=SEEDS)

@@ -250,7 +250,7 @@ def best_next(before: Ints, after: Ints, gain: Floats, count: int) -> Ints:
 
 
 def named(root: Ints, ids: Ints) -> Ints:
-    """The ids of chains of tracklets (K,), whose first ones are ``root``: of ``ids`` (K,) those that they begin with.
+    """The ids of chains of tracklets (K,) by their first ones, ``root``: of ``ids`` (K,) those that they begin with.
 
     Of several chains with one id the first has it, and the others have new ones.
     """

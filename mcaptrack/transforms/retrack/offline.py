@@ -46,8 +46,8 @@ _ROUNDS: Final = 5
 
 
 class Offline(NamedTuple):
-    """The rows of all tracks at each step, ordered by id; the decisions at each step, what tracks look like, and who is
-    who in other worlds, if they were asked for; how appearance tells people apart, None if nothing was seen of them.
+    """The rows of all tracks at each step, ordered by id; the decisions at each step, what tracks look like, and the
+    identities in worlds, if they were asked for; how appearance tells people apart, None if nothing was seen of them.
     """
 
     tracks: Iterator[Rows]

@@ -205,7 +205,8 @@ class LikelihoodOptions(RetrackOptions):
     store_appearance : bool
         Also write the mean colours of each track, as histograms of the upper body and of the legs.
     worlds : int
-        Also write who is who in so many plausible worlds, drawn where re-tracking is not sure; 0 for none.
+        Also write the identities of tracks in so many plausible worlds, which differ where re-tracking is not
+        sure; 0 for none.
     """
 
     writes: ClassVar[Mapping[str, Schema]] = _OfOutputs(  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""Plausible worlds: who is who, and who is a person, as it may be where offline re-tracking is not sure.
+"""Plausible worlds: identities of tracks, and which are people, as they may be where offline re-tracking is not sure.
 
 Each world is the best set of links under scores with noise of Gumbel's distribution (perturb and MAP: Papandreou and
 Yuille 2011), by the same solver. What was decided for reasons that no single link has (encounters, corrections of
@@ -99,7 +99,7 @@ def draw_worlds(
 
 
 def draw_links(count: int, hypotheses: Hypotheses, gain: Floats, seed: int = 0) -> Iterator[Ints]:
-    """For each world the first tracklet of the chain that each one (K,) is in; ``gain`` (E,) is that without noise."""
+    """For each world the first tracklet of the chain that has each one (K,); ``gain`` (E,) is that without noise."""
     tracklets, before, after, *_ = hypotheses
     size = len(tracklets.first)
     for world in range(count):
