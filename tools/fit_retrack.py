@@ -426,8 +426,8 @@ def main() -> None:
     linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
     linking._BY_GAP = np.array(links["usual by gap"])
     more = [*scenes, *runs(MORE, given.steps)]
-    who = fit_choices(list(told(choices_of, more, "choices")))
-    hypotheses.CHOICES = Choices.from_entry(who, hypotheses.GAP_NAMES, hypotheses.LINK_TERMS, hypotheses.END_TERMS)
+    choices = fit_choices(list(told(choices_of, more, "choices")))
+    hypotheses.CHOICES = Choices.from_entry(choices, hypotheses.GAP_NAMES, hypotheses.LINK_TERMS, hypotheses.END_TERMS)
     others = list(runs(JUDGED, JUDGED_STEPS))
     people = fit_people(list(told(people_of, more, "people")))
     install(false_tracks, "_PEOPLE", people)
@@ -443,7 +443,7 @@ def main() -> None:
         "licence": "Apache-2.0",
         "links": str(sum(int(one.right.sum()) for one in pairs)),
     }
-    fitted = {"card": card, "links": links, "who": who, "people": people} | judged
+    fitted = {"card": card, "links": links, "choices": choices, "people": people} | judged
     text = json.dumps(fitted, indent=1) + "\n"
     if given.check:
         print("the same" if WEIGHTS.read_text(encoding="utf-8") == text else text)

@@ -1,4 +1,4 @@
-"""Who is who over a whole log: a slow reference of one sweep, from the description in docs/method.md. See ``offline``.
+"""Identities over a whole log: a slow reference of one sweep, from the description in docs/method.md. See ``offline``.
 
 A claim says that a track has a sample: its step, the track, the online track, the input id and the position.
 """
@@ -25,7 +25,7 @@ from tests.references.offline import (
     link_spread,
 )
 
-WHO = FITTED["who"]
+CHOICES = FITTED["choices"]
 GAPS = ("next step", "up to 1.7 s", "up to 5 s", "longer")
 ENOUGH, USUAL, BESIDE_M, SQUARE_M = 1 / 5, 20, 2.0, 1.0
 
@@ -181,11 +181,11 @@ def swept(motion: Motion, claims: list[Claim], max_gap_s: float, least: float) -
         if terms is not None:
             bounds = np.maximum.accumulate([1.5 * motion.step_s, 1.7, 5.0])
             gap[i, j] = GAPS[int(np.searchsorted(bounds, terms["gap"]))]
-            link[i, j] = total(WHO["links"][gap[i, j]], terms)
+            link[i, j] = total(CHOICES["links"][gap[i, j]], terms)
     gains = np.full((len(parts), len(parts)), -log(least / (1 - least) * ENOUGH))
     for side, name in enumerate(("leaves", "comes")):
-        none = [total(WHO[name], scene.end(part, name == "leaves")) for part in parts]
-        shift = shifts(side, link, none, gap, WHO[f"usual_{name}"])
+        none = [total(CHOICES[name], scene.end(part, name == "leaves")) for part in parts]
+        shift = shifts(side, link, none, gap, CHOICES[f"usual_{name}"])
         for pair, score in link.items():
             gains[pair] += (score + shift[gap[pair]] - none[pair[side]] - shift["none"]) / 2
     allowed = np.array([[(i, j) in link and gains[i, j] > 0 for j in range(len(parts))] for i in range(len(parts))])

@@ -2,10 +2,10 @@
 
 Two methods associate observations online: ``Retrack``, by likelihood (``likelihood``), and ``RetrackByConsistency``,
 Algorithm 1 of the paper (``consistency``). Both leave assignments of samples to tracks, from which ``offline`` makes
-the tracks of the whole log: it decides who is who (``hypotheses``), resolves identity swaps (``identity_swaps``),
-leaves out false tracks (``false_tracks``) and smooths (``motion_model``); ``worlds`` decides again, with noise. All of
-this is in metres: where their scale is guessed and can't be right (``poor_scale``), tracks keep their ids, and
-``in_pictures`` links them over gaps by their boxes.
+the tracks of the whole log: it decides about identities (``hypotheses``), resolves identity swaps
+(``identity_swaps``), leaves out false tracks (``false_tracks``) and smooths (``motion_model``); ``worlds`` decides
+again, with noise. All of this is in metres: where their scale is guessed and can't be right (``poor_scale``), tracks
+keep their ids, and ``in_pictures`` links them over gaps by their boxes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Who is who over a whole log: tracklets, what may have become of each, how likely that is, and the best of it.
+"""Identities over a whole log: tracklets, what may have become of each, how likely that is, and the best of it.
 
-A tracklet is what nobody doubts: samples that the online tracker gave to one track in a row, all with one input id. At
+A tracklet is what is certain: samples that the online tracker gave to one track in a row, all with one input id. At
 its end a person goes on as a later tracklet or leaves; at its beginning one goes on from an earlier tracklet or comes.
 Each end chooses one of these, and so does each beginning, with probabilities in proportion to exp(score) (a multinomial
 logit: McFadden 1974). Scores are sums of named terms with fitted weights. What the log itself says of how many people
@@ -97,7 +97,7 @@ _ENOUGH: Final = 1 / 5
 #: The number of pairs that are examined at once.
 _BATCH: Final = 1_000_000
 #: What ends and beginnings choose.
-CHOICES = Choices.of("who", GAP_NAMES, LINK_TERMS, END_TERMS)
+CHOICES = Choices.of("choices", GAP_NAMES, LINK_TERMS, END_TERMS)
 
 
 class Tracklets(NamedTuple):
@@ -133,7 +133,7 @@ class Tracklets(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """What may have become of the tracklets of a log.
+    """The hypotheses about the tracklets of a log.
 
     ``before`` and ``after`` (E,) are the tracklets of candidate links, ``gap_s`` (E,) the seconds between them and
     ``gap`` (E,) the class of that; ``terms`` (E, F) are those of links, ``leaves`` and ``comes`` (K, G) of ends.

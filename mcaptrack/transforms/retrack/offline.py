@@ -39,7 +39,7 @@ from mcaptrack.transforms.retrack.worlds import PERSON, draw_worlds, world_rows
 MAX_MISFIT: Final = (0.6, 0.2)
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
-#: Who is who is decided so often, each time with the motion of the tracks that were decided before.
+#: Identities are decided so often, each time with the motion of the tracks that were decided before.
 _SWEEPS: Final = 2
 #: The number of times that encounters are examined again after identities were swapped.
 _ROUNDS: Final = 5
@@ -605,7 +605,7 @@ def _linked(
 
 
 def hypotheses_of(model: MotionModel, tracks: Tracks, max_gap_s: float, appearance: Appearance | None) -> Hypotheses:
-    """The hypotheses about who is who in tracks, with what the log shows of their looks."""
+    """The hypotheses about identities in tracks, with what the log shows of their looks."""
     hypotheses = Hypotheses.of(model, tracks, max_gap_s)
     if appearance is None:
         return hypotheses
