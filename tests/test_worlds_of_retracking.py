@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from itertools import pairwise
+from pathlib import Path
 
+import duckdb
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.schema import Frame
+from mcaptrack import log
+from mcaptrack.notices import collected
+from mcaptrack.schema import WORLDS, Frame
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import offline, worlds
+from tests.commands import done
 from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks
 
 QUICK = [Phase.explicit, Phase.generate]
@@ -126,3 +133,39 @@ def test_people_are_kept_in_as_many_worlds_as_is_likely():
         odds = np.log(probability / (1 - probability))
         kept = np.array([worlds.draw_people(world, np.array([odds]))[0] > 0 for world in range(4000)])
         assert kept.mean() == pytest.approx(probability, abs=0.03)
+
+
+def test_tracks_that_people_have_corrected_are_one_in_each_world():
+    frames = scene(11)
+    fixed = tuple(np.unique(np.concatenate([frame.rows["track_id"] for frame in frames]))[:3].tolist())
+    rows = [row for frame in outputs_of(frames, worlds=8, fixed_ids=fixed)["worlds"] for row in frame.rows]
+    for world in range(1, 9):
+        of = [
+            {int(row["track_id"]) for row in rows if row["world"] == world and row["source_id"] == name}
+            for name in fixed
+        ]
+        assert [len(tracks) for tracks in of] == [1] * len(fixed)
+        assert len(set.union(*of)) == len(fixed)
+
+
+def test_where_tracks_are_linked_in_the_picture_there_are_no_worlds_and_it_says_so():
+    with collected() as warnings:
+        made = outputs_of(scene(3), worlds=2, poor_scale=True)
+    assert sum(len(frame.rows) for frame in made["worlds"]) == 0
+    assert [warning.code for warning in warnings] == ["option-not-used"]
+
+
+def test_the_documented_query_counts_people_by_world(template, tmp_path, monkeypatch):
+    there = Path(shutil.copyfile(template, tmp_path / "log.mcap"))
+    done("retrack", there, "--worlds", "7", "-q")
+    done("export", there, "-q")
+    with log.Log(there) as opened:
+        rows = opened.frame_columns("/camera/retracks/worlds", WORLDS).rows()
+    many = [len(set(rows["track_id"][(rows["world"] == world) & rows["kept"]].tolist())) for world in range(1, 8)]
+    page = (Path(__file__).parent.parent / "docs" / "results.md").read_text(encoding="utf-8")
+    (query,) = re.findall(r"```sql\n(with people.*?)```", page, re.S)
+    monkeypatch.chdir(tmp_path)
+    assert duckdb.sql(query).fetchall() == [tuple(np.percentile(many, [50, 5, 95]))]
+    done("retrack", there, "-q")
+    with log.Log(there) as opened:
+        assert "/camera/retracks/worlds" not in opened.channels

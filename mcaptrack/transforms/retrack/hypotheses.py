@@ -229,7 +229,7 @@ class Scored(NamedTuple):
         return named(root, tracklets.online)[tracklets.of]
 
     def gain(self, min_confidence: float) -> Floats:
-        """How much better each link (E,) is than that its end leaves and its beginning comes; below 0 it isn't made."""
+        """The gain of each link (E,) over leaving at its end and coming at its beginning; below 0 it isn't made."""
         _, before, after, *_ = self.hypotheses
         least = np.log(min_confidence / (1 - min_confidence) * _ENOUGH)
         return np.asarray((self.out - self.leaves[before] + self.into - self.comes[after]) / 2 - least)
