@@ -177,7 +177,7 @@ def test_a_result_of_an_output_that_goes_is_kept_and_said(logs, place):
 def test_reserved_names_are_those_of_what_is_made_of_results(logs):
     with log.read(logs["full"]) as opened:
         made = {topic.removeprefix("/camera/").split("/")[1] for topic in opened.channels if topic.count("/") > 2}
-    own = {"online", "predictions", "decisions", "appearance", "tf"}
+    own = {"online", "predictions", "decisions", "appearance", "worlds", "tf"}
     assert made - own - {"image", "scene"} <= RESERVED
     assert FULL.strip("/") in RESERVED
 

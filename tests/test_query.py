@@ -267,7 +267,7 @@ def test_exported_tables_are_read_while_they_are_up_to_date(tmp_path):
 #: Tables that the log with known answers has no rows for.
 EMPTY = {
     *("detections", "camera_motions", "counts", "ground_planes", "forecast_scores", "sightings"),
-    *("zone_visits", "zone_crossings", "zone_counts", "decisions", "appearances", "warnings"),
+    *("zone_visits", "zone_crossings", "zone_counts", "decisions", "appearances", "worlds", "warnings"),
 }
 
 

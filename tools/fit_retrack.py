@@ -45,6 +45,7 @@ from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import Trajectories, to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
+from mcaptrack.transforms.retrack.worlds import draw_worlds
 
 DEFAULT = PROFILES["default"]
 Found = TypeVar("Found")
@@ -272,6 +273,27 @@ def decisions_of(run: Run) -> tuple[Judged, Judged]:
     return joins, Judged(decided.log_odds[:, None], np.bincount(track, people >= 0) * 2 >= count)
 
 
+def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
+    """In how many of 50 worlds each join of a scene holds, and which joins are right; and the number of people, the
+    number that was decided, and those that 5 %, 50 % and 95 % of the worlds don't exceed.
+    """
+    args = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
+    decided, least_steps, step_s = args[1], args[2], args[4]
+    tracks, choices, tracklets = decided.tracks, decided.hypotheses, decided.hypotheses.tracklets
+    some_worlds = draw_worlds(
+        50, choices, tracks.track[tracklets.first], decided.log_odds, decided.kept, DEFAULT.link_confidence, least_steps
+    )
+    begins, ends = sides_of(tracks, tracklets, run.people(tracks))
+    link = offline.find_joins(decided, step_s).link
+    before, after = choices.before[link], choices.after[link]
+    counts = (ends[before] >= 0) | (begins[after] >= 0)
+    share = (some_worlds.track[:, before] == some_worlds.track[:, after]).mean(axis=0)
+    joins = Judged(share[counts], (ends[before] == begins[after])[counts])
+    many = [len(np.unique(track[kept])) for track, kept in zip(*some_worlds, strict=True)]
+    people = np.unique(np.concatenate([frame.rows["track_id"] for frame in run.true]))
+    return joins, np.array([len(people), decided.kept.sum(), *np.percentile(many, [5, 50, 95])])
+
+
 def told(find: Callable[[Run], Found], scenes: list[Run], what: str) -> Iterator[Found]:
     """What is found in each scene; progress goes to stderr."""
     for number, run in enumerate(scenes, 1):
@@ -356,13 +378,14 @@ def install(module: Any, name: str, fitted: dict[str, Any]) -> None:
 
 
 def held(seeds: list[int], steps: int) -> None:
-    """Print IDF1 / MOTA / switches of scenes, before and after re-tracking by the weights of the file, and how many of
-    the decisions are right.
+    """Print IDF1 / MOTA / switches of scenes, before and after re-tracking by the weights of the file, how many of the
+    decisions are right, and what worlds say of joins and of the number of people.
     """
     parts: tuple[list, list] = ([], [])
-    outcomes = []
+    outcomes, in_worlds = [], []
     for run in runs(seeds, steps):
         outcomes.append(decisions_of(run))
+        in_worlds.append(worlds_of(run))
         rows = offline.offline_tracks(*run.args).tracks
         found = [frame._replace(rows=new) for frame, new in zip(run.samples, rows, strict=True)]
         for side, frames in zip(parts, (run.samples, found), strict=True):
@@ -372,9 +395,17 @@ def held(seeds: list[int], steps: int) -> None:
         print(f"{name:12}{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")
     made, people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
     show_reliability("joins", offline.JOINS.probability(made[0]), made[1])
-    is_person = offline.PERSON.probability(people[0])
+    is_person = probability(people[0][:, 0])
     is_right = np.where(is_person >= 0.5, people[1], ~people[1])
     show_reliability("people and false tracks", np.maximum(is_person, 1 - is_person), is_right)
+    joins, numbers = zip(*in_worlds, strict=True)
+    show_reliability("joins in worlds", *(np.concatenate(both) for both in zip(*joins, strict=True)))
+    people, decided, low, middle, high = np.array(numbers).T
+    inside = ((low <= people) & (people <= high)).mean()
+    print(f"people of a scene: {people.mean():.1f}; decided {decided.mean():.1f}; in worlds {middle.mean():.1f}")
+    print(
+        f"  the 90 % interval, {low.mean():.1f} to {high.mean():.1f}, holds them in {100 * inside:.0f} % of the scenes"
+    )
 
 
 def main() -> None:
@@ -404,6 +435,7 @@ def main() -> None:
     false_tracks._THROUGHOUT = people["stands throughout"]
     for name in ("mean", "spread"):
         setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))
+    offline.PERSON = Logistic(np.ones(1), 0.0, {})  # what is fitted
     judged = fit_decisions(others)
     card = {
         "made_by": f"tools/fit_retrack.py --seeds {' '.join(map(str, seeds))} --steps {given.steps}, "

@@ -26,7 +26,7 @@ from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, read_named_frames
 from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
-from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, Frame, Rows, Schema
+from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, WORLDS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
 from mcaptrack.sources.cameras import camera_at, cameras, provenance_of
@@ -208,11 +208,11 @@ class Before:
         out: list[Sequence[Frame]] = []
         largest = last_id
         for topic, schema, frames in zip(topics, schemas, outputs, strict=True):
-            if schema not in (TRACKS, PREDICTIONS, DECISIONS, APPEARANCE):
+            if schema not in (TRACKS, PREDICTIONS, DECISIONS, APPEARANCE, WORLDS):
                 out.append(self._kept(schema, frames, None))
                 continue
             of_main = maps.get(job.target, {})
-            same = maps.get(topic, of_main if schema in (DECISIONS, APPEARANCE) else of_predictions)
+            same = maps.get(topic, of_main if schema in (DECISIONS, APPEARANCE, WORLDS) else of_predictions)
             kept = self._kept(schema, frames, partial(_renumbered, same=same, last_id=last_id))
             largest = max(largest, int(unique_values(schema, kept, "track_id").max(initial=0)))
             out.append(kept)

@@ -255,6 +255,7 @@ ZONE_CROSSINGS: Final = Schema("mcaptrack.ZoneCrossings")
 ZONE_COUNTS: Final = Schema("mcaptrack.ZoneCounts")
 DECISIONS: Final = Schema("mcaptrack.Decisions")
 APPEARANCE: Final = Schema("mcaptrack.Appearance")
+WORLDS: Final = Schema("mcaptrack.Worlds")
 #: Row schemas by name.
 SCHEMAS: Final = {
     schema.name: schema
@@ -274,6 +275,7 @@ SCHEMAS: Final = {
         ZONE_COUNTS,
         DECISIONS,
         APPEARANCE,
+        WORLDS,
     )
 }
 #: Pictures instead of rows: a transform that reads this schema gets their brightness, or their colours if it asks for

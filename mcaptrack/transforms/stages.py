@@ -27,6 +27,7 @@ from mcaptrack.schema import (
     SIGHTINGS,
     TRACKS,
     VIDEO,
+    WORLDS,
     Schema,
 )
 from mcaptrack.transforms.protocol import Transform, check_options, option_problem, trait_problem
@@ -367,6 +368,7 @@ _STAGES: Final = (
             "predictions": PREDICTIONS,
             "decisions": DECISIONS,
             "appearance": APPEARANCE,
+            "worlds": WORLDS,
         },
         input_topic="samples",
         output_topic="retracks",
@@ -376,9 +378,13 @@ _STAGES: Final = (
         repairs_tracks=True,
         profiles_place="mcaptrack.transforms.retrack:PROFILES",
         modes=MappingProxyType(
-            {"both": (), "offline": ("", "decisions", "appearance"), "online": ("online", "predictions")}
+            {
+                "both": (),
+                "offline": ("", "decisions", "appearance", "worlds"),
+                "online": ("online", "predictions"),
+            }
         ),
-        beside=("decisions", "appearance"),
+        beside=("decisions", "appearance", "worlds"),
     ),
 )
 

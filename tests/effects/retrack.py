@@ -151,6 +151,10 @@ case(
     Retrack(descriptors=two_who_turn_back(RED, BLUE)[1]), list(two_who_turn_back(RED, BLUE)[0]), stored_rows,
     {True: 4, False: 0},
 )  # fmt: skip
+case(
+    "worlds", "two people, each a tracklet: a row for each world and tracklet", LIKELY,
+    walk(lambda n: {1: (0.5 * n, 0.0), 2: (0.5 * n, 9.0)}, 20), stored_rows, {0: 0, 3: 6},
+)  # fmt: skip
 case("horizon_s", "2.5 steps a second", LIKELY, line(0.5, 20, 20), forecast_steps, {0.4: 1, 2.0: 5, 4.8: 12})
 case(
     "distance",

@@ -112,6 +112,7 @@ class Scene:
             "misfit and speed": plain[6],
             "speed": log(max(hypot(*left), hypot(*came)) + 0.15),
             "noise": log(link_spread(self.motion, before, after, gap_s)),
+            "apart": log(hypot(b[0].at[0] - a[-1].at[0], b[0].at[1] - a[-1].at[1]) + 0.3),
             "miss alone": own[0],
             "misfit to noise alone": own[1],
             "gap": gap_s,

@@ -452,7 +452,7 @@ class LogTables:
         """The names of the classes of the tracks, and of the ground truth, that the rows of a channel are about."""
         how = provenance_of(self.opened, topic)
         base = topic
-        for beside in ("/events", "/errors", "/decisions", "/appearance"):
+        for beside in ("/events", "/errors", "/decisions", "/appearance", "/worlds"):
             base = base.removesuffix(beside)
         if how and how.zones:
             base = how.input

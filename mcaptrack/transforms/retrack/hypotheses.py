@@ -51,6 +51,7 @@ LINK_TERMS: Final = (
     "misfit and speed",
     "speed",
     "noise",
+    "apart",
     "miss alone",
     "misfit to noise alone",
     "gap",
@@ -167,6 +168,9 @@ class Hypotheses(NamedTuple):
             [
                 np.ones(len(before)),
                 *_motion_terms(model, gaps),
+                np.log(
+                    np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T) + _NEAR_M
+                ),
                 *features(model, gaps_alone)[:, :2].T,
                 gap_s,
                 np.log(gap_s + 0.2),
@@ -225,24 +229,41 @@ class Scored(NamedTuple):
         Each has the id of the online track that it begins in; of several the first, and the others have new ids.
         """
         tracklets, before, after, *_ = self.hypotheses
+        root = chains(best_next(before, after, self.gain(min_confidence), len(self.leaves)), tracklets.begins)
+        return named(root, tracklets.online)[tracklets.of]
+
+    def gain(self, min_confidence: float) -> Floats:
+        """The gain of each link (E,) over leaving at its end and coming at its beginning; below 0 it isn't made."""
+        _, before, after, *_ = self.hypotheses
         least = np.log(min_confidence / (1 - min_confidence) * _ENOUGH)
-        gain = (self.out - self.leaves[before] + self.into - self.comes[after]) / 2 - least
-        goes_on = np.full(len(self.leaves), -1)
-        good = np.flatnonzero(gain > 0)
-        links = good[assigned_links(before[good], after[good], np.round(gain[good], 6), len(goes_on))]
-        goes_on[before[links]] = after[links]
-        root = chains(goes_on, tracklets.begins)
-        first = np.unique(root)
-        ids = tracklets.online[first]
-        again = np.ones(len(first), bool)
-        again[np.unique(ids, return_index=True)[1]] = False
-        ids[again] = tracklets.online.max(initial=0) + 1 + np.arange(np.count_nonzero(again))
-        return np.asarray(ids[np.searchsorted(first, root)][tracklets.of])
+        return np.asarray((self.out - self.leaves[before] + self.into - self.comes[after]) / 2 - least)
 
     def log_odds(self) -> Floats:
         """The log odds of each link against all else that its end, and that its beginning, may choose, (E, 2)."""
         sides = (self.hypotheses.before, self.out, self.leaves), (self.hypotheses.after, self.into, self.comes)
         return np.stack([_against_others(*side) for side in sides], axis=1)
+
+
+def best_next(before: Ints, after: Ints, gain: Floats, count: int) -> Ints:
+    """The tracklet that follows each one (K,) by the best set of links (E,) with these gains; -1 where none does."""
+    out = np.full(count, -1)
+    good = np.flatnonzero(gain > 0)
+    links = good[assigned_links(before[good], after[good], np.round(gain[good], 6), count)]
+    out[before[links]] = after[links]
+    return out
+
+
+def named(root: Ints, ids: Ints) -> Ints:
+    """The ids of chains of tracklets (K,) by their first ones, ``root``: of ``ids`` (K,) those that they begin with.
+
+    Of several chains with one id the first has it, and the others have new ones.
+    """
+    first = np.unique(root)
+    names = ids[first]
+    again = np.ones(len(first), bool)
+    again[np.unique(names, return_index=True)[1]] = False
+    names[again] = ids.max(initial=0) + 1 + np.arange(np.count_nonzero(again))
+    return np.asarray(names[np.searchsorted(first, root)])
 
 
 def _tracked(
@@ -275,7 +296,7 @@ def _candidates(
     """Pairs (E,) of a tracklet and a later one that may be one person, and all that follow each other in a track."""
     low = np.searchsorted(tracklets.begins, tracklets.ends + 1)
     count = np.searchsorted(tracklets.begins, tracklets.ends + round(max_gap_s / model.step_s), "right") - low
-    follows = _following(tracks, tracklets)
+    follows = following(tracks.track[tracklets.first], tracklets.begins)
     joined = np.flatnonzero(follows >= 0)
     pairs = [joined * len(follows) + follows[joined]]
     for part in batches(count, _BATCH):
@@ -290,12 +311,11 @@ def _candidates(
     return before, after
 
 
-def _following(tracks: Tracks, tracklets: Tracklets) -> Ints:
-    """The tracklet that follows each one in its track, or -1; (K,)."""
-    order = np.lexsort((tracklets.begins, tracks.track[tracklets.first]))
-    track = tracks.track[tracklets.first][order]
+def following(track: Ints, begins: Ints) -> Ints:
+    """The tracklet that follows each one in its track (K,), or -1."""
+    order = np.lexsort((begins, track))
     out = np.full(len(order), -1)
-    same = np.flatnonzero(track[1:] == track[:-1])
+    same = np.flatnonzero(track[order][1:] == track[order][:-1])
     out[order[same]] = order[same + 1]
     return out
 

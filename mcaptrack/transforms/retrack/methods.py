@@ -13,8 +13,9 @@ import numpy as np
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes
+from mcaptrack.notices import warn
 from mcaptrack.predictors import warn_if_weak
-from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, Frame, Rows
+from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.resampling import resample_parts
@@ -35,7 +36,13 @@ from mcaptrack.transforms.retrack.in_pictures import link_in_picture
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
-from mcaptrack.transforms.retrack.options import ConsistencyOptions, LikelihoodOptions, RetrackOptions
+from mcaptrack.transforms.retrack.options import (
+    APPEARANCE_OUTPUT,
+    WORLDS_OUTPUT,
+    ConsistencyOptions,
+    LikelihoodOptions,
+    RetrackOptions,
+)
 from mcaptrack.transforms.to_video_rate import steady_s, to_metres
 
 Options = TypeVar("Options", bound=RetrackOptions)
@@ -189,6 +196,11 @@ def _keep_ids(
     forecaster = Forecaster(*settings, adapt=options.follows_log)
     linked: Iterator[Rows] | None = None
     stored: Iterator[Rows] = repeat(APPEARANCE.empty())
+    if options.drawn_worlds:
+        warn(
+            "`worlds=` finds nothing to write: without a measured ground plane tracks are not decided",
+            "option-not-used",
+        )
     if options.links_in_picture:
         frames = collect(TRACKS, frames)
         limits = options.filled_s, options.link_confidence, options.across_classes
@@ -201,8 +213,9 @@ def _keep_ids(
     for frame in frames:
         online = frame.rows[frame.rows["observed"]]
         offline = frame.rows if linked is None else next(linked)
-        rows = offline, online, forecaster.predict(frame), DECISIONS.empty(), next(stored)
-        yield tuple(frame._replace(rows=row) for row in rows[: len(options.writes)])
+        rows = {"": offline, "online": online, "predictions": forecaster.predict(frame)}
+        rows |= {"decisions": DECISIONS.empty(), APPEARANCE_OUTPUT: next(stored), WORLDS_OUTPUT: WORLDS.empty()}
+        yield tuple(frame._replace(rows=rows[name]) for name in options.writes)
     forecaster.warn()
 
 
@@ -232,8 +245,11 @@ def _retracked(
     offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
     seen.extend([] if offline.calibration is None else [offline.calibration])
     times = frames.t_ns.tolist(), frames.numbers.tolist()
-    tracks, decisions, looks = (map(Frame, *times, rows) for rows in (offline.tracks, offline.decisions, offline.looks))
-    return [tracks, *online.outputs(), decisions, looks][: len(options.writes)]
+    causal, predictions = online.outputs()
+    outputs: dict[str, Iterable[Frame]] = {"online": causal, "predictions": predictions}
+    of_log = {"": offline.tracks, "decisions": offline.decisions, APPEARANCE_OUTPUT: offline.looks}
+    outputs |= {name: map(Frame, *times, rows) for name, rows in (of_log | {WORLDS_OUTPUT: offline.worlds}).items()}
+    return [outputs[name] for name in options.writes]
 
 
 def _passed(run: OnlinePass, frames: FrameColumns) -> OnlinePass:

@@ -20,7 +20,7 @@ from mcaptrack.geometry.colour_histograms import BINS, mean_shares
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.notices import warn
-from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, BodyPart, DecisionKind, Frame, Rows
+from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, BodyPart, DecisionKind, Frame, Rows
 from mcaptrack.schema.classes import first_classes, majority
 from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows, spans_of
 from mcaptrack.schema.resampling import ANGLES, LINEAR
@@ -33,6 +33,7 @@ from mcaptrack.transforms.retrack.linking import TrackEnds, chains, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
+from mcaptrack.transforms.retrack.worlds import draw_worlds, world_rows
 
 #: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
 MAX_MISFIT: Final = (0.6, 0.2)
@@ -47,13 +48,14 @@ _ROUNDS: Final = 5
 
 
 class Offline(NamedTuple):
-    """The rows of all tracks at each step, ordered by id; the decisions at each step, and what tracks look like, if
-    they were asked for; and how appearance tells people apart, None if nothing was seen of them.
+    """The rows of all tracks at each step, ordered by id; the decisions at each step, what tracks look like, and the
+    identities in worlds, if they were asked for; how appearance tells people apart, None if nothing was seen of them.
     """
 
     tracks: Iterator[Rows]
     decisions: Iterator[Rows]
     looks: Iterator[Rows]
+    worlds: Iterator[Rows]
     calibration: AppearanceCalibration | None
 
 
@@ -134,12 +136,12 @@ def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
 
 #: Whether a join is right, from its log odds as its end and as its beginning see them.
 JOINS: Final = Logistic.of("joins", ("end", "beginning"))
+#: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
+PERSON: Final = Logistic.of("decided", ("log odds",))
 #: An alternative is at least so likely as log odds.
 _MAY_BE: Final = -4.0
 #: Samples of another input id that last less, between two parts with one, are no join. Seconds.
 _BRIEF_S: Final = 1.0
-#: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
-PERSON: Final = Logistic.of("decided", ("log odds",))
 _NO_ID: Final = -1
 
 
@@ -506,10 +508,13 @@ def offline_tracks(
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
     left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
+    worlds: Iterator[Rows] = repeat(WORLDS.empty(), len(steps))
     if is_decided and len(ids):
         hypotheses = hypotheses_of(model, tracks, options.link_s / movers.unit_m, appearance)
         decided = Decided(tracks, np.where(is_fixed, np.inf, odds), keeps, hypotheses)
         decisions = decision_rows(decided, model, samples, steps)
+        if options.drawn_worlds:
+            worlds = _worlds(options, decided, round(least_s * options.rate_hz), samples, model.step_s, steps)
     shown_m = None if moved_m is None else moved_m[left]
     by_step = rows_by_step(taken(rows, left), samples, shown_m, options.ground_planes, steps, times_ns)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
@@ -518,7 +523,35 @@ def offline_tracks(
         track_of = np.full(len(stored.t_ns), -1)
         track_of[kept.look] = kept.track
         looks = appearance_rows(stored, track_of, times_ns)
-    return Offline(by_step, decisions, looks, seen and seen.calibration)
+    return Offline(by_step, decisions, looks, worlds, seen and seen.calibration)
+
+
+def _worlds(
+    options: RetrackOptions,
+    decided: Decided,
+    least_steps: int,
+    samples: LogSamples,
+    step_s: float,
+    steps: Sequence[int],
+) -> Iterator[Rows]:
+    """The rows of Worlds at each of ``steps``."""
+    tracks, log_odds, kept, hypotheses = decided
+    tracklets = hypotheses.tracklets
+    of_class = int(samples.column("class_id")[0])
+    worlds = draw_worlds(
+        options.drawn_worlds,
+        hypotheses,
+        tracks.track[tracklets.first],
+        log_odds,
+        kept,
+        options.link_confidence,
+        least_steps,
+        of_class,
+    )
+    if options.fixed_ids:
+        for track in worlds.track:
+            track[:] = fix_tracks(tracks._replace(track=track[tracklets.of]), options.fixed_ids).track[tracklets.first]
+    return world_rows(worlds, hypotheses, step_s, steps)
 
 
 def _without_swaps(model: MotionModel, tracks: Tracks, appearance: Appearance | None) -> Tracks:

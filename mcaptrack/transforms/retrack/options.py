@@ -18,7 +18,7 @@ from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.predictors import Forecast, PredictorName
-from mcaptrack.schema import APPEARANCE, DECISIONS, PREDICTIONS, TRACKS, Frame, Schema
+from mcaptrack.schema import APPEARANCE, DECISIONS, PREDICTIONS, TRACKS, WORLDS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.transforms.forecasts import ADAPT_HELP
@@ -34,8 +34,9 @@ _LIFE: Final = "Begin and end of tracks"
 _OFFLINE: Final = "With the whole log known (offline)"
 #: Tracks of a short log last at least this share of it.
 _SHARE_OF_LOG: Final = 1 / 3
-#: The output that is written on request.
+#: The outputs that are written on request.
 APPEARANCE_OUTPUT: Final = "appearance"
+WORLDS_OUTPUT: Final = "worlds"
 #: The longest gap of a link where tracks are only linked in the picture, in seconds.
 MAX_LINK_IN_PICTURE_S: Final = 4.0
 
@@ -138,7 +139,7 @@ class RetrackOptions:
     # What methods do differently: whether tracks that are left unchanged are linked over gaps in the picture, and how
     # long ones are filled; whether ellipses of predictions follow the log, and the unit of offline tracks its speed;
     # whether a sample that was assigned to two tracks stays with both; the descriptors of samples, if appearance is
-    # compared, and if it is stored.
+    # compared, and if it is stored; the number of worlds that are drawn.
     links_in_picture: ClassVar[bool] = False
     filled_s: ClassVar[float] = 0.0
     follows_log: ClassVar[bool] = True
@@ -146,6 +147,7 @@ class RetrackOptions:
     shares_samples: ClassVar[bool] = False
     looks: ClassVar[Descriptors | None] = None
     stored_looks: ClassVar[Descriptors | None] = None
+    drawn_worlds: ClassVar[int] = 0
 
     @property
     def bridged_s(self) -> float:
@@ -185,10 +187,12 @@ class _OfOutputs(Generic[Value]):
 
     def __init__(self, of_all: Mapping[str, Value]) -> None:
         self._of_all = MappingProxyType(of_all)
-        self._usual = MappingProxyType({name: value for name, value in of_all.items() if name != APPEARANCE_OUTPUT})
 
     def __get__(self, options: LikelihoodOptions | None, _: type) -> Mapping[str, Value]:
-        return self._of_all if options is None or options.store_appearance else self._usual
+        if options is None:
+            return self._of_all
+        is_asked = {APPEARANCE_OUTPUT: options.store_appearance, WORLDS_OUTPUT: options.worlds > 0}
+        return MappingProxyType({name: value for name, value in self._of_all.items() if is_asked.get(name, True)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,13 +220,16 @@ class LikelihoodOptions(RetrackOptions):
         has pictures that tell people apart.
     store_appearance : bool
         Also write the mean colours of each track, as histograms of the upper body and of the legs.
+    worlds : int
+        Also write the identities of tracks in so many plausible worlds, which differ where re-tracking is not
+        sure; 0 for none.
     """
 
     writes: ClassVar[Mapping[str, Schema]] = _OfOutputs(  # type: ignore[assignment]
-        {**RetrackOptions.writes, "decisions": DECISIONS, APPEARANCE_OUTPUT: APPEARANCE}
+        {**RetrackOptions.writes, "decisions": DECISIONS, APPEARANCE_OUTPUT: APPEARANCE, WORLDS_OUTPUT: WORLDS}
     )
     latency_s: ClassVar[Mapping[str, float]] = _OfOutputs(  # type: ignore[assignment]
-        {**RetrackOptions.latency_s, "decisions": float("inf"), APPEARANCE_OUTPUT: float("inf")}
+        {**RetrackOptions.latency_s, **dict.fromkeys(("decisions", APPEARANCE_OUTPUT, WORLDS_OUTPUT), float("inf"))}
     )
 
     @property
@@ -248,6 +255,7 @@ class LikelihoodOptions(RetrackOptions):
     adapt: bool = setting(True, ADAPT_HELP, theme=_PREDICTIONS)
     appearance: bool | None = option(None, theme=_OFFLINE)
     store_appearance: bool = option(False, theme=_OFFLINE)
+    worlds: int = option(0, least=0, most=1000, theme=_OFFLINE)
     descriptors: Descriptors | None = context(lambda: None, is_recorded=False)
 
     @property
@@ -257,6 +265,10 @@ class LikelihoodOptions(RetrackOptions):
     @property
     def stored_looks(self) -> Descriptors | None:  # type: ignore[override]
         return self.descriptors if self.store_appearance else None
+
+    @property
+    def drawn_worlds(self) -> int:  # type: ignore[override]
+        return self.worlds
 
 
 # Distances between tracks and observations, by comparing their predictions (Eq. 1 and 2 of the paper).
