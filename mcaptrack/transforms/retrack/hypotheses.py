@@ -164,6 +164,7 @@ class Hypotheses(NamedTuple):
             Gaps(taken(forward, tracklets.last[before]), taken(backward, tracklets.first[after]), gap_s)
             for forward, backward in (tracked, alone)
         )
+        apart_m = np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T)
         terms = np.column_stack(
             [
                 np.ones(len(before)),
