@@ -169,9 +169,7 @@ class Hypotheses(NamedTuple):
             [
                 np.ones(len(before)),
                 *_motion_terms(model, gaps),
-                np.log(
-                    np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T) + _NEAR_M
-                ),
+                np.log(apart_m + _NEAR_M),
                 *features(model, gaps_alone)[:, :2].T,
                 gap_s,
                 np.log(gap_s + 0.2),
