@@ -222,7 +222,7 @@ def test_a_short_sequence_keeps_its_people(short, tmp_path):
 @pytest.mark.parametrize(
     ("setting", "reason"),
     [
-        ("min_track_s=2", "the longest track lasts 1.2 s; those under 2 s are left out (min_track_s)"),
+        ("track_confidence=0", "the longest track lasts 1.2 s; those under 2 s are left out (min_track_s)"),
         ("track_confidence=1", "no track is likely enough to be a person (track_confidence)"),
     ],
 )

@@ -60,19 +60,21 @@ def test_why_nothing_came_of_it(transform: Any, reason: str):
 
 
 @pytest.mark.parametrize(
-    ("least_s", "reason"),
+    ("least_s", "confidence", "reason"),
     [
-        (2.0, "no track is likely enough to be a person (track_confidence)"),
-        (2.5, "the longest track lasts 2 s; those under 2.5 s are left out (min_track_s)"),
+        (2.0, 0.0, "no track is likely enough to be a person (track_confidence)"),
+        (2.5, 0.0, "the longest track lasts 2 s; those under 2.5 s are left out (min_track_s)"),
+        (2.5, 0.5, "no track is likely enough to be a person (track_confidence)"),
     ],
 )
-def test_why_no_track_is_left(least_s: float, reason: str):
+def test_why_no_track_is_left(least_s: float, confidence: float, reason: str):
     """The second of three tracks, whose rows lie between those of others, lasts from 0.4 to 2.4 s."""
     frames = walk(lambda n: {4: (0, 0)} | ({7: (1, 0)} if 1 <= n <= 6 else {}) | ({9: (2, 0)} if n == 3 else {}), 7)
     for frame in frames:
         frame.rows["track_id"][frame.rows["track_id"] == 4] = 4 + 100 * frame.index  # each of one row
     assert longest_track_s(frames) == 2.0
-    assert Retrack(min_track_s=least_s).why_empty(frames, []) == reason
+    retrack = Retrack(min_track_s=least_s, track_confidence=confidence)
+    assert retrack.why_empty(frames, []) == reason  # a third of 2.4 s is enough where how likely tracks are counts
 
 
 class _Poses:
