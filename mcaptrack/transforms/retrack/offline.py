@@ -30,7 +30,14 @@ from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_lo
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.linking import TrackEnds, chains, link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, smooth_in_log, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import (
+    MotionModel,
+    State,
+    Trajectories,
+    smooth,
+    smooth_in_log,
+    to_trajectories,
+)
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
 from mcaptrack.transforms.retrack.worlds import draw_worlds, world_rows
@@ -487,18 +494,8 @@ def offline_tracks(
         _, _, smoothed = smooth(model, trajectories)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             moved_m = movers.unit_m * smooth_in_log(model, trajectories, options.noise_m is not None, movers.unit_m)
-        if movers.on_ground:
-            odds = scored_log_odds(
-                smoothed.mean[:, :2] * movers.unit_m,
-                trajectories.first,
-                rows.between(samples.column("score")),
-                samples.column("observed")[rows.before] & rows.is_sample,
-                movers.usual_score,
-                model.step_s,
-            )
-        else:
-            values = log_odds_in_log(model, trajectories, smoothed, (steps[0], steps[-1]))
-            odds = PERSON.log_odds(values[:, None])
+        log = steps[0], steps[-1]
+        odds = _log_odds(model, trajectories, smoothed, rows, samples, movers, log)
     of_row = np.searchsorted(ids, rows.track)
     least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
     least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
@@ -519,11 +516,37 @@ def offline_tracks(
     by_step = rows_by_step(taken(rows, left), samples, shown_m, options.ground_planes, steps, times_ns)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
     if (stored := options.stored_looks) is not None:
-        kept = taken(tracks, keeps[of] & (tracks.look >= 0))
-        track_of = np.full(len(stored.t_ns), -1)
-        track_of[kept.look] = kept.track
-        looks = appearance_rows(stored, track_of, times_ns)
+        looks = _looks(stored, taken(tracks, keeps[of] & (tracks.look >= 0)), times_ns)
     return Offline(by_step, decisions, looks, worlds, seen and seen.calibration)
+
+
+def _looks(stored: Descriptors, kept: Tracks, times_ns: Ints) -> Iterator[Rows]:
+    """The rows of Appearance of the tracks that were kept, at each of ``times_ns``."""
+    track_of = np.full(len(stored.t_ns), -1)
+    track_of[kept.look] = kept.track
+    return appearance_rows(stored, track_of, times_ns)
+
+
+def _log_odds(
+    model: MotionModel,
+    trajectories: Trajectories,
+    smoothed: State,
+    rows: TrackRows,
+    samples: LogSamples,
+    movers: Movers,
+    log: tuple[int, int],
+) -> Floats:
+    """The log odds (K,) that tracks are people, or what else moves; ``log`` are its first and last steps."""
+    if not movers.on_ground:
+        return PERSON.log_odds(log_odds_in_log(model, trajectories, smoothed, log)[:, None])
+    return scored_log_odds(
+        smoothed.mean[:, :2] * movers.unit_m,
+        trajectories.first,
+        rows.between(samples.column("score")),
+        samples.column("observed")[rows.before] & rows.is_sample,
+        movers.usual_score,
+        model.step_s,
+    )
 
 
 def _worlds(
