@@ -51,7 +51,6 @@ LINK_TERMS: Final = (
     "misfit and speed",
     "speed",
     "noise",
-    "apart",
     "miss alone",
     "misfit to noise alone",
     "gap",
@@ -90,6 +89,9 @@ _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: A person who is lost beside another one may be hidden by that one, or in one detection with that one; from this
 #: distance on nothing speaks for it, and at half of it half as much.
 _BESIDE_M: Final = 2.0
+#: The log odds that are added to links of an online track from one step to the next, no farther than at this speed and
+#: with no other track beside: however sharply a person turns there, it is the same one.
+_ALONE, _WALK_M_PER_S = 8.0, 1.1
 #: A long tracklet has so many samples, few are fewer than that; people are counted in squares of this size.
 _LONG, _FEW, _CELL_M = 8, 4, 1.0
 #: Links are kept from these odds on, as a share of those of the least confidence: pieces of a person that stay apart
@@ -164,12 +166,10 @@ class Hypotheses(NamedTuple):
             Gaps(taken(forward, tracklets.last[before]), taken(backward, tracklets.first[after]), gap_s)
             for forward, backward in (tracked, alone)
         )
-        apart_m = np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T)
         terms = np.column_stack(
             [
                 np.ones(len(before)),
                 *_motion_terms(model, gaps),
-                np.log(apart_m + _NEAR_M),
                 *features(model, gaps_alone)[:, :2].T,
                 gap_s,
                 np.log(gap_s + 0.2),
@@ -179,8 +179,12 @@ class Hypotheses(NamedTuple):
                 *np.broadcast_to(_rates(tracks, tracklets)[:, None], (2, len(before))),
             ]
         )
-        bounds = np.maximum.accumulate([1.5 * model.step_s, *GAPS_S])
         nearest = [np.asarray(near.max(axis=1).todense()).ravel() for near in beside]
+        apart_m = np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T)
+        is_alone = (tracklets.begins[after] - tracklets.ends[before] == 1) & (apart_m < _WALK_M_PER_S * gap_s)
+        is_alone &= tracklets.online[before] == tracklets.online[after]
+        is_alone &= nearest[0][before] + nearest[1][after] == 0
+        bounds = np.maximum.accumulate([1.5 * model.step_s, *GAPS_S])
         leaves, comes = (
             _end_terms(model, tracks, tracklets, tracked, nearest[not leaving], leaving) for leaving in (True, False)
         )
@@ -193,7 +197,7 @@ class Hypotheses(NamedTuple):
             terms.astype(np.float64),
             leaves,
             comes,
-            np.zeros(len(before)),
+            np.where(is_alone, _ALONE, 0.0),
         )
 
     def scored(self) -> Scored:

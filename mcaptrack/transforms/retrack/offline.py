@@ -616,4 +616,5 @@ def hypotheses_of(model: MotionModel, tracks: Tracks, max_gap_s: float, appearan
     if appearance is None:
         return hypotheses
     sides = appearance.between(tracks._replace(track=hypotheses.tracklets.of))
-    return hypotheses._replace(evidence=sides.of_tracks(hypotheses.before, hypotheses.after))
+    looks = sides.of_tracks(hypotheses.before, hypotheses.after)
+    return hypotheses._replace(evidence=hypotheses.evidence + looks)
