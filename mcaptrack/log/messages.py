@@ -633,16 +633,19 @@ class Messages:
         ]
         waiting: dict[int, list[Payloads]] = {}
         held: Counter[int] = Counter()
+        total = 0
         window = _Window()
 
         def batches() -> Iterator[tuple[int, Payloads]]:
+            nonlocal total
             for number, part in window.topics(lose):
                 waiting.setdefault(number, []).append(part)
                 held[number] += len(part.data)
-                while held.total() >= _WAITING_BYTES or held[number] >= _BATCH_BYTES:
+                total += len(part.data)
+                while total >= _WAITING_BYTES or held[number] >= _BATCH_BYTES:
                     largest = number if held[number] >= _BATCH_BYTES else max(held, key=held.__getitem__)
                     yield largest, _batch(waiting.pop(largest))
-                    del held[largest]
+                    total -= held.pop(largest)
 
         for number, group in heapq.merge(*streams, key=lambda numbered: numbered[1][0].place):
             for batch in group:
