@@ -18,7 +18,7 @@ from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import compatible, find_swaps, resolve_swaps, swapped_by_pace
 from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
 from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, smooth_in_log, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, filtered, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.memory import held
 from tests.references.hypotheses import Claim, swept
@@ -88,7 +88,7 @@ def test_filtered_and_smoothed_states_equal_the_reference(seed):
     model, motion = models(rng)
     paths = scattered(rng, 4)
     out, _ = laid_out(paths, model.noise_m)
-    found = smooth(model, out)
+    found = *filtered(model, out), smooth(model, out)
     wanted = (motion.filtered, motion.backwards, motion.smoothed)
     for states, other in zip(found, wanted, strict=True):
         theirs = [state for path in paths.values() for state in dict(sorted(other(path).items())).values()]

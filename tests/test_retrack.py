@@ -346,7 +346,7 @@ def drawn(seed: int, most: int) -> tuple[Paths, Motion, tuple[MotionModel, Traje
     model, motion = models(rng)
     paths = with_companions(rng, int(rng.integers(1, most + 1)))
     out, _ = laid_out(paths, model.noise_m)
-    return paths, motion, (model, out, smooth(model, out)[2])
+    return paths, motion, (model, out, smooth(model, out))
 
 
 @given(seed=SEEDS)
@@ -388,7 +388,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
     steps = [step for step in range(begins, ends + 1) if not 10 < step <= 10 + missed]
     paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
     out, _ = laid_out(paths, 1e-3)
-    smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0, 0.4), out)[2]  # it follows the positions
+    smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0, 0.4), out)  # it follows the positions
     assert stand_throughout(out, smoothed, np.zeros((1, len(FEATURES))), (0, 39), 0.4).tolist() == [stands]
 
 
@@ -398,7 +398,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
 )
 def test_two_seconds_of_a_long_log_ten_of_a_short_one_and_doubles(begins, last, in_step, stands):
     out, _ = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))}, 0.1)
-    smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1, 0.4), out)[2]
+    smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1, 0.4), out)
     found = np.where(np.array(FEATURES) == "in step", in_step, 0.0)[None]
     assert stand_throughout(out, smoothed, found, (0, last), 0.4).tolist() == [stands]
 

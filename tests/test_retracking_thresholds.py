@@ -144,7 +144,7 @@ def test_the_largest_sideways_distance_of_a_link(speed, gap, others, least):
 def feature(name: str, paths: dict[int, Path]) -> tuple[float, float]:
     """A feature of the second of two tracks: of the package, and of the reference."""
     out, _ = laid_out(paths)
-    _, _, smoothed = smooth(MODEL, out)
+    smoothed = smooth(MODEL, out)
     return float(features(MODEL, out, smoothed)[1, FEATURES.index(name)]), person_features(MOTION, paths)[2][name]
 
 

@@ -2,11 +2,11 @@
 
 Writes mcaptrack/transforms/retrack/weights.json. Scenes are those of `crowds.py`: squares, streets, crossings and open
 places with groups, people who stand, and bicycles; each is corrupted by `corruptions.py` with faults of its own. They
-are sampled and re-tracked, and what re-tracking decides about is compared with who was there: links first; then, in
-other scenes, which joins of online tracks are right, then which links after cutting wrong ones; then which of the
-tracks that come of all these links are people; and, in the other scenes, how likely what is decided so is right. No
-recording is used. With --check it says whether the same comes out now. With --held nothing is written: scenes of other
-seeds score the weights of the file, and say how reliable probabilities are. A few minutes of one core.
+are sampled and re-tracked, and what re-tracking decides about is compared with who was there: links online first; then
+what ends and beginnings of tracklets choose; then which of the tracks that come of these choices are people; and, in
+other scenes, how likely what is decided so is right. Links in pictures are fitted by `fit_pictures.py`. No recording is
+used. With --check it says whether the same comes out now. With --held nothing is written: scenes of other seeds score
+the weights of the file, and say how reliable probabilities are. Some ten minutes of one core.
 
     .venv/bin/python tools/fit_retrack.py [--check | --held] [--seeds 101 102] [--steps 300]
 

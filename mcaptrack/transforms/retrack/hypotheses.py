@@ -18,17 +18,21 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.neighbours import touching_pairs
-from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_ends, run_starts
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.linking import (
+    Fit,
     Gaps,
-    are_in_reach,
+    TrackEnds,
     assigned_links,
     chains,
     features,
+    features_of,
     has_chance,
+    log_distance,
     log_odds,
-    spread_m2,
+    log_speed,
+    pairs_in_reach,
 )
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import Choices
@@ -84,8 +88,6 @@ GAPS_S: Final = (1.7, 5.0)
 GAP_NAMES: Final = ("next step", "up to 1.7 s", "up to 5 s", "longer")
 #: The number of ends and beginnings with the usual shares that count beside those of a log.
 _USUAL_ENDS: Final = 20.0
-#: Added to distances and speeds before taking logarithms: differences below these mean nothing.
-_NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: A person who is lost beside another one may be hidden by that one, or in one detection with that one; from this
 #: distance on nothing speaks for it, and at half of it half as much.
 _BESIDE_M: Final = 2.0
@@ -97,8 +99,6 @@ _LONG, _FEW, _CELL_M = 8, 4, 1.0
 #: Links are kept from these odds on, as a share of those of the least confidence: pieces of a person that stay apart
 #: cost more than wrong ones that go together. (Chosen on synthetic crowds.)
 _ENOUGH: Final = 1 / 5
-#: The number of pairs that are examined at once.
-_BATCH: Final = 1_000_000
 #: What ends and beginnings choose.
 CHOICES = Choices.of("choices", GAP_NAMES, LINK_TERMS, END_TERMS)
 
@@ -155,22 +155,30 @@ class Hypotheses(NamedTuple):
 
     @classmethod
     def of(cls, model: MotionModel, tracks: Tracks, max_gap_s: float) -> Hypotheses:
-        """The hypotheses about tracks as they are now; ``evidence`` is 0."""
+        """The hypotheses about tracks as they are now, with the ``evidence`` of those that go on alone."""
         tracklets = Tracklets.in_tracks(tracks)
         tracked, beside = _tracked(model, tracks, tracklets)
         _, row, paths = to_trajectories(tracks.step, tracklets.of, tracks.xy_m)
         alone = [taken(states, row) for states in filtered(model, paths)]
-        before, after = _candidates(model, tracks, tracklets, tracked, max_gap_s)
-        gap_s = np.asarray((tracklets.begins[after] - tracklets.ends[before]) * model.step_s, np.float64)
-        gaps, gaps_alone = (
-            Gaps(taken(forward, tracklets.last[before]), taken(backward, tracklets.first[after]), gap_s)
+        ends, ends_alone = (
+            TrackEnds(
+                model,
+                tracklets.begins,
+                tracklets.ends,
+                taken(backward, tracklets.first),
+                taken(forward, tracklets.last),
+            )
             for forward, backward in (tracked, alone)
         )
+        follows = following(tracks.track[tracklets.first], tracklets.begins)
+        before, after = _candidates(ends, follows, max_gap_s)
+        gaps = ends.gaps(before, after)
+        gap_s = gaps.seconds
         terms = np.column_stack(
             [
                 np.ones(len(before)),
                 *_motion_terms(model, gaps),
-                *features(model, gaps_alone)[:, :2].T,
+                *features(model, ends_alone.gaps(before, after))[:, :2].T,
                 gap_s,
                 np.log(gap_s + 0.2),
                 *_same(tracklets, before, after),
@@ -293,23 +301,13 @@ def _tracked(
     return (taken(forward, row), taken(backward, row)), (beside[:count], beside[count:])
 
 
-def _candidates(
-    model: MotionModel, tracks: Tracks, tracklets: Tracklets, states: tuple[State, State], max_gap_s: float
-) -> tuple[Ints, Ints]:
-    """Pairs (E,) of a tracklet and a later one that may be one person, and all that follow each other in a track."""
-    low = np.searchsorted(tracklets.begins, tracklets.ends + 1)
-    count = np.searchsorted(tracklets.begins, tracklets.ends + round(max_gap_s / model.step_s), "right") - low
-    follows = following(tracks.track[tracklets.first], tracklets.begins)
+def _candidates(ends: TrackEnds, follows: Ints, max_gap_s: float) -> tuple[Ints, Ints]:
+    """Pairs (E,) of a tracklet and a later one that may be one person, and all with which tracks go on, ``follows``."""
     joined = np.flatnonzero(follows >= 0)
     pairs = [joined * len(follows) + follows[joined]]
-    for part in batches(count, _BATCH):
-        before = part.start + group_index(count[part])
-        after = ragged_range(low[part], count[part])
-        gap_s = np.asarray((tracklets.begins[after] - tracklets.ends[before]) * model.step_s, np.float64)
-        gaps = Gaps(taken(states[0], tracklets.last[before]), taken(states[1], tracklets.first[after]), gap_s)
-        near = np.flatnonzero(are_in_reach(gaps))
-        near = near[has_chance(log_odds(features(model, taken(gaps, near))))]
-        pairs.append(before[near] * len(follows) + after[near])
+    for before, after, gaps in pairs_in_reach(ends, max_gap_s):
+        likely = has_chance(log_odds(features(ends.model, gaps)))
+        pairs.append(before[likely] * len(follows) + after[likely])
     before, after = np.divmod(np.unique(np.concatenate(pairs)), max(len(follows), 1))
     return before, after
 
@@ -325,25 +323,11 @@ def following(track: Ints, begins: Ints) -> Ints:
 
 def _motion_terms(model: MotionModel, gaps: Gaps) -> list[Floats]:
     """The terms of how the motion before a gap fits that after it."""
-    before, after, gap_s = gaps
-    span = gap_s[:, None]
-    way = after.mean[:, :2] - before.mean[:, :2]
-    left, came = before.mean[:, 2:], after.mean[:, 2:]
-    length = [np.hypot(*vector.T) for vector in (way - left * span, way - came * span, way - (left + came) / 2 * span)]
-    miss, misfit, stay = np.minimum(*length[:2]), length[2], np.hypot(*way.T)
-    speed = np.log(np.maximum(np.hypot(*left.T), np.hypot(*came.T)) + _SPEED_M_PER_S)
-    noise_m2 = spread_m2(model, gaps)
-    return [
-        np.log(miss + _NEAR_M),
-        np.log1p(misfit**2 / noise_m2 / 2),
-        np.log(misfit + 0.2),
-        np.log(np.minimum(misfit, stay) + _NEAR_M),
-        np.log(np.hypot(*(came - left).T) + _SPEED_M_PER_S),
-        np.log(stay + _NEAR_M) * speed,
-        np.log(misfit + _NEAR_M) * speed,
-        speed,
-        np.log(noise_m2),
-    ]
+    fit = Fit.of(model, gaps)
+    miss, to_noise, _, _, turn, stay, misfit = features_of(fit, gaps.seconds).T
+    shorter = log_distance(np.minimum(fit.misfit, fit.stay))
+    speed, noise = log_speed(fit.speed), np.log(fit.spread_m2)
+    return [miss, to_noise, np.log(fit.misfit + 0.2), shorter, turn, stay, misfit, speed, noise]
 
 
 def _same(tracklets: Tracklets, before: Ints, after: Ints) -> tuple[Bools, Bools]:

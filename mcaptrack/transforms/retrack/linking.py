@@ -9,6 +9,7 @@ Letters: K tracks, E candidate links, F features.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -58,7 +59,6 @@ class TrackEnds(NamedTuple):
     """The first and last steps of tracks (K,), and their states there: filtered backward, and forward."""
 
     model: MotionModel
-    trajectories: Trajectories
     begins: Ints
     ends: Ints
     begun: State
@@ -70,7 +70,7 @@ class TrackEnds(NamedTuple):
         forward, backward = filtered(model, trajectories)
         first, last = trajectories.first[:-1], trajectories.first[1:] - 1
         steps = trajectories.step[first], trajectories.step[last]
-        return cls(model, trajectories, *steps, taken(backward, first), taken(forward, last))
+        return cls(model, *steps, taken(backward, first), taken(forward, last))
 
     def gaps(self, i: Ints, j: Ints) -> Gaps:
         """The gaps (E,) from the ends of tracks ``i`` to the beginnings of tracks ``j``."""
@@ -96,7 +96,8 @@ def link_tracks(
     i, j = candidates(ends, max_gap_s)
     gaps = ends.gaps(i, j)
     if np.isfinite(max_misfit[0]):
-        fits = misfits(gaps) <= max_misfit[0] + max_misfit[1] * gaps.seconds
+        fit = Fit.of(ends.model, gaps)
+        fits = np.minimum(fit.misfit, fit.stay) <= max_misfit[0] + max_misfit[1] * gaps.seconds
         i, j, gaps = i[fits], j[fits], taken(gaps, fits)
     if len(i) == 0:
         return continued_by
@@ -150,18 +151,23 @@ def assigned_links(ends: Ints, begins: Ints, gain: Floats, count: int) -> Ints:
 
 def candidates(ends: TrackEnds, max_gap_s: float) -> tuple[Ints, Ints]:
     """Pairs (E,) of a track and a later one within reach of its end."""
+    none = np.empty(0, np.int64), np.empty(0, np.int64)
+    i, j = zip(none, *((i, j) for i, j, _ in pairs_in_reach(ends, max_gap_s)), strict=True)
+    return np.concatenate(i), np.concatenate(j)
+
+
+def pairs_in_reach(ends: TrackEnds, max_gap_s: float) -> Iterator[tuple[Ints, Ints, Gaps]]:
+    """The same (E,) some at a time, with the gaps between."""
     order = np.argsort(ends.begins, kind="stable")
     begins = ends.begins[order]
     low = np.searchsorted(begins, ends.ends + 1)
     count = np.searchsorted(begins, ends.ends + round(max_gap_s / ends.model.step_s), "right") - low
-    parts = [(np.empty(0, np.int64), np.empty(0, np.int64))]
     for part in batches(count, _BATCH):
         i = part.start + group_index(count[part])
         j: Ints = order[ragged_range(low[part], count[part])]
-        near = are_in_reach(ends.gaps(i, j))
-        parts.append((i[near], j[near]))
-    i, j = (np.concatenate(members) for members in zip(*parts, strict=True))
-    return i, j
+        gaps = ends.gaps(i, j)
+        near = np.flatnonzero(are_in_reach(gaps))
+        yield i[near], j[near], taken(gaps, near)
 
 
 def reach_m(gap_s: Floats) -> Floats:
@@ -234,58 +240,82 @@ def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
     return list(np.split(order, starts[1:])) if len(order) else []
 
 
-def features(model: MotionModel, gaps: Gaps) -> Floats:
-    """The features that distinguish right links from wrong ones, (E, F): see ``FEATURES``.
+class Fit(NamedTuple):
+    """The fit of the motion before gaps (E,) to that after them.
 
-    The miss is the distance from one side to where the other, extrapolated at its own velocity, expects it (the smaller
-    of the two); the misfit is that distance with the mean of both velocities.
+    Attributes
+    ----------
+    miss : (E,) of float
+        The distance from one side to where the other, extrapolated at its own velocity, expects it (the smaller of the
+        two), in m.
+    misfit : (E,) of float
+        That distance with the mean of both velocities, in m.
+    stay : (E,) of float
+        The distance from one side to the other, in m.
+    turn, speed : (E,) of float
+        The difference of both velocities, and the higher speed, in m/s.
+    spread_m2 : (E,) of float
+        The variance of the misfit per axis.
     """
-    before, after, gap_s = gaps
-    span = gap_s[:, None]
-    way = after.mean[:, :2] - before.mean[:, :2]
-    left, came = before.mean[:, 2:], after.mean[:, 2:]
-    miss = np.minimum(_length(way - left * span), _length(way - came * span))
-    misfit, stay = _length(way - (left + came) / 2 * span), _length(way)
-    speed = np.maximum(_length(left), _length(came))
-    spread = spread_m2(model, gaps)
-    log_speed = np.log(speed + _SPEED_M_PER_S)
+
+    miss: Floats
+    misfit: Floats
+    stay: Floats
+    turn: Floats
+    speed: Floats
+    spread_m2: Floats
+
+    @classmethod
+    def of(cls, model: MotionModel, gaps: Gaps) -> Fit:
+        """The fit of gaps (E,)."""
+        before, after, gap_s = gaps
+        span = gap_s[:, None]
+        way = after.mean[:, :2] - before.mean[:, :2]
+        left, came = before.mean[:, 2:], after.mean[:, 2:]
+        speed = np.maximum(_length(left), _length(came))
+        power = (model.drift_m_per_s + model.drift_ratio * speed) ** 2
+        spread = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
+        spread += power * gap_s**3 / 12
+        return cls(
+            np.minimum(_length(way - left * span), _length(way - came * span)),
+            _length(way - (left + came) / 2 * span),
+            _length(way),
+            _length(came - left),
+            speed,
+            spread,
+        )
+
+
+def features(model: MotionModel, gaps: Gaps) -> Floats:
+    """The features that distinguish right links from wrong ones, (E, F): see ``FEATURES``."""
+    return features_of(Fit.of(model, gaps), gaps.seconds)
+
+
+def features_of(fit: Fit, gap_s: Floats) -> Floats:
+    """The same of gaps (E,) with this fit and so many seconds."""
+    speed = log_speed(fit.speed)
     return np.stack(
         [
-            np.log(miss + _NEAR_M),
-            np.log1p(misfit**2 / spread / 2),
+            log_distance(fit.miss),
+            np.log1p(fit.misfit**2 / fit.spread_m2 / 2),
             gap_s,
-            np.log(np.minimum(misfit, stay) + _NEAR_M) * np.log(gap_s + 0.4),
-            np.log(_length(came - left) + _SPEED_M_PER_S),
-            np.log(stay + _NEAR_M) * log_speed,
-            np.log(misfit + _NEAR_M) * log_speed,
+            log_distance(np.minimum(fit.misfit, fit.stay)) * np.log(gap_s + 0.4),
+            log_speed(fit.turn),
+            log_distance(fit.stay) * speed,
+            log_distance(fit.misfit) * speed,
         ],
         axis=1,
     )
 
 
-def log_likelihood(model: MotionModel, gaps: Gaps) -> Floats:
-    """The log likelihood (E,) of states after gaps if they are of the same person as those before.
-
-    The misfit has Student's distribution with two degrees of freedom, because people also turn and stop.
-    """
-    return np.asarray(-2 * features(model, gaps)[:, FEATURES.index("misfit")] - np.log(spread_m2(model, gaps)))
+def log_distance(distance_m: Floats) -> Floats:
+    """The logarithms of distances (E,), of which differences below some centimetres mean nothing."""
+    return np.asarray(np.log(distance_m + _NEAR_M))
 
 
-def spread_m2(model: MotionModel, gaps: Gaps) -> Floats:
-    """The variance (E,) of the misfit per axis."""
-    before, after, gap_s = gaps
-    speed = np.maximum(_length(before.mean[:, 2:]), _length(after.mean[:, 2:]))
-    power = (model.drift_m_per_s + model.drift_ratio * speed) ** 2
-    spread = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
-    spread += power * gap_s**3 / 12
-    return np.asarray(spread)
-
-
-def misfits(gaps: Gaps) -> Floats:
-    """The distances (E,) of ends of tracks to continuations, extrapolated at the mean velocity or at rest."""
-    before, after, gap_s = gaps
-    way = after.mean[:, :2] - before.mean[:, :2]
-    return np.minimum(_length(way - (before.mean[:, 2:] + after.mean[:, 2:]) / 2 * gap_s[:, None]), _length(way))
+def log_speed(speed_m_per_s: Floats) -> Floats:
+    """The logarithms of speeds (E,), of which small differences mean nothing."""
+    return np.asarray(np.log(speed_m_per_s + _SPEED_M_PER_S))
 
 
 def _length(vector: Floats) -> Floats:

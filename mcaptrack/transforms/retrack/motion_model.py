@@ -141,12 +141,12 @@ class _Steps(NamedTuple):
         return cls(forward, first[1:][order][place] - 1 - step, [0, *np.cumsum(alive).tolist()])
 
 
-def filtered(model: MotionModel, trajectories: Trajectories, steps: _Steps | None = None) -> tuple[State, State]:
+def filtered(model: MotionModel, trajectories: Trajectories) -> tuple[State, State]:
     """The state of every row from past and present, and from present and future.
 
     The filters run over all tracks at once, forward and backward together.
     """
-    steps = steps or _Steps.of(trajectories.first)
+    steps = _Steps.of(trajectories.first)
     rows = np.stack([steps.forward, steps.backward], axis=-1).reshape(-1)
     noise_m = np.full(len(rows), model.noise_m)
     both = _filter(model, trajectories.xy_m.T.take(rows, axis=1), noise_m, [2 * bound for bound in steps.bounds])
@@ -156,18 +156,19 @@ def filtered(model: MotionModel, trajectories: Trajectories, steps: _Steps | Non
     return forward, backward
 
 
-def smooth(model: MotionModel, trajectories: Trajectories) -> tuple[State, State, State]:
-    """The state of every row: from past and present, from present and future, and from all (RTS smoother).
+def smooth(model: MotionModel, trajectories: Trajectories) -> State:
+    """The state of every row from past, present and future (RTS smoother).
 
     Source: Rauch, Tung, Striebel 1965.
     """
+    return _smoothed(model, trajectories, np.full(len(trajectories.step), model.noise_m))
+
+
+def _smoothed(model: MotionModel, trajectories: Trajectories, noise_m: Floats) -> State:
+    """The state of every row from all of its track, with the noise of each, (N,)."""
     steps = _Steps.of(trajectories.first)
-    forward, backward = filtered(model, trajectories, steps)
-    return forward, backward, _smoothed(model, forward, steps)
-
-
-def _smoothed(model: MotionModel, forward: State, steps: _Steps) -> State:
-    """The state of every row from all of its track, from that of past and present."""
+    xy_m = trajectories.xy_m.T.take(steps.forward, axis=1)
+    forward = _states(_filter(model, xy_m, noise_m[steps.forward], steps.bounds), steps.forward)
     rows = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
     _smooth_back(model, rows, steps.bounds)
     return _states(rows, steps.backward)
@@ -221,11 +222,8 @@ def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known
     faster = max(_usual_speed(trajectories, model.step_s) * unit_m / WALK_M_PER_S, 1.0)
     usual_m = model.noise_m / faster**2
     of_track = np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m))
-    steps = _Steps.of(trajectories.first)
-    noise_m = np.repeat(of_track, np.diff(trajectories.first))[steps.forward]
     model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
-    forward = _filter(model, trajectories.xy_m.T.take(steps.forward, axis=1), noise_m, steps.bounds)
-    return _smoothed(model, _states(forward, steps.forward), steps).mean[:, :2]
+    return _smoothed(model, trajectories, np.repeat(of_track, np.diff(trajectories.first))).mean[:, :2]
 
 
 def _usual_speed(trajectories: Trajectories, step_s: float) -> float:

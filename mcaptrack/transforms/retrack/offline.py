@@ -491,7 +491,7 @@ def offline_tracks(
     odds = np.full(len(ids), np.inf)
     if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
         _, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-        _, _, smoothed = smooth(model, trajectories)
+        smoothed = smooth(model, trajectories)
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             moved_m = movers.unit_m * smooth_in_log(model, trajectories, options.noise_m is not None, movers.unit_m)
         log = steps[0], steps[-1]
@@ -596,7 +596,7 @@ def _without_swaps(model: MotionModel, tracks: Tracks, appearance: Appearance | 
 def _linked(
     options: RetrackOptions, model: MotionModel, tracks: Tracks, movers: Movers, appearance: Appearance | None
 ) -> Tracks:
-    """Link tracks of the same person; in pictures they are cut first where they seem to be of two."""
+    """Decide about identities; tracks in metres, which a tracker made there, are only linked."""
     most_s, least = options.link_s / movers.unit_m, options.link_confidence
     if not movers.on_ground:
         for _ in range(_SWEEPS):
