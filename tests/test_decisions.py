@@ -63,7 +63,9 @@ def test_joins_are_the_repairs_among_events_and_tracks_are_kept_or_left_out(seed
         assert row["source_id"] == np.bincount(mine["source_id"]).argmax()
     every = rows_of(decisions)
     assert ((every["probability"] >= 0) & (every["probability"] <= 1)).all()
-    assert (every["track_id"][every["kind"] == DecisionKind.LEFT_OUT] == -1).all()
+    left_out = every[every["kind"] == DecisionKind.LEFT_OUT]
+    assert (left_out["track_id"] == -1).all()
+    assert (left_out["probability"] > 0.5).all()  # that it is no person
 
 
 def test_the_alternative_is_the_neighbour_and_a_join_in_a_crowd_is_less_certain():
@@ -97,6 +99,21 @@ def test_what_is_left_out_is_a_row_with_its_place_and_the_input_id():
     assert (row["source_id"], row["frames"], row["x_m"], row["y_m"]) == (7, 7, 22.0, 30.0)
     assert row["duration_s"] == pytest.approx(6 * STEP_S)
     assert row["probability"] > 0.5  # that it is no person
+
+
+def test_who_is_too_short_is_rather_no_person_however_straight_the_walk():
+    """Eight people cross a scene of 24 s; each of twelve others is seen for 1.2 s, walking as straight."""
+
+    def scene(tick: int) -> dict:
+        people = {name: (0.5 * tick, 9.0 * name) for name in range(1, 9)}
+        return people | {20 + k: (0.5 * tick - 40, 9.0 * k) for k in range(12) if 4 * k <= tick < 4 * k + 4}
+
+    _, decisions = decided(walking(scene))
+    rows = rows_of(decisions)
+    short = rows[(rows["source_id"] >= 20) & (rows["kind"] != DecisionKind.JOINED)]
+    assert len(short) == 12
+    assert (short["kind"] == DecisionKind.LEFT_OUT).all()
+    assert (short["probability"] > 0.5).all()
 
 
 def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():

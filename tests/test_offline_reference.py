@@ -21,7 +21,7 @@ from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, filtered, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.memory import held
-from tests.references.hypotheses import Claim, swept
+from tests.references.hypotheses import Claim, Scene, gains_of, swept
 from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, links, smoothed_in_log, usual_by_gap
 from tests.references.online import Bends
 from tests.tiers import thorough
@@ -139,8 +139,12 @@ def test_who_is_who_equals_the_reference(seed):
     step, track, online, source = np.array([(c.step, c.track, c.online, c.source) for c in claims]).T
     tracks = tracks_of(step, track, source, np.array([claim.at for claim in claims]))._replace(online=online)
     most_s, least = float(rng.choice([0.0, 1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
-    found = Hypotheses.of(model, tracks, most_s).scored().best(least)
-    assert found.tolist() == swept(motion, claims, most_s, least)
+    hypotheses = Hypotheses.of(model, tracks, most_s)
+    scored = hypotheses.scored()
+    gains = gains_of(Scene(motion, claims), most_s, least)
+    assert [*zip(hypotheses.before.tolist(), hypotheses.after.tolist(), strict=True)] == sorted(gains)
+    np.testing.assert_allclose(scored.gain(least), [gains[pair] for pair in sorted(gains)], rtol=1e-6, atol=1e-6)
+    assert scored.best(least).tolist() == swept(motion, claims, most_s, least)
 
 
 @given(seed=SEEDS)

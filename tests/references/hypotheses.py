@@ -176,12 +176,9 @@ def total(weights: dict[str, float], terms: dict[str, float]) -> float:
     return sum(weights[name] * value for name, value in terms.items())
 
 
-def swept(motion: Motion, claims: list[Claim], max_gap_s: float, least: float) -> list[int]:
-    """The track of each claim after one sweep."""
-    from scipy.optimize import linear_sum_assignment
-
-    scene = Scene(motion, claims)
-    parts = scene.tracklets
+def gains_of(scene: Scene, max_gap_s: float, least: float) -> dict[tuple[int, int], float]:
+    """How much each candidate link gains over leaving at its end and coming at its beginning."""
+    motion, parts = scene.motion, scene.tracklets
     candidates = {(i, j): scene.link(a, b, max_gap_s) for i, a in enumerate(parts) for j, b in enumerate(parts)}
     gap, link = {}, {}
     for (i, j), terms in candidates.items():
@@ -189,14 +186,24 @@ def swept(motion: Motion, claims: list[Claim], max_gap_s: float, least: float) -
             bounds = np.maximum.accumulate([1.5 * motion.step_s, 1.7, 5.0])
             gap[i, j] = GAPS[int(np.searchsorted(bounds, terms["gap"]))]
             link[i, j] = total(CHOICES["links"][gap[i, j]], terms) + ALONE * scene.is_alone(parts[i], parts[j])
-    gains = np.full((len(parts), len(parts)), -log(least / (1 - least) * ENOUGH))
+    gains = dict.fromkeys(link, -log(least / (1 - least) * ENOUGH))
     for side, name in enumerate(("leaves", "comes")):
         none = [total(CHOICES[name], scene.end(part, name == "leaves")) for part in parts]
         shift = shifts(side, link, none, gap, CHOICES[f"usual_{name}"])
         for pair, score in link.items():
             gains[pair] += (score + shift[gap[pair]] - none[pair[side]] - shift["none"]) / 2
-    allowed = np.array([[(i, j) in link and gains[i, j] > 0 for j in range(len(parts))] for i in range(len(parts))])
-    gains = np.where(allowed.reshape(gains.shape), gains, 0.0)
+    return gains
+
+
+def swept(motion: Motion, claims: list[Claim], max_gap_s: float, least: float) -> list[int]:
+    """The track of each claim after one sweep."""
+    from scipy.optimize import linear_sum_assignment
+
+    scene = Scene(motion, claims)
+    parts = scene.tracklets
+    gains = np.zeros((len(parts), len(parts)))
+    for pair, gain in gains_of(scene, max_gap_s, least).items():
+        gains[pair] = max(gain, 0.0)
     root = list(range(len(parts)))
     for i, j in zip(*linear_sum_assignment(-gains), strict=True):
         if gains[i, j] > 0:
