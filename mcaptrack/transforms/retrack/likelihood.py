@@ -5,14 +5,14 @@ Letters: R rows of online tracks, L past positions.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.ragged import group_index, run_starts
-from mcaptrack.predictors import Forecast, Predictor, make, predict_together
-from mcaptrack.predictors.linear import LinearPredictor
+from mcaptrack.predictors import Forecast, Predictor, make, predict_together, uses_people
 from mcaptrack.predictors.position_noise import PAST, PositionNoise
 from mcaptrack.predictors.tail_calibration import TailCalibration
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
@@ -117,6 +117,8 @@ class InputNoise:
 
 #: Predictions that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
+#: Tracks whose products of matrices are computed at once: more would be given to threads that wait for each other.
+_BLOCK: Final = 32
 
 
 class Unpredicted(NamedTuple):
@@ -171,7 +173,7 @@ class OnlineForecasts:
         done = 0
         while len(waiting.ids) - done >= least:
             end = done + _BATCH
-            if not isinstance(self._predictor, LinearPredictor):
+            if uses_people(self._predictor):
                 end = int(np.searchsorted(waiting.step, waiting.step[min(end, len(waiting.ids)) - 1], "right"))
             ids, past, is_known, coasts, steps = taken(waiting, slice(done, end))
             mean, cov = self._forecast(past / self._unit_m, is_known, steps)
@@ -181,17 +183,19 @@ class OnlineForecasts:
         self._write(taken(self._left, slice(0)))  # frames without tracks
 
     def _forecast(self, past: Floats, is_known: Bools, steps: Ints) -> Forecast:
-        """The forecasts of tracks, step by step unless the predictor is linear: the last digits of others depend on the
-        size of a batch, and so on later tracks.
+        """The forecasts of a batch of tracks, step by step if the predictor looks at others.
+
+        The last digits of a product of matrices depend on their size: all blocks have the same, the last one of a log
+        by repeating its last track, so that forecasts don't depend on later tracks.
         """
-        if isinstance(self._predictor, LinearPredictor):
-            return self._predictor.predict(past, is_known)
-        begins = np.flatnonzero(run_starts(steps))
-        parts = [
-            predict_together(self._predictor, past[low:high], is_known[low:high])
-            for low, high in zip(begins, np.append(begins[1:], len(steps)), strict=True)
-        ]
-        return Forecast(*map(np.concatenate, zip(*parts, strict=True)))
+        count = len(steps)
+        if uses_people(self._predictor):
+            bounds = pairwise([*np.flatnonzero(run_starts(steps)), count])
+            parts = [predict_together(self._predictor, past[low:high], is_known[low:high]) for low, high in bounds]
+        else:
+            blocks = np.minimum(np.arange(count + -count % _BLOCK), count - 1).reshape(-1, _BLOCK)
+            parts = [self._predictor.predict(past[rows], is_known[rows]) for rows in blocks]
+        return Forecast(*(np.concatenate(part)[:count] for part in zip(*parts, strict=True)))
 
     def _write(self, new: _Predicted) -> None:
         """Write the frames that are complete with these predictions."""
