@@ -55,11 +55,9 @@ def main() -> None:
     open_streams()
     try:
         from mcaptrack.cli import app
-        from mcaptrack.environment import hush_libraries, share_allocator
+        from mcaptrack.environment import set_up_libraries
 
-        hush_libraries()
-        share_allocator()
-
+        set_up_libraries()
         try:
             app()
         except SystemExit:

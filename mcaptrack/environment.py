@@ -146,14 +146,13 @@ def threads() -> int:
     return int(said) if said.isascii() and said.isdecimal() and int(said) > 0 else cores()
 
 
-def share_allocator() -> None:
-    """Let Arrow take memory from the allocator of all others, unless the user chose another (before Arrow is loaded).
+def set_up_libraries() -> None:
+    """Choose what libraries read from the environment as they are loaded, unless the user chose otherwise.
 
-    What it frees there can be used again, and be given back; its own pool keeps tens of megabytes for itself.
+    Arrow takes memory from the allocator of all others: what it frees there can be used again, and be given back, where
+    its own pool keeps tens of megabytes. OpenCV's messages about damaged pictures are left to the command, which says
+    them in a line. NumPy computes with one thread: its matrices here are small, and threads would wait for each other.
     """
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
-
-
-def hush_libraries() -> None:
-    """Silence OpenCV's messages about damaged pictures, which the command reports in one line."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -22,7 +22,7 @@ from time import monotonic
 from types import FrameType
 from typing import Any, Final, NoReturn
 
-from mcaptrack.environment import hush_libraries, share_allocator
+from mcaptrack.environment import set_up_libraries
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet.ledger import digest_of_log
 from mcaptrack.fleet.results import LogOutcome, State
@@ -97,8 +97,7 @@ def serve(handle: int, life: int) -> None:
         signal.signal(number, signal.SIG_IGN)  # Ctrl-C and a closed terminal are for the parent, which ends its workers
     signal.signal(signal.SIGTERM, _end)
     faulthandler.enable(sys.stderr)
-    hush_libraries()
-    share_allocator()
+    set_up_libraries()
     die_with(life)
     sent = 0.0
 
