@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Rows, framing
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.provenance import Provenance
@@ -195,6 +196,19 @@ def test_frames_of_each_class_hold_its_tracks_whole(seed, part_rows, monkeypatch
         for own, frame in zip(part, frames, strict=True):
             is_own = [first[one] == kind for one in frame.rows["track_id"].tolist()]
             assert_same_rows(own.rows, frame.rows[np.array(is_own, bool)])
+
+
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
+def test_rows_without_metres_count_as_if_they_were_not_there(profile):
+    frames = walk(lambda n: {7: (0.4 * n, 0.0), 8: (0.0, 3.0 - 0.4 * n)}, 30)
+    without = [frame._replace(rows=frame.rows[frame.rows["track_id"] != 7 + n % 4]) for n, frame in enumerate(frames)]
+    for n, frame in enumerate(frames):
+        frame.rows["x_m"][frame.rows["track_id"] == 7 + n % 4] = np.nan
+    with pytest.warns(McaptrackWarning, match=r"^16 rows of tracks have no position in metres, and are left out$"):
+        parts = run(profile, frames)
+    for part, expected in zip(parts, run(profile, without), strict=True):
+        for frame, same in zip(part, expected, strict=True):
+            assert_same_rows(frame.rows, same.rows)
 
 
 def test_one_class_is_not_split():

@@ -18,6 +18,7 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.geometry.ticks import RegularClock
+from mcaptrack.notices import warn
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, split_rows
@@ -68,9 +69,13 @@ class Sample:
         return MappingProxyType({"": max(self.max_gap_s, 2 / self.rate_hz)})
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        kept = FrameCollector(TRACKS)
+        kept, left_out = FrameCollector(TRACKS), 0
         for frame in frames:
-            kept.append(frame._replace(rows=_in_metres(frame, self.ground_planes)))
+            rows = _in_metres(frame, self.ground_planes)
+            kept.append(frame._replace(rows=rows))
+            left_out += len(frame.rows) - len(rows)
+        if left_out:
+            warn(f"{left_out:,} rows of tracks are above the horizon of the ground plane, and are left out", "left-out")
         in_metres = kept.done()
         if not len(in_metres):
             return

@@ -10,7 +10,7 @@ from typing import ClassVar, Final, TypeAlias, TypeVar
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
@@ -177,7 +177,7 @@ def _retrack(
     if options.leaves_unchanged:
         yield from _keep_ids(options, frames, calibrations)
         return
-    frames = collect(TRACKS, frames)
+    frames = _placed(collect(TRACKS, frames))
     classes = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
     outputs = [_retracked(options, new_pass, part, score, calibrations) for part in classes]
@@ -186,6 +186,19 @@ def _retrack(
         return
     for parts in zip(*outputs[0], strict=True):
         yield tuple(frame._replace(rows=frame.rows.copy()) for frame in parts)  # what is kept can't be written to
+
+
+def _placed(frames: FrameColumns) -> FrameColumns:
+    """The frames without the rows that have no position in metres; how many these are is said."""
+    counts = [(~_is_placed(part.rows)).sum() for _, _, part in joined_parts(TRACKS, frames)]
+    if not any(counts):
+        return frames
+    warn(f"{sum(counts):,} rows of tracks have no position in metres, and are left out", "left-out")
+    return collect(TRACKS, (frame._replace(rows=frame.rows[_is_placed(frame.rows)]) for frame in frames))
+
+
+def _is_placed(rows: Rows) -> Bools:
+    return np.isfinite(rows["x_m"]) & np.isfinite(rows["y_m"])
 
 
 def _keep_ids(
