@@ -17,12 +17,11 @@ from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import compatible, find_swaps, resolve_swaps, swapped_by_pace
 from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
-from mcaptrack.transforms.retrack.linking import TrackEnds, link_tracks
 from mcaptrack.transforms.retrack.motion_model import MotionModel, filtered, smooth, smooth_in_log, to_trajectories
 from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
 from tests.memory import held
 from tests.references.hypotheses import Claim, Scene, gains_of, swept
-from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, links, smoothed_in_log, usual_by_gap
+from tests.references.offline import DRIFTS, Motion, by_pace, course_of, exchanged, smoothed_in_log, usual_by_gap
 from tests.references.online import Bends
 from tests.tiers import thorough
 from tools.corruptions import STEP_S, corrupt
@@ -112,19 +111,6 @@ def test_smoothing_that_follows_the_log_equals_the_reference(seed, is_noise_know
 
 
 @given(seed=SEEDS)
-@settings(max_examples=25)
-def test_links_equal_the_reference(seed):
-    rng = np.random.default_rng(seed)
-    model, motion = models(rng)
-    paths = scattered(rng, int(rng.integers(1, 10)))
-    most_s, least = float(rng.choice([1.2, 6.0, 20.0])), float(rng.choice([0.1, 0.5, 0.9]))
-    out, _ = laid_out(paths, model.noise_m)
-    found = link_tracks(TrackEnds.of(model, out), most_s, least)
-    names = sorted(paths)
-    assert {names[i]: names[j] for i, j in enumerate(found.tolist()) if j >= 0} == links(motion, paths, most_s, least)
-
-
-@given(seed=SEEDS)
 @settings(max_examples=8)
 def test_who_is_who_equals_the_reference(seed):
     """Tracks that were of other online tracks for a while, and change their input ids now and then."""
@@ -152,12 +138,14 @@ def test_who_is_who_equals_the_reference(seed):
 def test_links_are_the_same_without_a_table_of_all_pairs_and_in_batches_of_any_size(seed):
     rng = np.random.default_rng(seed)
     model, _ = models(rng)
-    out, _ = laid_out(scattered(rng, 14), model.noise_m)
-    whole = link_tracks(TrackEnds.of(model, out), 20.0, 0.1)
-    for name, value in (("_TABLE_CELLS", 1), ("_BATCH", int(rng.integers(1, 9)))):
+    placed = [(step, name, *at) for name, path in scattered(rng, 14).items() for step, at in path.items()]
+    step, name, *xy = map(np.array, zip(*placed, strict=True))
+    tracks = tracks_of(step, name, name, np.stack(xy, axis=-1))
+    whole = Hypotheses.of(model, tracks, 20.0).scored().best(0.1)
+    for constant, value in (("_TABLE_CELLS", 1), ("_BATCH", int(rng.integers(1, 9)))):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(linking, name, value)
-            assert link_tracks(TrackEnds.of(model, out), 20.0, 0.1).tolist() == whole.tolist()
+            patch.setattr(linking, constant, value)
+            assert Hypotheses.of(model, tracks, 20.0).scored().best(0.1).tolist() == whole.tolist()
 
 
 @given(seed=SEEDS)

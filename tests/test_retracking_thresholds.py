@@ -16,10 +16,10 @@ from mcaptrack.schema import Frame
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.retrack.false_tracks import FEATURES, features
 from mcaptrack.transforms.retrack.identity_swaps import find_encounters, resolve_swaps
-from mcaptrack.transforms.retrack.linking import TrackEnds, candidates, link_tracks
-from mcaptrack.transforms.retrack.motion_model import MotionModel, smooth, to_trajectories
+from mcaptrack.transforms.retrack.linking import TrackEnds, pairs_in_reach
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, smooth, to_trajectories
 from tests.references.false_tracks import person_features
-from tests.references.offline import Motion, Path, encounters, exchanged, links
+from tests.references.offline import Motion, Path, encounters, exchanged
 from tests.references.online import OnlineTracker
 from tests.tiers import one_in
 from tests.worlds import walk
@@ -115,30 +115,6 @@ def laid_out(paths: dict[int, Path]):
 
 def line(first: int, steps: int, start: tuple[float, float], speed: tuple[float, float]) -> Path:
     return {first + k: (start[0] + speed[0] * k * 0.4, start[1] + speed[1] * k * 0.4) for k in range(steps)}
-
-
-@pytest.mark.parametrize(("others", "least"), [(0, 0.5), (4, 0.1), (4, 0.9)])
-@pytest.mark.parametrize(("speed", "gap"), one_in(2, [(0.0, 3), (0.0, 30), (1.2, 20), (1.2, 3)]))
-def test_the_largest_sideways_distance_of_a_link(speed, gap, others, least):
-    def paths(aside_m: float) -> dict[int, Path]:
-        out = {
-            k: line(20 * (k % 2), 12, (300.0 * (k // 2) + 14.4 * (k % 2), 40.0), (1.8, 0.0)) for k in range(2 * others)
-        }
-        out[90] = line(0, 15, (0.0, 0.0), (speed, 0.0))
-        out[91] = line(14 + gap, 15, (speed * 0.4 * (14 + gap), aside_m), (speed, 0.0))
-        return out
-
-    def ours(aside_m: float) -> bool:
-        out, _ = laid_out(paths(aside_m))
-        return link_tracks(TrackEnds.of(MODEL, out), 20.0, least)[-2] == 2 * others + 1
-
-    def reference(aside_m: float) -> bool:
-        return links(MOTION, paths(aside_m), 20.0, least).get(90) == 91
-
-    if reference(0.0):
-        compare(ours, reference, 0.0, 20.0)
-    else:
-        assert not ours(0.0)
 
 
 def feature(name: str, paths: dict[int, Path]) -> tuple[float, float]:
@@ -298,8 +274,11 @@ def test_the_input_id_0_counts_like_any_other():
 )
 def test_a_link_leads_forward_in_time_and_no_farther_than_its_limits(gap, aside_m, is_candidate):
     """Up to 20 s, which are 50 steps, and 1 m and 2.5 m for each second, which is 3 m in two steps."""
-    out, _ = laid_out({1: line(0, 15, (0, 0), (0, 0)), 2: line(14 + gap, 15, (0, aside_m), (0, 0))})
-    ends = TrackEnds.of(MODEL, out)
-    i, j = candidates(ends, 20.0)
-    assert list(zip(i.tolist(), j.tolist(), strict=True)) == [(0, 1)] * is_candidate
-    assert ends.gaps(i, j).seconds.tolist() == pytest.approx([0.4 * gap] * is_candidate)
+    states = State(np.array([[0, 0, 0, 0], [0, aside_m, 0, 0]], float), np.ones((2, 3)))
+    ends = TrackEnds(MODEL, np.array([0, 14 + gap]), np.array([14, 28 + gap]), states, states)
+    pairs = [
+        (i, j, gaps.seconds)
+        for first, second, gaps in pairs_in_reach(ends, 20.0)
+        for i, j in zip(first, second, strict=True)
+    ]
+    assert pairs == [(0, 1, pytest.approx([0.4 * gap]))] * is_candidate

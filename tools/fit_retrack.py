@@ -35,6 +35,7 @@ from reproduce import on_clock
 from mcaptrack import __version__
 from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.metrics import combine, score, summary
+from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.schema import Frame
@@ -43,7 +44,7 @@ from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offl
 from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.motion_model import Trajectories, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import Trajectories, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
 from mcaptrack.transforms.retrack.worlds import draw_worlds
 
@@ -183,8 +184,11 @@ def pairs_of(run: Run) -> Pairs:
     """The candidate links of a scene."""
     model, tracks, *_ = reached("hypotheses_of", FITTED, *run.args[1:])
     _, _, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-    sides = linking.TrackEnds.of(model, paths)
-    i, j = linking.candidates(sides, MAX_GAP_S)
+    first, last = paths.first[:-1], paths.first[1:] - 1
+    forward, backward = filtered(model, paths)
+    sides = linking.TrackEnds(model, paths.step[first], paths.step[last], taken(backward, first), taken(forward, last))
+    parts = [(i, j) for i, j, _ in linking.pairs_in_reach(sides, MAX_GAP_S)]
+    i, j = map(np.concatenate, zip(*parts, strict=True))
     gaps = sides.gaps(i, j)
     gap_s, found = gaps.seconds, linking.features(sides.model, gaps)
     owner = owners_of(run, paths)

@@ -169,31 +169,6 @@ def link_features(motion: Motion, before: State, after: State, gap_s: float) -> 
     ]  # fmt: skip
 
 
-def links(motion: Motion, paths: dict[int, Path], max_gap_s: float, least: float) -> dict[int, int]:
-    """For each linked track the track that continues it."""
-    from scipy.optimize import linear_sum_assignment
-
-    names = sorted(paths)
-    ends = {name: motion.filtered(paths[name])[max(paths[name])] for name in names}
-    begins = {name: motion.backwards(paths[name])[min(paths[name])] for name in names}
-    gains = np.zeros((len(names), len(names)))
-    for a, b in ((a, b) for a in names for b in names):
-        gap = min(paths[b]) - max(paths[a])
-        gap_s = gap * motion.step_s
-        apart = hypot(*(ends[a].mean[:, 0] - begins[b].mean[:, 0]))
-        if 0 < gap <= round(max_gap_s / motion.step_s) and apart <= 1 + REACH_M_PER_S * gap_s:
-            odds = np.dot(LINK_WEIGHTS, link_features(motion, ends[a], begins[b], gap_s)) + LINK_BIAS
-            gains[names.index(a), names.index(b)] = max(odds - LINK_LEAST, 0)
-    made = {
-        (i, j): gains[i, j] + LINK_LEAST for i, j in zip(*linear_sum_assignment(-gains), strict=True) if gains[i, j]
-    }
-    shift = 0.0
-    for _ in range(1000):  # the share of right links in this log
-        share = (sum(sigmoid(odds + shift) for odds in made.values()) + 0.3) / (len(made) + 3)
-        shift = log(share / (1 - share)) - log(LINK_USUAL / (1 - LINK_USUAL))
-    return {names[i]: names[j] for (i, j), odds in made.items() if sigmoid(odds + shift) > least}
-
-
 def gap_class(gap_s: float) -> int:
     """The class of a gap: the first one with a bound that isn't less."""
     return next(number for number, bound in enumerate(GAPS_S) if gap_s <= bound)

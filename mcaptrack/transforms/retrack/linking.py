@@ -1,8 +1,7 @@
-"""Tracklet linking: which track continues another one after a gap, decided over the whole log at once.
+"""Links: how well the motion before a gap and the motion after it fit together, and the best set of such links.
 
-A link is judged by how well the motion before a gap and the motion after it fit together: people walk on as they
-walked, or stay where they stood. Since links are scored pair by pair, the best set of them is one assignment of ends to
-beginnings.
+People walk on as they walked, or stay where they stood. Since links are scored pair by pair, the best set of them is
+one assignment of ends to beginnings. Online tracking links as it goes; offline these are terms of the hypotheses.
 
 Letters: K tracks, E candidate links, F features.
 """
@@ -17,8 +16,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
-from mcaptrack.transforms.retrack.appearance import Evidence
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, filtered
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State
 from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: A track that continues another begins no farther from its end than this, and so much more for each second between.
@@ -64,51 +62,10 @@ class TrackEnds(NamedTuple):
     begun: State
     ended: State
 
-    @classmethod
-    def of(cls, model: MotionModel, trajectories: Trajectories) -> TrackEnds:
-        """The ends of trajectories."""
-        forward, backward = filtered(model, trajectories)
-        first, last = trajectories.first[:-1], trajectories.first[1:] - 1
-        steps = trajectories.step[first], trajectories.step[last]
-        return cls(model, *steps, taken(backward, first), taken(forward, last))
-
     def gaps(self, i: Ints, j: Ints) -> Gaps:
         """The gaps (E,) from the ends of tracks ``i`` to the beginnings of tracks ``j``."""
         seconds = np.asarray((self.begins[j] - self.ends[i]) * self.model.step_s, np.float64)
         return Gaps(taken(self.ended, i), taken(self.begun, j), seconds)
-
-
-def link_tracks(
-    ends: TrackEnds,
-    max_gap_s: float,
-    min_confidence: float,
-    max_misfit: tuple[float, float] = (np.inf, 0.0),
-    evidence: Evidence | None = None,
-) -> Ints:
-    """For each track the one that continues it, or -1; (K,).
-
-    A link is made if it is right with a probability of at least ``min_confidence``. How many links are right at all
-    differs from log to log: hardly any where gaps are short and people who disappear have left, most where they are
-    occluded for long. That share is estimated from the links themselves (expectation maximisation). ``evidence`` is
-    what else tells whether both sides are one person.
-    """
-    continued_by = np.full(len(ends.begins), -1)
-    i, j = candidates(ends, max_gap_s)
-    gaps = ends.gaps(i, j)
-    if np.isfinite(max_misfit[0]):
-        fit = Fit.of(ends.model, gaps)
-        fits = np.minimum(fit.misfit, fit.stay) <= max_misfit[0] + max_misfit[1] * gaps.seconds
-        i, j, gaps = i[fits], j[fits], taken(gaps, fits)
-    if len(i) == 0:
-        return continued_by
-    gain = log_odds(features(ends.model, gaps))
-    if evidence is not None:
-        gain = gain + evidence(i, j)
-    links = best_links(i, j, gain, len(continued_by))
-    shift = prior_shift(gain[links])
-    links = links[gain[links] + shift > np.log(min_confidence / (1 - min_confidence))]
-    continued_by[i[links]] = j[links]
-    return continued_by
 
 
 def chains(continued_by: Ints, begins: Ints) -> Ints:
@@ -149,15 +106,8 @@ def assigned_links(ends: Ints, begins: Ints, gain: Floats, count: int) -> Ints:
     return np.flatnonzero(continued_by[ends] == begins)
 
 
-def candidates(ends: TrackEnds, max_gap_s: float) -> tuple[Ints, Ints]:
-    """Pairs (E,) of a track and a later one within reach of its end."""
-    none = np.empty(0, np.int64), np.empty(0, np.int64)
-    i, j = zip(none, *((i, j) for i, j, _ in pairs_in_reach(ends, max_gap_s)), strict=True)
-    return np.concatenate(i), np.concatenate(j)
-
-
 def pairs_in_reach(ends: TrackEnds, max_gap_s: float) -> Iterator[tuple[Ints, Ints, Gaps]]:
-    """The same (E,) some at a time, with the gaps between."""
+    """Pairs (E,) of a track and a later one within reach of its end, some at a time, with the gaps between."""
     order = np.argsort(ends.begins, kind="stable")
     begins = ends.begins[order]
     low = np.searchsorted(begins, ends.ends + 1)

@@ -29,7 +29,6 @@ from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSam
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
-from mcaptrack.transforms.retrack.linking import TrackEnds, chains, link_tracks
 from mcaptrack.transforms.retrack.motion_model import (
     MotionModel,
     State,
@@ -42,8 +41,6 @@ from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
 from mcaptrack.transforms.retrack.worlds import draw_worlds, world_rows
 
-#: Links of tracks in metres miss by at most so much, and so much more for each second of the gap.
-MAX_MISFIT: Final = (0.6, 0.2)
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
 #: The log odds of tracks that are too short are no larger.
@@ -478,7 +475,7 @@ def offline_tracks(
     seen = Appearance.of(options.looks, tracks, model.step_s)
     appearance = seen if seen and seen.calibration.tells_apart else None
     if options.link_s > 0 and len(tracks.step):
-        tracks = _linked(options, model, tracks, movers, appearance)
+        tracks = _linked(model, tracks, options.link_s / movers.unit_m, options.link_confidence, appearance)
     if options.resolve_swaps and len(tracks.step) and not movers.on_ground:
         tracks = _without_swaps(model, tracks, appearance)
     tracks = fix_tracks(tracks, options.fixed_ids)
@@ -594,20 +591,13 @@ def _without_swaps(model: MotionModel, tracks: Tracks, appearance: Appearance | 
 
 
 def _linked(
-    options: RetrackOptions, model: MotionModel, tracks: Tracks, movers: Movers, appearance: Appearance | None
+    model: MotionModel, tracks: Tracks, max_gap_s: float, min_confidence: float, appearance: Appearance | None
 ) -> Tracks:
-    """Decide about identities; tracks in metres, which a tracker made there, are only linked."""
-    most_s, least = options.link_s / movers.unit_m, options.link_confidence
-    if not movers.on_ground:
-        for _ in range(_SWEEPS):
-            hypotheses = hypotheses_of(model, tracks, most_s, appearance)
-            tracks = tracks._replace(track=hypotheses.scored().best(least))
-        return tracks
-    ids, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-    ends = TrackEnds.of(model, trajectories)
-    seen = None if appearance is None else appearance.between(tracks).of_tracks
-    root = chains(link_tracks(ends, most_s, least, MAX_MISFIT, seen), ends.begins)
-    return tracks._replace(track=np.asarray(ids[root][np.searchsorted(ids, tracks.track)]))
+    """Decide about identities."""
+    for _ in range(_SWEEPS):
+        hypotheses = hypotheses_of(model, tracks, max_gap_s, appearance)
+        tracks = tracks._replace(track=hypotheses.scored().best(min_confidence))
+    return tracks
 
 
 def hypotheses_of(model: MotionModel, tracks: Tracks, max_gap_s: float, appearance: Appearance | None) -> Hypotheses:
