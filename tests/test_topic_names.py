@@ -119,6 +119,15 @@ def test_the_end_of_a_topic_is_the_topic(template, tmp_path, end, work):
     assert out[0]
 
 
+@pytest.mark.parametrize(("end", "work"), [*FUNCTIONS.values(), *METHODS.values()], ids=[*FUNCTIONS, *METHODS])
+def test_a_topic_of_a_camera_that_is_not_there_is_refused(template, tmp_path, end, work):
+    path = Path(shutil.copy(template, tmp_path / "log.mcap"))
+    with pytest.raises(McaptrackError, match=f"/cmaera/{end}"):
+        work(path, f"/cmaera/{end}", tmp_path)
+    assert path.read_bytes() == template.read_bytes()
+    assert not (tmp_path / "copy.mcap").exists()
+
+
 def test_a_name_that_several_channels_end_with_is_refused_with_them():
     topics = ["/left/tracks", "/right/tracks", "/right/video", "odd"]
     assert find_topic("/left/tracks", topics, Path("a")) == find_topic("left/tracks", topics, Path("a"))

@@ -70,11 +70,13 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     Of several cameras the scene that they were fused to is taken, or the one called "camera", with a warning.
 
     Raises McaptrackError if the log has several cameras and none is named, or if the topic belongs to another camera
-    than the named one.
+    than the named one, or to none.
     """
     if topic:
         topic = opened.find(topic, "/" + name.strip("/") if name else "")
         prefix = _prefix_of_topic(opened, topic)
+        if topic not in opened.channels and not any(prefix in camera.names for camera in cameras(opened)):
+            opened.channel(topic)  # refuses it: of no camera of the log, so no stage makes it
         if name and "/" + name.strip("/") not in (prefix, *camera_at(opened, prefix).names):
             raise McaptrackError(
                 f"{opened.path}: {topic} belongs to the camera {prefix[1:]}, not to {name}; leave `camera=` out"
