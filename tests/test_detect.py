@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -13,8 +15,8 @@ from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
-from mcaptrack.sources.demo import SyntheticScene
-from mcaptrack.transforms import STAGES, KnnDetector
+from mcaptrack.sources.demo import SyntheticScene, pairs_scene
+from mcaptrack.transforms import STAGES, KnnDetector, MedianDetector
 from mcaptrack.transforms.detect.background import Registration, _BackgroundModel, _PersonHeight, clear_border, halve
 from tests.tiers import one_in
 from tests.worlds import ns, small_scene
@@ -275,3 +277,11 @@ def test_pictures_of_another_size_begin_another_view(name, stabilise):
     if name == "median":  # the others know the height of people by then, and have seen random numbers
         for late, frame in zip(both[len(wide) :], alone[1], strict=True):
             np.testing.assert_array_equal(columns_to_boxes(late.rows), columns_to_boxes(frame.rows))
+
+
+def test_leaves_that_sway_do_not_pass_for_people_far_away():
+    """A tree gives more outlines than three pairs who cross the square; of its height there are no people."""
+    scene = replace(pairs_scene(10), fps=5)
+    frames = [Frame(200_000_000 * number, number, shot.image) for number, shot in enumerate(scene.shots())]
+    bottom = np.concatenate([frame.rows["y_px"] + frame.rows["h_px"] for (frame,) in MedianDetector()(frames)])
+    assert (bottom < 100).sum() < 0.15 * len(bottom)

@@ -478,13 +478,21 @@ class _View:
         least_s = detector.history_s / 2 if self._blocks else min(_MIN_SPAN_S, detector.history_s / 2)
         if len(samples) < _MIN_PICTURES or self._last_ns - start_ns < seconds_to_ns(least_s):
             return  # the background before it holds on, if there is one
-        background = Background.of(samples, detector.threshold)
-        masks = [background.mask(image, detector.remove_shadows) for image in samples]
-        person_px, smaller_px = typical_heights(masks)
+        usual = Background.of(samples, detector.threshold)
+
+        def masks_of(background: Background) -> list[Image]:
+            return [background.mask(image, detector.remove_shadows) for image in samples]
+
+        person_px, _ = typical_heights(masks_of(usual))
+        background = usual.swaying(samples, person_px)
+        masks = masks_of(background)
+        # what sways has as much outline as people far away: only without it the outlines tell how tall these are
+        _, smaller_px = typical_heights(masks)
         is_apart = smaller_px * _APART < person_px
+        if is_apart:
+            background = usual.swaying(samples, smaller_px)
+            masks = masks_of(background)
         self._person_px = smaller_px if is_apart else person_px
-        background = background.swaying(samples, self._person_px)
-        masks = [background.mask(image, detector.remove_shadows) for image in samples]
         self._learner.add(masks, person_px, smaller_px if is_apart else None)
         self._blocks.append((start_ns, replace(background)))  # a copy without the ranges that were computed
 
