@@ -43,6 +43,8 @@ from mcaptrack.transforms.retrack.worlds import draw_worlds, world_rows
 
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
+#: Tracks with samples in a smaller share of their steps are as long as they were seen at once.
+_SPARSE: Final = 0.25
 #: The log odds of tracks that are too short are no larger.
 _SHORT: Final = -0.7
 #: Identities are decided so often, each time with the motion of the tracks that were decided before.
@@ -496,7 +498,7 @@ def offline_tracks(
     of_row = np.searchsorted(ids, rows.track)
     least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
     least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
-    is_short = np.bincount(of_row, minlength=len(ids)) < round(least_s * options.rate_hz) + 1
+    is_short = _are_short(of_row, rows.is_sample, len(ids), round(least_s * options.rate_hz) + 1)
     odds = np.where(is_short, np.minimum(odds, _SHORT), odds)
     keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short)
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
@@ -515,6 +517,19 @@ def offline_tracks(
     if (stored := options.stored_looks) is not None:
         looks = _looks(stored, taken(tracks, keeps[of] & (tracks.look >= 0)), times_ns)
     return Offline(by_step, decisions, looks, worlds, seen and seen.calibration)
+
+
+def _are_short(of_row: Ints, is_sample: Bools, count: int, least: int) -> Bools:
+    """Which of so many tracks have fewer than ``least`` rows (R,); in a row, if they were hardly seen in between.
+
+    What flickers at one place, as leaves do, is joined to long tracks with a sample now and then.
+    """
+    length, seen = np.bincount(of_row, minlength=count), np.bincount(of_row[is_sample], minlength=count)
+    starts = np.flatnonzero(run_starts(of_row, is_sample))
+    lasts = np.where(is_sample[starts], np.diff(np.append(starts, len(of_row))), 0)
+    longest = np.zeros(count, np.int64)
+    np.maximum.at(longest, of_row[starts], lasts)
+    return np.asarray(np.where(seen < _SPARSE * length, longest, length) < least)
 
 
 def _looks(stored: Descriptors, kept: Tracks, times_ns: Ints) -> Iterator[Rows]:
