@@ -1,7 +1,7 @@
 """Compare trackers without ground truth: differences of their IDF1 against offline re-tracking of the same log.
 
 Re-tracking is wrong, too: it misses whom its tracker missed, and shares errors with it. So levels say nothing, and only
-differences are given, as better or worse where they were right on labelled scenes (``tools/fit_against.py``):
+differences are given, as better or worse where they were right on labelled scenes (``tools/without_truth.py``):
 where they are large, whichever way rows that the reference doesn't have are counted, and with other people, too.
 """
 
@@ -148,11 +148,12 @@ def differences(logs: Sequence[Candidates]) -> list[Difference]:
             f"there are no two channels of tracks to compare ({', '.join(names) or 'none'}); name those that all logs "
             "have with `topic=`, or bring in another tracker's as `log.write` does"
         )
+    return [compare(before, after, logs) for before, after in combinations(names, 2)]
+
+
+def compare(before: str, after: str, logs: Sequence[Candidates]) -> Difference:
+    """Compare two channels, over all logs together."""
     related = {name: how for candidates in logs for name, how in candidates.related.items()}
-    return [_difference(before, after, logs, related) for before, after in combinations(names, 2)]
-
-
-def _difference(before: str, after: str, logs: Sequence[Candidates], related: Mapping[str, str]) -> Difference:
     sides = [[candidates.scores[name] for candidates in logs] for name in (before, after)]
     by_people = intervals(*sides)
     nan = float("nan")

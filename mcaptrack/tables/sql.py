@@ -77,7 +77,7 @@ select s.* exclude (next_ns, dx, dy)
 from steps s join frames f on (f.recording, f.topic) = (s.recording, s.topic) and f.t_ns > s.t_ns and f.t_ns < next_ns
 """
 #: Intervals from worlds are wider by this share of the median on both sides, because worlds lack rows that no detector
-#: gave: so they hold in nine of ten drawn scenes (``tools/cover_worlds.py``).
+#: gave: so they hold in nine of ten drawn scenes (``tools/without_truth.py``).
 WIDER: Final = 0.12
 _MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
 
@@ -275,7 +275,7 @@ class Database:
             low, high = f"{low} - {WIDER} * abs({middle})", f"{high} + {WIDER} * abs({middle})"
             low = f"if({least} < 0, {low}, greatest({low}, 0))"
             if counted:
-                low, high = f"ceil({low})::bigint", f"floor({high})::bigint"
+                low, high = f"floor({low})::bigint", f"ceil({high})::bigint"
             if counted and [pc.sum(answer[name]).as_py() or 0 for answer in answers] == list(people):
                 notices.warn(
                     f"{name}: the number of people has no interval; worlds hold it too seldom, because they lack "
