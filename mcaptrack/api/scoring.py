@@ -523,7 +523,7 @@ def _from_files(
     sequences = []
     for name, path, truth in pairs:
         both = compare_files(path, truth, how, topics)
-        if repeats(both.ground_truth, both.tracks):
+        if holds_tables(truth) and repeats(both.ground_truth, both.tracks):
             raise McaptrackError(
                 f"{truth} has the tracks of {path}, row by row, so scores would say nothing; give ground truth, or "
                 f"compare trackers in a log without it ({call('evaluate', 'LOG', against='/camera/retracks/full')})"
