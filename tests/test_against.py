@@ -95,7 +95,7 @@ def test_the_sign_is_that_of_the_truth(compared):
 @pytest.mark.parametrize("trick", TRICKS)
 def test_no_trick_makes_a_tracker_better(compared, trick):
     row = difference(compared, "good", trick)
-    # Rows that the reference lacks may be of people whom it misses.
+    # Rows that the reference lacks may be of people that it misses.
     assert row.verdict == ("undecided" if trick == "twice" else "worse"), row
 
 

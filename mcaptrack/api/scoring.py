@@ -402,16 +402,11 @@ def evaluate(
         frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
     )  # fmt: skip
     paths = locations_of(tracks)
+    if against is not None:
+        chosen = {"similarity": similarity is not None, "gate_m": gates != DEFAULT_GATES_M, "smoothed": smoothed}
+        chosen |= {"min_iou": min_iou != IOU_THRESHOLD, "rules": rules != "trackeval"}
+        return _differences(paths, camera, topics, (against, truth), how, chosen, progress)
     with collected() as warnings:
-        if against is not None:
-            if truth is not None:
-                raise McaptrackError("`against=` compares without ground truth; leave `truth=` out")
-            reason = "without ground truth trackers are compared by IDF1 and distance on the ground, at one gate"
-            warn_unused(reason, similarity=similarity is not None, gate_m=gates != DEFAULT_GATES_M)
-            warn_unused(reason, min_iou=min_iou != IOU_THRESHOLD, rules=rules != "trackeval", smoothed=smoothed)
-            labels.warn_of_unused(how, "there are no labels", "classes")
-            compared = _against(paths, camera, topics, against, progress)
-            return Scores((), (), tuple(dict.fromkeys(warnings)), against=against, differences=tuple(compared))
         if truth is None:
             sequences = _from_logs(paths, camera, topics, smoothed)
         else:
@@ -471,17 +466,30 @@ def _from_logs(
     return sequences
 
 
-def _against(
-    paths: Sequence[Location], camera: str | None, topics: tuple[str, ...], against: str, progress: Progress
-) -> list[Difference]:
-    """Compare the channels of tracks of logs by one of them."""
+def _differences(
+    paths: Sequence[Location],
+    camera: str | None,
+    topics: tuple[str, ...],
+    references: tuple[str, Any],
+    how: IngestOptions,
+    chosen: Mapping[str, bool],
+    progress: Progress,
+) -> Scores:
+    """Compare the channels of tracks of logs by one of them; ``chosen`` says which options of scores were given."""
+    against, truth = references
+    if truth is not None:
+        raise McaptrackError("`against=` compares without ground truth; leave `truth=` out")
     members = []
-    for number, path in enumerate(paths):
-        progress("evaluate", number, len(paths))
-        with logs.read(path) as opened:
-            members.append(candidates_of_log(opened, pipeline.find_camera(opened, camera), against, topics))
-    progress("evaluate", len(paths), len(paths))
-    return differences(members)
+    with collected() as warnings:
+        warn_unused("without ground truth trackers are compared by IDF1 and distance, at one gate", **chosen)
+        labels.warn_of_unused(how, "there are no labels", "classes")
+        for number, path in enumerate(paths):
+            progress("evaluate", number, len(paths))
+            with logs.read(path) as opened:
+                members.append(candidates_of_log(opened, pipeline.find_camera(opened, camera), against, topics))
+        progress("evaluate", len(paths), len(paths))
+        compared = tuple(differences(members))
+    return Scores((), (), tuple(dict.fromkeys(warnings)), against=against, differences=compared)
 
 
 def _refuse_own(opened: logs.Log, prefix: str, ground_truth: Sequence[Frame]) -> None:

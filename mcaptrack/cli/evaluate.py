@@ -69,18 +69,7 @@ class Evaluate(Once["Scores"]):
             bool, Option(SCORES, flag="all", help="Print the scores at all gates, and all columns of forecasts.")
         ] = False
 
-    most_used = (
-        "truth",
-        "against",
-        "topic",
-        "all_gates",
-        "similarity",
-        "gate_m",
-        "fail_under",
-        "csv",
-        "output",
-        "force",
-    )
+    most_used = ("truth", "against", "topic", "all_gates", "similarity", "gate_m", "fail_under", "output", "force")
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)

@@ -1,8 +1,8 @@
 """Compare trackers without ground truth: differences of their IDF1 against offline re-tracking of the same log.
 
-Re-tracking is wrong, too: it misses whom its tracker missed, and shares errors with it. So levels say nothing, and only
-differences are given, as better or worse where they were right on labelled scenes (``tools/without_truth.py``):
-where they are large, whichever way rows that the reference doesn't have are counted, and with other people, too.
+Re-tracking is wrong, too: it misses people that its tracker missed, and shares errors with it. So levels say nothing.
+Differences are called better or worse where they were right on drawn scenes (``tools/without_truth.py``): where they
+are large, also without the rows that the reference lacks, and have the same sign with other people.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _COPIED: Final = 0.99
 
 
 class Difference(NamedTuple):
-    """How one channel of tracks differs from another, by a reference that is no ground truth.
+    """The difference of one channel of tracks from another, by a reference that is no ground truth.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ def candidates_of_log(opened: log.Log, prefix: str, against: str, topics: Sequen
 
 
 def _relation(opened: log.Log, topic: str, reference: str) -> str:
-    """How a channel and the reference come from the same tracks, of one tracker; "" if they don't."""
+    """The tracks that a channel and the reference both come from, as a reason; "" if there are none."""
     own, other = (
         [name for name, _ in lineage(opened, end) if name in opened.channels and opened.channels[name].holds(TRACKS)]
         for end in (topic, reference)
@@ -160,7 +160,7 @@ def compare(before: str, after: str, logs: Sequence[Candidates]) -> Difference:
     if by_people is None:
         return Difference(before, after, "undecided", nan, nan, nan, "they have rows at different times")
     value, low, high = change = by_people.idf1_change
-    # A row that the reference doesn't have is a false one, or of a person whom it misses.
+    # A row that the reference doesn't have is a false one, or of a person that it misses.
     forgiving = float(np.subtract(*(_idf1_of_matched(side) for side in reversed(sides))))
     sign = 1 if value > 0 else -1
     winner = after if sign > 0 else before

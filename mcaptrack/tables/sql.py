@@ -279,7 +279,7 @@ class Database:
             if counted and [pc.sum(answer[name]).as_py() or 0 for answer in answers] == list(people):
                 notices.warn(
                     f"{name}: the number of people has no interval; worlds hold it too seldom, because they lack "
-                    "people whom no detector saw, and take those who come back late for others", "not-compared"
+                    "people that no detector saw, and take those who come back late for others", "not-compared"
                 )  # fmt: skip
                 low = high = "null"
             columns += [f"{middle} as {column}"]
