@@ -66,15 +66,17 @@ seen as (
     left join all_tracks r on (r.recording, r.topic, r.source_id, r.t_ns)
                               = (part.recording, part.topic, part.source_id, s.t_ns)),
 steps as (
-    select *, lead(t_ns) over track as next_ns, lead(x_m) over track - x_m as dx, lead(y_m) over track - y_m as dy
-    from seen window track as (partition by world, recording, topic, track_id order by t_ns))
-select * exclude (next_ns, dx, dy) from steps
+    select *, lead(frame) over track as next, lead(t_ns) over track - t_ns as dt, lead(x_m) over track - x_m as dx,
+           lead(y_m) over track - y_m as dy
+    from seen window track as (partition by world, recording, topic, track_id order by t_ns)),
+gaps as (select *, unnest(range(frame + 1, next)) as gap from steps where next > frame + 1)
+select * exclude (next, dt, dx, dy) from steps
 union all
-select s.* exclude (next_ns, dx, dy)
+select g.* exclude (next, dt, dx, dy, gap)
        replace (f.frame as frame, f.t as t, f.t_ns as t_ns, false as observed, -1 as source_id,
-                x_m + dx * (f.t_ns - s.t_ns) / (next_ns - s.t_ns) as x_m,
-                y_m + dy * (f.t_ns - s.t_ns) / (next_ns - s.t_ns) as y_m)
-from steps s join frames f on (f.recording, f.topic) = (s.recording, s.topic) and f.t_ns > s.t_ns and f.t_ns < next_ns
+                null as x_px, null as y_px, null as w_px, null as h_px, null as score,
+                x_m + dx * (f.t_ns - g.t_ns) / dt as x_m, y_m + dy * (f.t_ns - g.t_ns) / dt as y_m)
+from gaps g join frames f on (f.recording, f.topic, f.frame) = (g.recording, g.topic, g.gap)
 """
 #: Intervals from worlds are wider by this share of the median on both sides, because worlds lack rows that no detector
 #: gave: so they hold in nine of ten drawn scenes (``tools/without_truth.py``).
