@@ -261,10 +261,11 @@ class Database:
         is_number = {f.name: pa.types.is_integer(f.type) or pa.types.is_floating(f.type) for f in schema}
         keys = [_quoted(name) for name in schema.names if not is_number[name]]
         whole = pa.concat_tables(
-            [answer.append_column("world_", pa.array([n] * len(answer))) for n, answer in enumerate(answers)]
+            [answer.append_column("world of answer", pa.array([n] * len(answer))) for n, answer in enumerate(answers)]
         )
         rows = self._connection.from_arrow(whole)
-        if rows.aggregate("count(*) as rows", ", ".join(["world_", *keys])).filter("rows > 1").fetchall():
+        repeated = rows.aggregate('count(*) as "rows of world"', ", ".join(['"world of answer"', *keys]))
+        if repeated.filter('"rows of world" > 1').fetchall():
             raise McaptrackError(
                 "worlds have several rows with the same texts and times, so that their numbers can't be put together; "
                 "name each row by a text, as in `track_id::text`, or ask for one row"
@@ -287,7 +288,7 @@ class Database:
             columns += [f"{middle} as {column}"]
             columns += [f"{low} as {_quoted(name + '_from')}", f"{high} as {_quoted(name + '_to')}"]
         over_all = rows.aggregate(", ".join([*columns, "count(*) as worlds"]), ", ".join(keys))
-        return (over_all.order(", ".join(keys)) if keys else over_all).to_arrow_table()
+        return (over_all.order(", ".join(keys)) if keys else over_all.limit(len(whole))).to_arrow_table()
 
     def _run(self, statement: Any) -> Any:
         """The answer of a statement, Arrow or None; loads the tables that it names, and those that DuckDB then
