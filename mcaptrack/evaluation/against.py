@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Final, Literal, NamedTuple
 
-import numpy as np
-
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M, align, are_3d, compare_rows, has_positions
@@ -161,7 +159,7 @@ def compare(before: str, after: str, logs: Sequence[Candidates]) -> Difference:
         return Difference(before, after, "undecided", nan, nan, nan, "they have rows at different times")
     value, low, high = change = by_people.idf1_change
     # A row that the reference doesn't have is a false one, or of a person that it misses.
-    forgiving = float(np.subtract(*(_idf1_of_matched(side) for side in reversed(sides))))
+    forgiving = _idf1_of_matched(sides[1]) - _idf1_of_matched(sides[0])
     sign = 1 if value > 0 else -1
     winner = after if sign > 0 else before
     reasons = {
