@@ -72,7 +72,8 @@ def candidates_of_log(opened: log.Log, prefix: str, against: str, topics: Sequen
     path, how = opened.path, provenance_of(opened, reference)
     opened.channel(reference)
     stage = STAGES.get(how.transform) if how is not None else None
-    if how is None or stage is None or not stage.repairs_tracks or reference.endswith("/online"):
+    is_offline = stage is not None and stage.repairs_tracks and not reference.endswith("/online")
+    if how is None or not is_offline or how.parameters.get("retracker", "likelihood") != "likelihood":
         raise McaptrackError(
             f"{path}: {reference} can't be a reference: offline re-tracking did not make it "
             f"({call('retrack', path)} makes /camera/retracks/full)"
