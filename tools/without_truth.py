@@ -100,17 +100,17 @@ def questions(low: Rows, size: Rows) -> dict[str, str]:
         for p in places
     )
     return {
-        "people": "select count(distinct track_id) as n from tracks",
-        "visitors of A": f"select count(distinct track_id) as n from tracks where {a}",
-        "visitors of B": f"select count(distinct track_id) as n from tracks where {b}",
-        "A -> B": f"select count(*) as n from (select min(t_ns) filter ({a}) as a, max(t_ns) filter ({b}) as b "
+        "people": "select count(distinct track_id) from tracks",
+        "visitors of A": f"select count(distinct track_id) from tracks where {a}",
+        "visitors of B": f"select count(distinct track_id) from tracks where {b}",
+        "A -> B": f"select count(*) from (select min(t_ns) filter ({a}) as a, max(t_ns) filter ({b}) as b "
         "from tracks group by track_id) where a < b",
-        "dwell in A": f"select count(*) * {STEP_S} / count(distinct track_id) as n from tracks where {a}",
+        "dwell in A": f"select count(*) * {STEP_S} / count(distinct track_id) from tracks where {a}",
     }
 
 
-def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, dict[str, float]]]:
-    """What was asked, the true answer, and that of worlds."""
+def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, list[float]]]:
+    """What was asked, the true answer, and that of worlds: from, median, to."""
     for seed in seeds:
         for number, truth in enumerate(scenes(seed, STEPS, count)):
             rng = np.random.default_rng([seed, number, 8])
@@ -121,19 +121,19 @@ def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, dict[str
                         log.write("/camera/tracks", [frame for frame in frames(rows) if len(frame.rows)])
                 mcaptrack.retrack(Path(folder, "scene.mcap"), worlds=50)
                 low = truth[:, 2:].min(axis=0)
-                for name, query in questions(low, truth[:, 2:].max(axis=0) - low).items():
-                    (true,) = mcaptrack.query(Path(folder, "true.mcap"), query).to_pylist()
-                    (row,) = mcaptrack.query(Path(folder, "scene.mcap"), query, worlds=True).to_pylist()
-                    yield name, true["n"], row
+                asked = questions(low, truth[:, 2:].max(axis=0) - low)
+                query = "select " + ", ".join(f'({part}) as "{name}"' for name, part in asked.items())
+                (true,) = mcaptrack.query(Path(folder, "true.mcap"), query).to_pylist()
+                (found,) = mcaptrack.query(Path(folder, "scene.mcap"), query, worlds=True).to_pylist()
+                for name in asked:
+                    yield name, true[name], [found[name + end] for end in ("_from", "", "_to")]
 
 
 def worlds(seeds: list[int], count: int) -> None:
     table = defaultdict(list)
-    for name, true, row in answers(seeds, count):
-        if true and row["n_from"] is not None:
-            table[name].append(
-                (row["n_from"] <= true <= row["n_to"], (row["n_to"] - row["n_from"]) / true, row["n"] / true)
-            )
+    for name, true, (low, middle, high) in answers(seeds, count):
+        if true and low is not None:
+            table[name].append((low <= true <= high, (high - low) / true, middle / true))
     for name, rows in table.items():
         held, wide, middle = np.mean(rows, axis=0)
         print(f"{name:16} {len(rows):4} scenes, held {held:.2f}, width {wide:.2f}, median {middle:.2f} of the truth")

@@ -78,6 +78,11 @@ select g.* exclude (next, dt, dx, dy, gap)
                 x_m + dx * (f.t_ns - g.t_ns) / dt as x_m, y_m + dy * (f.t_ns - g.t_ns) / dt as y_m)
 from gaps g join frames f on (f.recording, f.topic, f.frame) = (g.recording, g.topic, g.gap)
 """
+_TRACKS_OF_WORLD: Final = """
+create or replace temp table tracks as
+select * exclude (world) from world_tracks where world = ? order by recording, topic, track_id, t_ns
+"""
+_PEOPLE: Final = "select count(distinct (recording, topic, track_id)) from tracks"
 #: Intervals from worlds are wider by this share of the median on both sides, because worlds lack rows that no detector
 #: gave: so they hold in nine of ten drawn scenes (``tools/without_truth.py``).
 WIDER: Final = 0.12
@@ -246,10 +251,9 @@ class Database:
         self._connection.unregister("tracks")
         answers, people = [], []
         for world in range(1, min(counts.values()) + 1):
-            here = self._connection.view("world_tracks").filter(f"world = {world}").project("* exclude (world)")
-            here.create_view("tracks", replace=True)
+            self._connection.execute(_TRACKS_OF_WORLD, [world])
             answers.append(tables.tidy(self._run(self._connection.extract_statements(query)[0])))
-            people += here.aggregate("count(distinct (recording, topic, track_id))").fetchall()[0]
+            people += self._connection.sql(_PEOPLE).fetchall()[0]
         return self._over_worlds(answers, people)
 
     def _over_worlds(self, answers: Sequence[Any], people: Sequence[int]) -> Any:
