@@ -236,6 +236,7 @@ def test_rows_are_told_apart_by_texts_and_counts_of_missing_rows_are_none(drawn)
     for row in rows:
         many = [found["n"] for found in per_world if str(found["track_id"]) == row["track"]]
         assert (row["worlds"], row["n"]) == (len(many), np.median(many + [0] * (9 - len(many))))
+        assert 0 <= row["n_from"] <= row["n"] <= row["n_to"]
 
 
 def test_the_number_of_people_has_no_interval(drawn):
