@@ -499,7 +499,7 @@ def _refuse_own(opened: logs.Log, prefix: str, ground_truth: Sequence[Frame]) ->
         if topic in opened.channels and repeats(ground_truth, opened.frames(topic, TRACKS)):
             raise McaptrackError(
                 f"{opened.path}: the ground truth is {topic} itself, row by row, so scores would say nothing; "
-                f"{call('evaluate', opened.path, against=topic)} compares other trackers by it"
+                "`against=` compares other trackers by it"
             )
 
 
@@ -534,7 +534,7 @@ def _from_files(
         if holds_tables(truth) and repeats(both.ground_truth, both.tracks):
             raise McaptrackError(
                 f"{truth} has the tracks of {path}, row by row, so scores would say nothing; give ground truth, or "
-                f"compare trackers in a log without it ({call('evaluate', 'LOG', against='/camera/retracks/full')})"
+                "compare trackers in a log without it (`against=`)"
             )
         for note in both.notes:
             notes.say(note)

@@ -12,7 +12,7 @@ from itertools import combinations
 from typing import Final, Literal, NamedTuple
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M, align, are_3d, compare_rows, has_positions
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.evaluation.people import LEAST_PEOPLE, PersonScores, intervals, person_scores
@@ -75,8 +75,8 @@ def candidates_of_log(opened: log.Log, prefix: str, against: str, topics: Sequen
     is_offline = stage is not None and stage.repairs_tracks and not reference.endswith("/online")
     if how is None or not is_offline or how.parameters.get("retracker", "likelihood") != "likelihood":
         raise McaptrackError(
-            f"{path}: {reference} can't be a reference: offline re-tracking did not make it "
-            f"({call('retrack', path)} makes /camera/retracks/full)"
+            f"{path}: {reference} can't be a reference, because offline re-tracking did not make it; "
+            "/camera/retracks/full is one"
         )
     planes = [plane for _, plane in how.parameters.get("ground_planes") or ()]
     frames = opened.frames(reference, TRACKS)
