@@ -321,7 +321,7 @@ def test_text_is_printed_without_what_a_terminal_acts_on():
 
 def test_a_terminal_shows_sixty_rows_of_an_answer_and_a_pipe_all(folder, monkeypatch, terminal):
     answer = pa.table({"n": pa.array(range(61), pa.int64()), "word": ["a\x1b[31m"] * 61})
-    monkeypatch.setattr(mcaptrack, "query", lambda log, sql, files: answer)
+    monkeypatch.setattr(mcaptrack, "query", lambda log, sql, **_: answer)
 
     def on_screen(*words: str) -> str:
         screen = Terminal()

@@ -249,6 +249,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "evaluate", "tracks.csv", "--truth", "truth.txt"
     ),
     "tables/sql.py:_answer:list_tables": lambda s: s.says("query", "LOG", "show tables"),
+    "tables/sql.py:_worlds_answer:retrack": lambda s: s.says("query", "LOG", "--worlds", "select count(*) from tracks"),
     "sources/ingest/job.py:read:ingest": lambda s: (
         s.without("/camera/truth*").cubes().says("ingest", "clip.mp4", "--truth", "cubes.csv")
     ),

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from itertools import pairwise
 from pathlib import Path
 
-import duckdb
 import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+import mcaptrack
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
-from mcaptrack.schema import WORLDS, Frame
+from mcaptrack.schema import TRACKS, WORLDS, Frame
+from mcaptrack.tables.sql import WIDER
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import offline, worlds
 from tests.commands import done
-from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks
+from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks, write_channels
 
 QUICK = [Phase.explicit, Phase.generate]
 SEEDS = st.integers(0, 2**32 - 1)
@@ -155,17 +156,111 @@ def test_where_tracks_are_linked_in_the_picture_there_are_no_worlds_and_it_says_
     assert [warning.code for warning in warnings] == ["option-not-used"]
 
 
-def test_the_documented_query_counts_people_by_world(template, tmp_path, monkeypatch):
+def test_retracking_without_the_option_removes_worlds(template, tmp_path):
     there = Path(shutil.copyfile(template, tmp_path / "log.mcap"))
     done("retrack", there, "--worlds", "7", "-q")
-    done("export", there, "-q")
-    with log.Log(there) as opened:
-        rows = opened.frame_columns("/camera/retracks/worlds", WORLDS).rows()
-    many = [len(set(rows["track_id"][(rows["world"] == world) & rows["kept"]].tolist())) for world in range(1, 8)]
-    page = (Path(__file__).parent.parent / "docs" / "results.md").read_text(encoding="utf-8")
-    (query,) = re.findall(r"```sql\n(with people.*?)```", page, re.S)
-    monkeypatch.chdir(tmp_path)
-    assert duckdb.sql(query).fetchall() == [tuple(np.percentile(many, [50, 5, 95]))]
     done("retrack", there, "-q")
     with log.Log(there) as opened:
         assert "/camera/retracks/worlds" not in opened.channels
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory) -> Path:
+    """A log of walkers with nine worlds."""
+    path = tmp_path_factory.mktemp("worlds") / "log.mcap"
+    write_channels(path, samples=noisy_tracks(np.random.default_rng(5), people=8, ticks=80, hidden=0.03))
+    done("retrack", path, "--worlds", "9", "-q")
+    return path
+
+
+def visitors(path: Path) -> list[int]:
+    """The tracks with an observed sample to the right of x = 0 in each world, from the rows of worlds and samples."""
+    with log.Log(path) as opened:
+        parts = [(frame.t_ns, row) for frame in opened.frames("/camera/retracks/worlds", WORLDS) for row in frame.rows]
+        samples = [(f.t_ns, row) for f in opened.frames("/camera/samples", TRACKS) for row in f.rows if row["observed"]]
+        smooth = {
+            (frame.t_ns, row["source_id"]): row["x_m"]
+            for frame in opened.frames("/camera/retracks", TRACKS)
+            for row in frame.rows
+        }
+    out = []
+    for world in range(1, 10):
+        tracks = set()
+        for begin_ns, part in parts:
+            end_ns = begin_ns + part["duration_s"] * 1e9 + 1000
+            if part["world"] == world and part["kept"]:
+                tracks |= {
+                    int(part["track_id"])
+                    for t_ns, row in samples
+                    if row["track_id"] == part["source_id"] and begin_ns <= t_ns <= end_ns
+                    and smooth.get((t_ns, row["track_id"]), row["x_m"]) > 0
+                }  # fmt: skip
+        out.append(len(tracks))
+    return out
+
+
+def test_a_number_has_its_median_and_an_interval_around_those_of_the_worlds(drawn):
+    many = visitors(drawn)
+    query = "select count(distinct track_id) as n, avg(x_m) as x from tracks where observed and x_m > 0"
+    (row,) = mcaptrack.query(drawn, query, worlds=True).to_pylist()
+    (again,) = mcaptrack.query(drawn, query, worlds=True).to_pylist()
+    low, middle, high = np.percentile(many, [5, 50, 95])
+    assert len(set(many)) > 1
+    assert (row, row["n"], row["worlds"]) == (again, middle, 9)
+    assert max(low - WIDER * middle, 0) - 1 < row["n_from"] <= low <= high <= row["n_to"] < high + WIDER * middle + 1
+    assert row["x_from"] < row["x"] < row["x_to"]
+    grouped = mcaptrack.query(
+        drawn, "select count(distinct track_id) as n from world_tracks where observed and x_m > 0 group by world"
+    )
+    assert sorted(grouped.column("n").to_pylist()) == sorted(many)
+
+
+def test_gaps_of_a_track_are_filled_straight_and_no_track_is_at_two_places_at_once(drawn):
+    rows = mcaptrack.query(drawn, "from world_tracks order by world, track_id, t_ns").to_pylist()
+    for one, row, other in zip(rows, rows[1:], rows[2:], strict=False):
+        ends = (one, row, other)
+        if len({(end["world"], end["track_id"]) for end in ends}) == 1:
+            assert one["t_ns"] < row["t_ns"]
+            if not row["observed"]:
+                times, places = [end["t_ns"] for end in ends], [end["x_m"] for end in ends]
+                assert row["x_m"] == pytest.approx(np.interp(times[1], times[::2], places[::2]))
+    assert any(not row["observed"] for row in rows)
+
+
+def test_rows_are_told_apart_by_texts_and_counts_of_missing_rows_are_none(drawn):
+    query = "select track_id::text as track, count(*) as n from tracks group by all"
+    rows = mcaptrack.query(drawn, query, worlds=True).to_pylist()
+    per_world = mcaptrack.query(
+        drawn, "select world, track_id, count(*) as n from world_tracks group by all"
+    ).to_pylist()
+    for row in rows:
+        many = [found["n"] for found in per_world if str(found["track_id"]) == row["track"]]
+        assert (row["worlds"], row["n"]) == (len(many), np.median(many + [0] * (9 - len(many))))
+        assert 0 <= row["n_from"] <= row["n"] <= row["n_to"]
+
+
+def test_the_number_of_people_has_no_interval(drawn):
+    with collected() as warnings:
+        (row,) = mcaptrack.query(drawn, "select count(distinct track_id) as n from tracks", worlds=True).to_pylist()
+    assert (row["n_from"], row["n_to"], row["n"] > 0) == (None, None, True)
+    assert ["no interval" in warning.message for warning in warnings] == [True]
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("select count(*) from zone_visits", "not zone_visits"),
+        ("select 1 as n", "nothing else"),
+        ("select count(*) from tracks where topic = '/camera/samples'", "not /camera/samples"),
+        ("create table a as from tracks; select count(*) from a", "one SELECT"),
+        ("select track_id from tracks", "same texts"),
+    ],
+)
+def test_what_worlds_do_not_change_is_refused(drawn, query, message):
+    with pytest.raises(McaptrackError, match=message):
+        mcaptrack.query(drawn, query, worlds=True)
+
+
+def test_logs_without_worlds_are_refused(template):
+    with pytest.raises(McaptrackError, match="has no worlds"):
+        mcaptrack.query(template, "select count(*) as n from tracks", worlds=True)

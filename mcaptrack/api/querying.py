@@ -45,6 +45,7 @@ def query(
     files: Annotated[
         Mapping[str, PathLike] | None, Option(QUERY, flag="with", metavar="NAME=FILE", shown=False)
     ] = None,
+    worlds: Annotated[bool, Option(QUERY)] = False,
 ) -> pa.Table:
     """Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.
 
@@ -61,11 +62,14 @@ def query(
         The query.
     files : mapping of str to path, optional
         A CSV, JSON or Parquet file as one more table.
+    worlds : bool, default False
+        Ask `tracks` in each world of `retrack --worlds`: median and 90 % interval of each number.
 
     Returns
     -------
     pyarrow.Table
-        The answer; times are UTC.
+        The answer; times are UTC. With ``worlds``, each number ``n`` is a median, with the interval in ``n_from`` and
+        ``n_to``; rows are told apart by their texts and times.
 
     Raises
     ------
@@ -89,7 +93,7 @@ def query(
 
     named = {name: as_path(path) for name, path in (files or {}).items()}
     with Database(locations_of(log), named) as database:
-        answer = database.ask(sql)
+        answer = database.ask_worlds(sql) if worlds else database.ask(sql)
         for note in database.notes:
             detail(note)
     return answer

@@ -24,6 +24,7 @@ from mcaptrack.api.options import (
     MinIou,
     PathLike,
     PointOfBox,
+    Progress,
     Reports,
     gate_m,
     no_progress,
@@ -34,6 +35,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation import (
     COMBINED,
     DEFAULT_GATES_M,
+    FULL,
     Candidate,
     EvaluateOptions,
     EvaluationInput,
@@ -43,6 +45,7 @@ from mcaptrack.evaluation import (
     sequence_of_log,
 )
 from mcaptrack.evaluation import evaluate as score_sequences
+from mcaptrack.evaluation.against import Difference, candidates_of_log, differences, repeats
 from mcaptrack.evaluation.aligned import IOU_THRESHOLD
 from mcaptrack.evaluation.forecasts import smoothed_predictions
 from mcaptrack.evaluation.metrics import Rules
@@ -51,7 +54,7 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.location import Location, distinct_names
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline.rebuild import rebuild
-from mcaptrack.schema import TRACKS
+from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at, provenance_of
@@ -91,6 +94,10 @@ class Scores:
         score.
     warnings : tuple of mcaptrack.Notice
         What was assumed, and what could not be compared.
+    against : str
+        The channel that tracks were compared with in place of ground truth; "" if there is ground truth.
+    differences : tuple of mcaptrack.evaluation.against.Difference
+        How the channels differ by it, each two of them; there are no ``results`` then.
 
     """
 
@@ -98,8 +105,12 @@ class Scores:
     notes: tuple[str, ...]
     warnings: tuple[Notice, ...]
     labelled: Mapping[str, Labelled] = field(default_factory=dict)
+    against: str = ""
+    differences: tuple[Difference, ...] = ()
 
     def __repr__(self) -> str:
+        if self.against:
+            return f"Scores(no ground truth; `differences` has {len(self.differences)})"
         return f"Scores({len(self.results)} results; `rows` returns them)"
 
     def _repr_html_(self) -> str:
@@ -200,7 +211,7 @@ class Scores:
         Raises
         ------
         McaptrackError
-            If no such class was scored.
+            If no such class was scored, or if there is no ground truth.
 
         Examples
         --------
@@ -210,6 +221,8 @@ class Scores:
         True
 
         """
+        if self.against:
+            raise McaptrackError(f"there is no ground truth, only {self.against}: there are differences, and no scores")
         rows = [row for row in self.rows() if row["class"] == of_class]
         if not rows and of_class is not None:
             scored = ", ".join(dict.fromkeys(result.of_class for result in self.results if result.of_class is not None))
@@ -307,6 +320,7 @@ def evaluate(
     ],
     *,
     truth: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, shown=False)] = None,
+    against: Annotated[str | None, Option(SCORES, metavar="TOPIC", shown=False)] = None,
     similarity: Annotated[Similarity | None, similarity("both, as far as there are boxes and metres")] = None,
     gate_m: _Gates = DEFAULT_GATES_M,
     min_iou: MinIou = 0.5,
@@ -339,6 +353,8 @@ def evaluate(
         their times.
     truth : path or sequence of paths, optional
         Ground truth for files of tracks: one file for each, matched by name or in order.
+    against : str, optional
+        Without ground truth, compare trackers of logs by this channel of offline re-tracking: differences only.
     gate_m : float or sequence of float, default (0.5, 1, 2)
         Gate: largest distance in metres at which ground truth and a track match.
 
@@ -370,6 +386,8 @@ def evaluate(
 
         mcaptrack evaluate tracks.txt --truth gt.txt --fail-under idf1=0.7
 
+        mcaptrack evaluate log.mcap --against /camera/retracks/full --topic /a/tracks --topic /b/tracks
+
     >>> import mcaptrack
     >>> scores = mcaptrack.evaluate("log.mcap", similarity="metres", gate_m=1.0)
     >>> 0.5 < scores.score("IDF1", "retracks") <= 1.0
@@ -384,6 +402,10 @@ def evaluate(
         frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
     )  # fmt: skip
     paths = locations_of(tracks)
+    if against is not None:
+        chosen = {"similarity": similarity is not None, "gate_m": gates != DEFAULT_GATES_M, "smoothed": smoothed}
+        chosen |= {"min_iou": min_iou != IOU_THRESHOLD, "rules": rules != "trackeval"}
+        return _differences(paths, camera, topics, (against, truth), how, chosen, progress)
     with collected() as warnings:
         if truth is None:
             sequences = _from_logs(paths, camera, topics, smoothed)
@@ -434,6 +456,7 @@ def _from_logs(
         with logs.read(path) as opened:
             prefix = pipeline.find_camera(opened, camera)
             sequence = sequence_of_log(opened, prefix, topics)
+            _refuse_own(opened, prefix, sequence.ground_truth)
             if how := provenance_of(opened, camera_at(opened, prefix).truth):
                 how.warn_again()
             if smoothed:
@@ -441,6 +464,43 @@ def _from_logs(
             sequence.name = name
             sequences.append(sequence)
     return sequences
+
+
+def _differences(
+    paths: Sequence[Location],
+    camera: str | None,
+    topics: tuple[str, ...],
+    references: tuple[str, Any],
+    how: IngestOptions,
+    chosen: Mapping[str, bool],
+    progress: Progress,
+) -> Scores:
+    """Compare the channels of tracks of logs by one of them; ``chosen`` says which options of scores were given."""
+    against, truth = references
+    if truth is not None:
+        raise McaptrackError("`against=` compares without ground truth; leave `truth=` out")
+    members = []
+    with collected() as warnings:
+        warn_unused("without ground truth trackers are compared by IDF1 and distance, at one gate", **chosen)
+        labels.warn_of_unused(how, "there are no labels", "classes")
+        for number, path in enumerate(paths):
+            progress("evaluate", number, len(paths))
+            with logs.read(path) as opened:
+                members.append(candidates_of_log(opened, pipeline.find_camera(opened, camera), against, topics))
+        progress("evaluate", len(paths), len(paths))
+        compared = tuple(differences(members))
+    return Scores((), (), tuple(dict.fromkeys(warnings)), against=against, differences=compared)
+
+
+def _refuse_own(opened: logs.Log, prefix: str, ground_truth: Sequence[Frame]) -> None:
+    """Raise McaptrackError if the ground truth of a log is its own re-tracking."""
+    stage = STAGES["retrack"]
+    for topic in (f"{prefix}/{name}" for name in (FULL, stage.output_topic)):
+        if topic in opened.channels and repeats(ground_truth, opened.frames(topic, TRACKS)):
+            raise McaptrackError(
+                f"{opened.path}: the ground truth is {topic} itself, row by row, so scores would say nothing; "
+                "`against=` compares other trackers by it"
+            )
 
 
 def _smoothed(opened: logs.Log, prefix: str) -> Candidate:
@@ -471,6 +531,11 @@ def _from_files(
     sequences = []
     for name, path, truth in pairs:
         both = compare_files(path, truth, how, topics)
+        if holds_tables(truth) and repeats(both.ground_truth, both.tracks):
+            raise McaptrackError(
+                f"{truth} has the tracks of {path}, row by row, so scores would say nothing; give ground truth, or "
+                "compare trackers in a log without it (`against=`)"
+            )
         for note in both.notes:
             notes.say(note)
         sequence = sequence_of_files(

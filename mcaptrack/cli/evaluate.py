@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
+from math import isnan
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from mcaptrack.api.declared import Option
@@ -68,7 +69,7 @@ class Evaluate(Once["Scores"]):
             bool, Option(SCORES, flag="all", help="Print the scores at all gates, and all columns of forecasts.")
         ] = False
 
-    most_used = ("truth", "topic", "all_gates", "similarity", "gate_m", "fail_under", "csv", "output", "force")
+    most_used = ("truth", "against", "topic", "all_gates", "similarity", "gate_m", "fail_under", "output", "force")
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)
@@ -86,7 +87,8 @@ class Evaluate(Once["Scores"]):
     def data(self, done: Scores) -> dict[str, Any]:
         """Return the scores as values of JSON."""
         labelled = [{"sequence": name, **how._asdict()} for name, how in done.labelled.items()]
-        return {"results": done.rows(), "labelled": labelled}
+        differences = {"against": done.against, "differences": [row._asdict() for row in done.differences]}
+        return {"results": done.rows(), "labelled": labelled} | (differences if done.against else {})
 
     def print_result(self, done: Scores, talk: common.Talk) -> None:
         """Print the scores, or write them to a file, and draw curves."""
@@ -99,6 +101,8 @@ class Evaluate(Once["Scores"]):
         """Print a verdict and a table, or rows of CSV."""
         if self.values["csv"]:
             _print_csv(done)
+        elif done.against:
+            _print_differences(done)
         else:
             print_results(done, self.values["all_gates"], self.values["verbose"])
 
@@ -154,6 +158,17 @@ def print_results(scores: Scores, all_gates: bool, verbose: bool) -> None:
         _print_forecasts(forecasts, _ALL_FORECAST_COLUMNS if all_gates or verbose else _FORECAST_COLUMNS)
     if verbose:
         _print_reliability(forecasts)
+
+
+def _print_differences(scores: Scores) -> None:
+    """Which tracker is better, by differences of IDF1 in points."""
+    show(f"no ground truth: differences by {scores.against}, in points of IDF1", "")
+    numbers = ("IDF1", "from", "to")
+    rows: list[list[str | Text]] = []
+    for row in scores.differences:
+        points = ["-" if isnan(value) else f"{100 * value:+.1f}" for value in (row.idf1, row.low, row.high)]
+        rows.append([row.after, row.verdict, f"than {row.before}", *points, row.why])
+    show_left_out(print_table(["tracks", "", "", *numbers, "why undecided"], rows, numbers, ["from", "to"]))
 
 
 def _print_scores(results: Sequence[EvaluationRow]) -> None:
@@ -264,6 +279,7 @@ def _print_csv(scores: Scores) -> None:
     import csv
 
     rows = [{k: v for k, v in result.to_json().items() if k not in _NESTED} for result in scores.results]
+    rows += [row._asdict() for row in scores.differences]
     rows = [{k: printable(v) if isinstance(v, str) else v for k, v in row.items()} for row in rows]
     names = list(dict.fromkeys(name for row in rows for name in row))
     writer = csv.DictWriter(sys.stdout, fieldnames=names, lineterminator="\n")

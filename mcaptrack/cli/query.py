@@ -57,7 +57,7 @@ class Query(Once[Any]):
             bool, Option(QUERY, help="List the tables with their columns, units and meanings; no query.")
         ] = False
 
-    most_used = ("file", "form", "rows", "tables", "output", "force")
+    most_used = ("file", "form", "rows", "tables", "worlds", "output", "force")
 
     @property
     def function(self) -> Callable[..., Any]:
@@ -69,14 +69,16 @@ class Query(Once[Any]):
         given, output = self.values, self.values["output"]
         paths, sql = _asked(given["words"] or [], given["file"], given["tables"])
         if given["tables"]:
-            warn_unused("--tables lists what could be asked", "form", "rows")
+            warn_unused("--tables lists what could be asked", "form", "rows", "worlds")
         logs = expand(paths, folders=True)
         self._form = _form(given["form"], output, given["json"])
         if output is not None:
             refuse_overwrite(output, given["force"])
             if any(is_same_file(output, path) for path in logs):
                 raise McaptrackError(f"{output} is both input and output; give another name with -o")
-        return {"log": logs, "files": _named(given["files"] or [])} | ({} if given["tables"] else {"sql": sql})
+        return {"log": logs, "files": _named(given["files"] or [])} | (
+            {} if given["tables"] else {"sql": sql, "worlds": given["worlds"]}
+        )
 
     def print_result(self, done: Any, talk: common.Talk) -> None:
         """Print the answer, or write it to a file."""

@@ -10,13 +10,13 @@ log. Each channel is a table, too, under its name in double quotes. Only this mo
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
-from mcaptrack import log, tables
+from mcaptrack import log, notices, tables
 from mcaptrack.errors import McaptrackError, call, did_you_mean
 from mcaptrack.files import place_of
 from mcaptrack.location import Location, distinct_names, join
@@ -46,6 +46,46 @@ _READERS: Final = {
     ".jsonl": "read_json",
     ".ndjson": "read_json",
 }
+#: The tables that ``world_tracks`` is made of, and all that are the same in each world.
+_OF_WORLDS: Final = ("tracks", "worlds", "channels", "frames")
+_IN_ALL_WORLDS: Final = {"frames", "channels", "recordings", "ground_planes"}
+#: Tracks in each world: observed samples of what a world keeps, at their smoothed places where re-tracking kept them,
+#: and straight on over gaps.
+_WORLD_TRACKS: Final = """
+create temp view world_tracks as
+with part as (
+    select recording, topic[:-8] as topic, input, world, source_id, track_id, t_ns as from_ns,
+           t_ns + (duration_s * 1e9)::bigint + 1000 as to_ns
+    from worlds join channels using (recording, topic) where kept),
+seen as (
+    select world, s.* replace (part.topic as topic, part.track_id as track_id,
+                               coalesce(r.x_m, s.x_m) as x_m, coalesce(r.y_m, s.y_m) as y_m)
+    from part
+    join all_tracks s on (s.recording, s.topic, s.track_id) = (part.recording, part.input, part.source_id)
+                         and s.t_ns between from_ns and to_ns and s.observed
+    left join all_tracks r on (r.recording, r.topic, r.source_id, r.t_ns)
+                              = (part.recording, part.topic, part.source_id, s.t_ns)),
+steps as (
+    select *, lead(frame) over track as next, lead(t_ns) over track - t_ns as dt, lead(x_m) over track - x_m as dx,
+           lead(y_m) over track - y_m as dy
+    from seen window track as (partition by world, recording, topic, track_id order by t_ns)),
+gaps as (select *, unnest(range(frame + 1, next)) as gap from steps where next > frame + 1)
+select * exclude (next, dt, dx, dy) from steps
+union all
+select g.* exclude (next, dt, dx, dy, gap)
+       replace (f.frame as frame, f.t as t, f.t_ns as t_ns, false as observed, -1 as source_id,
+                null as x_px, null as y_px, null as w_px, null as h_px, null as score,
+                x_m + dx * (f.t_ns - g.t_ns) / dt as x_m, y_m + dy * (f.t_ns - g.t_ns) / dt as y_m)
+from gaps g join frames f on (f.recording, f.topic, f.frame) = (g.recording, g.topic, g.gap)
+"""
+_TRACKS_OF_WORLD: Final = """
+create or replace temp table tracks as
+select * exclude (world) from world_tracks where world = ? order by recording, topic, track_id, t_ns
+"""
+_PEOPLE: Final = "select count(distinct (recording, topic, track_id)) from tracks"
+#: Intervals from worlds are wider by this share of the median on both sides, because worlds lack rows that no detector
+#: gave: so they hold in nine of ten drawn scenes (``tools/without_truth.py``).
+WIDER: Final = 0.12
 _MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
 
 
@@ -117,7 +157,7 @@ class Database:
             self._duckdb = _duckdb()
             #: The sources of the tables that were loaded, as text.
             self.notes: list[str] = []
-            self._loaded: set[str] = set()
+            self._loaded: dict[str, Any] = {}
             self._sources = [source for path in _unique_paths(paths) for source in self._opened(path, opening)]
             named = [(source.recording, source.where) for source in self._sources]
             self._names = distinct_names([name for name, _ in named], [where for _, where in named])
@@ -153,9 +193,23 @@ class Database:
 
         Raises McaptrackError, in one line, for errors of DuckDB.
         """
+        return self._guarded(query, self._answer)
+
+    def ask_worlds(self, query: str) -> Any:
+        """The answer of one SELECT from ``tracks`` in the worlds of re-tracking, an Arrow table.
+
+        Each number has its median, and in ``NAME_from`` and ``NAME_to`` an interval of 90 %. Rows are told apart by
+        their texts and times; ``worlds`` says in how many worlds a row is. A whole number counts as 0 in others. The
+        number of people has no interval.
+
+        Raises McaptrackError for errors of DuckDB, queries that worlds don't change, and logs without worlds.
+        """
+        return self._guarded(query, self._worlds_answer)
+
+    def _guarded(self, query: str, answered: Callable[[str], Any]) -> Any:
         duckdb = self._duckdb
         try:
-            answer = self._answer(query)
+            answer = answered(query)
         except duckdb.OutOfMemoryException as error:
             raise McaptrackError(f"the query needs more memory than there is: {_first(error)}") from None
         except (duckdb.Error, RuntimeError) as error:  # DuckDB raises these, too
@@ -175,6 +229,70 @@ class Database:
             result = self._run(statement)
             answer = result if statement.type.name in _ANSWERING else answer
         return answer
+
+    def _worlds_answer(self, query: str) -> Any:
+        """As ``ask_worlds``."""
+        statements = self._connection.extract_statements(query)
+        if [statement.type.name for statement in statements] != ["SELECT"]:
+            raise McaptrackError("worlds are asked by one SELECT; `world_tracks` has their tracks for other queries")
+        names = {name.lower().strip('"') for name in self._connection.get_table_names(query)}
+        self._load("world_tracks")
+        counts = dict(self._connection.sql("select recording, max(world) from worlds group by recording").fetchall())
+        if lacking := [name for name in self._names if name not in counts]:
+            raise McaptrackError(f"{lacking[0]} has no worlds; {call('retrack', 'LOG', worlds=50)} draws them")
+        others = {name for name in names if name in TABLES or "/" in name} - _IN_ALL_WORLDS - {"tracks"}
+        topics = {topic for (topic,) in self._connection.sql("select distinct topic[:-8] from worlds").fetchall()}
+        others |= set(re.findall(r"'(/[^']*)'", query)) & set(self.channels) - topics
+        if others or "tracks" not in names:
+            raise McaptrackError(
+                f"worlds have other `tracks` of {', '.join(sorted(topics))}, and nothing else: ask these"
+                + (f", not {', '.join(sorted(others))}" if others else "")
+            )
+        self._connection.unregister("tracks")
+        answers, people = [], []
+        for world in range(1, min(counts.values()) + 1):
+            self._connection.execute(_TRACKS_OF_WORLD, [world])
+            answers.append(tables.tidy(self._run(self._connection.extract_statements(query)[0])))
+            people += self._connection.sql(_PEOPLE).fetchall()[0]
+        return self._over_worlds(answers, people)
+
+    def _over_worlds(self, answers: Sequence[Any], people: Sequence[int]) -> Any:
+        """The median and the interval of each number in the ``answers`` of all worlds, which have so many people."""
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        schema = answers[0].schema
+        is_number = {f.name: pa.types.is_integer(f.type) or pa.types.is_floating(f.type) for f in schema}
+        keys = [_quoted(name) for name in schema.names if not is_number[name]]
+        whole = pa.concat_tables(
+            [answer.append_column("world of answer", pa.array([n] * len(answer))) for n, answer in enumerate(answers)]
+        )
+        rows = self._connection.from_arrow(whole)
+        repeated = rows.aggregate('count(*) as "rows of world"', ", ".join(['"world of answer"', *keys]))
+        if repeated.filter('"rows of world" > 1').fetchall():
+            raise McaptrackError(
+                "worlds have several rows with the same texts and times, so that their numbers can't be put together; "
+                "name each row by a text, as in `track_id::text`, or ask for one row"
+            )
+        columns = list(keys)
+        for name in (f.name for f in schema if is_number[f.name]):
+            column, counted = _quoted(name), pa.types.is_integer(schema.field(name).type)
+            values = f"list_resize(list({column}), {len(answers)}, 0)" if counted else f"list({column})"
+            least, low, middle, high = (f"list_aggregate({values}, 'quantile_cont', {q})" for q in (0, 0.05, 0.5, 0.95))
+            low, high = f"{low} - {WIDER} * abs({middle})", f"{high} + {WIDER} * abs({middle})"
+            low = f"if({least} < 0, {low}, greatest({low}, 0))"
+            if counted:
+                low, high = f"floor({low})::bigint", f"ceil({high})::bigint"
+            if counted and [pc.sum(answer[name]).as_py() or 0 for answer in answers] == list(people):
+                notices.warn(
+                    f"{name}: the number of people has no interval; worlds hold it too seldom, because they lack "
+                    "people that no detector saw, and take those who come back late for others", "not-compared"
+                )  # fmt: skip
+                low = high = "null"
+            columns += [f"{middle} as {column}"]
+            columns += [f"{low} as {_quoted(name + '_from')}", f"{high} as {_quoted(name + '_to')}"]
+        over_all = rows.aggregate(", ".join([*columns, "count(*) as worlds"]), ", ".join(keys))
+        return (over_all.order(", ".join(keys)) if keys else over_all.limit(len(whole))).to_arrow_table()
 
     def _run(self, statement: Any) -> Any:
         """The answer of a statement, Arrow or None; loads the tables that it names, and those that DuckDB then
@@ -216,6 +334,12 @@ class Database:
         lower = name.lower()
         if name in self._loaded or lower in self._loaded:
             return False
+        if lower == "world_tracks":
+            for table in _OF_WORLDS:
+                self._load(table)
+            self._connection.register("all_tracks", self._loaded["tracks"])
+            self._loaded[lower] = self._connection.execute(_WORLD_TRACKS)
+            return True
         if lower in TABLES:
             name, columns = lower, TABLES[lower].arrow
             parts = [(at, source.part(lower)) for at, source in self._named()]
@@ -228,8 +352,8 @@ class Database:
         for recording, part in parts:
             text = f"from {part}" if isinstance(part, Path) else "read from the log; exported tables would be quicker"
             self.notes.append(f"{recording}: {name} {text}")
-        self._connection.register(name, tables.join(parts, columns))
-        self._loaded.add(name)
+        self._loaded[name] = tables.join(parts, columns)
+        self._connection.register(name, self._loaded[name])
         return True
 
     def _named(self) -> list[tuple[str, _TableSource]]:
@@ -266,13 +390,13 @@ class Database:
             getattr(self._connection, reader)(str(path)).create(name)
         except self._duckdb.Error as error:
             raise McaptrackError(f"{path} can't be read as a table: {_first(error)}") from None
-        self._loaded.add(name.lower())
+        self._loaded[name.lower()] = path
 
     def _error_text(self, error: str, query: str) -> str:
         """A message of DuckDB in one line, with the tables that exist."""
         if missing := _MISSING.search(error):
             name = missing.group(1)
-            names = [*TABLES, *sorted(self._loaded - set(TABLES))]
+            names = [*TABLES, *sorted(set(self._loaded) - set(TABLES))]
             channels = self.channels if "/" in name else ()
             question = did_you_mean(name, [*names, *channels])
             nearest = f" ({question.rstrip()})" if question else ""
@@ -317,6 +441,11 @@ def _refuse_writing(kinds: Sequence[str]) -> None:
             raise McaptrackError(
                 f"queries only read: {kind} is refused; `output=` writes an answer, `files=` gives a file"
             )
+
+
+def _quoted(name: str) -> str:
+    """The name of a column in a query."""
+    return '"' + name.replace('"', '""') + '"'
 
 
 def _first(error: Exception) -> str:

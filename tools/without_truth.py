@@ -1,0 +1,152 @@
+"""What is said without ground truth, on drawn scenes that have it: signs of comparisons, and intervals from worlds.
+
+    .venv/bin/python tools/without_truth.py signs --seeds 9001 9101
+    .venv/bin/python tools/without_truth.py worlds --seeds 7101 --scenes 24
+
+``signs`` makes five trackers of each scene (``crowds.py``), with faults of their own or with those of the tracker that
+the reference is re-tracked from, and prints how often better and worse are right, by the difference that is seen.
+``worlds`` prints how often the intervals of ``query --worlds`` hold the true number, and how wide they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from corruptions import STEP_S, Rows, corrupt
+from crowds import faults, scenes
+from reproduce import on_clock
+
+import mcaptrack
+from mcaptrack.evaluation.against import Candidates, compare
+from mcaptrack.evaluation.events import MatchRule
+from mcaptrack.evaluation.people import person_scores
+from mcaptrack.schema import Frame
+from mcaptrack.transforms import Retrack, Sample
+
+STEPS = 300
+RULE = MatchRule("metres", 1.0)
+
+
+def frames(rows: Rows) -> list[Frame]:
+    return on_clock(rows, np.arange(STEPS))
+
+
+def samples(rows: Rows) -> list[Frame]:
+    return [frame for (frame,) in Sample(start_ns=0)(frames(rows))]
+
+
+def worse(rows: Rows, rng: np.random.Generator) -> Rows:
+    """A tracker with the same detections, that breaks ids, loses people or rows, or places them badly."""
+    rows, kind = rows.copy(), rng.integers(4)
+    ids, of = np.unique(rows[:, 1], return_inverse=True)
+    if kind == 0:
+        breaks = rng.random(len(rows)) < 10 ** rng.uniform(-2.5, -1)
+        for track in range(len(ids)):
+            rows[of == track, 1] = ids[track] + 1e4 * np.cumsum(breaks[of == track])
+    elif kind == 1:
+        rows = rows[(rng.random(len(ids)) > rng.uniform(0.03, 0.5))[of]]
+    elif kind == 2:
+        rows = rows[rng.random(len(rows)) > rng.uniform(0.02, 0.4)]
+    else:
+        rows[:, 2:] += rng.normal(0, rng.uniform(0.05, 0.6), (len(rows), 2))
+    return rows
+
+
+def signs(seeds: list[int], count: int) -> None:
+    table = defaultdict(list)
+    for seed in seeds:
+        for number, truth in enumerate(scenes(seed, STEPS, count)):
+            rng = np.random.default_rng([seed, number])
+            source, other, third = (corrupt(truth, faults(rng), rng) for _ in range(3))
+            (true, reference) = frames(truth), [parts[0] for parts in Retrack()(samples(source))]
+            trackers = {"other": other, "third": third, "worse": worse(other, rng), "same 1": worse(source, rng)}
+            trackers["same 2"] = worse(source, rng)
+            made = {name: samples(rows) for name, rows in trackers.items()}
+            made["re-tracked"] = [parts[0] for parts in Retrack()(made["other"])]
+            by_truth, by_reference = (
+                {name: person_scores(side, tracks, RULE) for name, tracks in made.items()} for side in (true, reference)
+            )
+            for names in combinations(made, 2):
+                row = compare(*names, [Candidates(by_reference, {})])
+                wanted = by_truth[names[1]].idf1() - by_truth[names[0]].idf1()
+                kind = f"{sum(name.startswith('same') for name in names)} on the reference's detections"
+                table[kind, int(np.digitize(abs(row.idf1), [0.05, 0.1, 0.2]))].append(
+                    (row.verdict != "undecided", row.idf1 * wanted > 0)
+                )
+    for (kind, size), rows in sorted(table.items()):
+        decided, right = np.array(rows).T
+        span = ("under 5", "5 to 10", "10 to 20", "over 20")[size]
+        of_decided = f"{right[decided].mean():7.1%}" if decided.any() else "      -"
+        print(f"{kind:32} {span:>9} points: {len(rows):5} pairs, sign right {right.mean():6.1%}, "
+              f"decided {decided.sum():5}, of these right {of_decided}")  # fmt: skip
+
+
+def questions(low: Rows, size: Rows) -> dict[str, str]:
+    """What is asked of a scene of this size: in two rectangles, which are A and B."""
+    places = [np.array([0.1, 0.2, 0.6, 0.7]), np.array([0.45, 0.55, 0.9, 0.95])]
+    a, b = (
+        "x_m between {} and {} and y_m between {} and {}".format(
+            *(low[axis] + share * size[axis] for axis, share in ((0, p[0]), (0, p[2]), (1, p[1]), (1, p[3])))
+        )
+        for p in places
+    )
+    return {
+        "people": "select count(distinct track_id) from tracks",
+        "visitors of A": f"select count(distinct track_id) from tracks where {a}",
+        "visitors of B": f"select count(distinct track_id) from tracks where {b}",
+        "A -> B": f"select count(*) from (select min(t_ns) filter ({a}) as a, max(t_ns) filter ({b}) as b "
+        "from tracks group by track_id) where a < b",
+        "dwell in A": f"select count(*) * {STEP_S} / count(distinct track_id) from tracks where {a}",
+    }
+
+
+def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, list[float]]]:
+    """What was asked, the true answer, and that of worlds: from, median, to."""
+    for seed in seeds:
+        for number, truth in enumerate(scenes(seed, STEPS, count)):
+            rng = np.random.default_rng([seed, number, 8])
+            made = {"scene": corrupt(truth, faults(rng), rng), "true": truth}
+            with tempfile.TemporaryDirectory() as folder:
+                for name, rows in made.items():
+                    with mcaptrack.open(Path(folder, f"{name}.mcap"), create=True) as log:
+                        log.write("/camera/tracks", [frame for frame in frames(rows) if len(frame.rows)])
+                mcaptrack.retrack(Path(folder, "scene.mcap"), worlds=50)
+                low = truth[:, 2:].min(axis=0)
+                asked = questions(low, truth[:, 2:].max(axis=0) - low)
+                query = "select " + ", ".join(f'({part}) as "{name}"' for name, part in asked.items())
+                (true,) = mcaptrack.query(Path(folder, "true.mcap"), query).to_pylist()
+                (found,) = mcaptrack.query(Path(folder, "scene.mcap"), query, worlds=True).to_pylist()
+                for name in asked:
+                    yield name, true[name], [found[name + end] for end in ("_from", "", "_to")]
+
+
+def worlds(seeds: list[int], count: int) -> None:
+    table = defaultdict(list)
+    for name, true, (low, middle, high) in answers(seeds, count):
+        if true and low is not None:
+            table[name].append((low <= true <= high, (high - low) / true, middle / true))
+    for name, rows in table.items():
+        held, wide, middle = np.mean(rows, axis=0)
+        print(f"{name:16} {len(rows):4} scenes, held {held:.2f}, width {wide:.2f}, median {middle:.2f} of the truth")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("signs", "worlds"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[9101])
+    parser.add_argument("--scenes", type=int, default=24)
+    given = parser.parse_args()
+    {"signs": signs, "worlds": worlds}[given.what](given.seeds, given.scenes)
+
+
+if __name__ == "__main__":
+    main()
