@@ -198,7 +198,7 @@ def _placed(frames: FrameColumns) -> FrameColumns:
 
 
 def _is_placed(rows: Rows) -> Bools:
-    return np.isfinite(rows["x_m"]) & np.isfinite(rows["y_m"])
+    return np.asarray(np.isfinite(rows["x_m"]) & np.isfinite(rows["y_m"]))
 
 
 def _keep_ids(
