@@ -23,11 +23,9 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import log
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.errors import McaptrackError
 from mcaptrack.errors import call as proposed
-from mcaptrack.schema import TRACKS
 from mcaptrack.sources import demo
 from mcaptrack.transforms import ByteTrack
 from tests.commands import GROUP, call, done
@@ -72,11 +70,6 @@ def place(template, tmp_path, monkeypatch) -> Path:
             shutil.copy(path, tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def rows(path: Path, topic: str) -> bytes:
-    with log.read(path) as opened:
-        return opened.rows(topic, TRACKS).rows.tobytes()
 
 
 class TestTheSameAsTheCommandLine:
