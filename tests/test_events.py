@@ -377,15 +377,6 @@ def test_events_texts_and_counts_are_channels_beside_the_tracks(place):
         }
 
 
-def test_events_are_kept_and_remade_identically(place):
-    watched(place)
-    once = place.read_bytes()
-    assert watched(place)[0].stages == []
-    assert place.read_bytes() == once
-    assert watched(place, again=True)[0].stages == ["events"]
-    assert place.read_bytes() == once
-
-
 def test_options_of_events_are_kept_until_changed(place):
     def rule():
         with log.read(place) as opened:
@@ -432,12 +423,6 @@ def test_ground_truth_that_cannot_be_compared_is_reported_once(tmp_path):
     assert ["never overlap in time" in note for note in notes] == [True]
     assert report.warnings[0].code == "not-compared"
     assert watched(path)[1] == []
-
-
-def test_foreign_tracks_are_watched_and_never_replaced(tmp_path):
-    path = write_channels(tmp_path / "a.mcap", made_by="", tracks=SWAPPED, truth=TRUTH)
-    assert watched(path)[0].events["/camera/tracks"]["identity switch"] == 2
-    assert watched(path)[0].stages == []
 
 
 def test_named_channels_stay_watched(tmp_path):

@@ -183,11 +183,6 @@ def side_by_side(frames: int = 60) -> list[str]:
     return [f"{n},-1,{x},20,20,60,1,-1,-1,-1" for n in range(1, frames) for x in (n * 3, 200 - n * 3)]
 
 
-def downwards(frames: int = 60) -> list[str]:
-    """Return tracks of people seen from above, with paths over the whole picture."""
-    return [f"{n},-1,{x},{n * 4},20,40,1,-1,-1,-1" for n in range(1, frames) for x in (100, 300)]
-
-
 def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     path = ingested(tmp_path / "a.mcap", side_by_side())
     data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
@@ -199,38 +194,6 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
     assert "held-back" not in {one["code"] for one in insisted["warnings"]} | {code for _, code in kept(path)}
     assert made_by(path, "/camera/retracks").parameters["side_view"] is True
-
-
-@pytest.fixture(scope="module")
-def short(tmp_path_factory) -> Path:
-    """A log of 14 pictures, 1.3 s, of two people seen from above, with their samples."""
-    folder = tmp_path_factory.mktemp("short")
-    (folder / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
-    path = ingested(folder / "a.mcap", downwards(15), "--ground-plane", folder / "plane.txt")
-    done("sample", path, "-q")
-    return path
-
-
-def test_a_short_sequence_keeps_its_people(short, tmp_path):
-    path = shutil.copy(short, tmp_path / "a.mcap")
-    assert json.loads(done("retrack", path, "--json", "-q").out)["warnings"] == []
-    with log.read(path) as opened:
-        kept_people = np.unique(opened.rows("/camera/retracks", TRACKS).rows["track_id"])
-    assert len(kept_people) == 2
-
-
-@pytest.mark.parametrize(
-    ("setting", "reason"),
-    [
-        ("track_confidence=0", "the longest track lasts 1.2 s; those under 2 s are left out (min_track_s)"),
-        ("track_confidence=1", "no track is likely enough to be a person (track_confidence)"),
-    ],
-)
-def test_why_nobody_is_kept_is_said(setting, reason, short, tmp_path):
-    path = shutil.copy(short, tmp_path / "a.mcap")
-    (said,) = json.loads(done("retrack", path, "--set", setting, "--json", "-q").out)["warnings"]
-    assert said["code"] == "nothing-found"
-    assert reason in said["message"]
 
 
 # Cameras that move
@@ -285,17 +248,3 @@ def test_detect_refuses_a_camera_in_constant_motion(kind):
     frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
     with pytest.raises(McaptrackError, match=r"the camera moves in \d+% of the pictures"):
         list(KnnDetector()(frames))
-
-
-def test_later_stages_repeat_the_warning_of_camera_motion(tmp_path):
-    import cv2
-
-    (tmp_path / "pictures").mkdir()
-    for n in range(60):
-        cv2.imwrite(str(tmp_path / "pictures" / f"{n:03}.png"), looks("pans for a while", n))
-    path = tmp_path / "a.mcap"
-    done("ingest", tmp_path / "pictures", "--fps", "10", "--image-format", "png", "-o", path, "-q")
-    for command in ("detect", "track"):
-        outcome = done(command, path, "--json", "-q")
-        assert "camera-moves" in [one["code"] for one in json.loads(outcome.out)["warnings"]]
-        assert f"warning: {path}: the camera moves in" in outcome.err

@@ -272,18 +272,6 @@ def turned(**angles: float) -> np.ndarray:
     return rotation.as_quat()[[3, 0, 1, 2]]
 
 
-def test_headings_are_those_of_scipy():
-    rng = np.random.default_rng(5)
-    angles = np.column_stack([rng.uniform(-180, 180, 40), rng.uniform(-30, 30, (40, 2))])
-    rotation = Rotation.from_euler("zyx", angles, degrees=True)
-    lengths = rng.uniform(0.91, 1.09, (40, 1))
-    heading, tilt = headings(rotation.as_quat()[:, [3, 0, 1, 2]] * lengths, Path("a"), str)
-    forward, up = rotation.apply([1, 0, 0]), rotation.apply([0, 0, 1])
-    np.testing.assert_allclose(heading, np.arctan2(forward[:, 1], forward[:, 0]), atol=1e-12)
-    np.testing.assert_allclose(tilt, np.arccos(up[:, 2]), atol=1e-7)
-    assert [len(one) for one in headings(np.empty((0, 4)), Path("a"), str)] == [0, 0]
-
-
 @pytest.mark.parametrize("length", [0.0, 0.89, 1.11, math.nan])
 def test_quaternions_have_the_length_1(length):
     quaternions = np.stack([turned(z=5), turned(z=9) * length, turned(z=7) * 3])
@@ -438,17 +426,6 @@ def kitti(*lines: str, folder: Path) -> Path:
 
 
 CAR = "3 7 Car 0 0 -10 1 2 3 4 1.5 2 4 3 1.25 9 0.5"
-
-
-def test_a_line_of_kitti_by_hand(tmp_path):
-    walker = "1 2 Pedestrian 0 0 -10 1 2 3 4 1.8 0.5 0.6 -3 1 9 -0.5 0.75"
-    rows = read_labels(kitti(CAR, walker, folder=tmp_path), "kitti-3d", "detections")
-    half = math.pi / 2
-    np.testing.assert_allclose(
-        rows.boxes_m, [[9, 3, -0.1, 0.6, 0.5, 1.8, 0.5 - half], [9, -3, -0.5, 4, 2, 1.5, -0.5 - half]], atol=1e-12
-    )
-    np.testing.assert_equal(rows.score, [0.75, np.nan])
-    assert (rows.frame.tolist(), rows.id.tolist(), rows.labelled.tolist()) == ([1, 3], [2, 7], [1, 3])
 
 
 @pytest.mark.parametrize(
