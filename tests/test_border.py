@@ -396,20 +396,9 @@ WRITERS = {
 }  # fmt: skip
 #: What a format states in all of its files.
 STATED_FIRST = (
-    "supervision",
-    "mot",
-    "kitti",
-    "sdd",
-    "trajnet",
-    "obsmat",
-    "trajnet++",
-    "cvat",
-    "jrdb",
-    "label-studio",
-    "kitti-3d",
-    "youtube-vis",
-    "levelx",
-)
+    "supervision", "mot", "kitti", "sdd", "trajnet", "obsmat", "trajnet++", "cvat", "jrdb", "label-studio", "kitti-3d",
+    "youtube-vis", "levelx",
+)  # fmt: skip
 #: The first of the pictures that these list is taken as the first; what is assumed is said once the clock is known.
 BY_LIST = ("coco", "bdd", "voc", "labelme", "via", "datumaro", "darknet", "mots", "kitti-frames")
 TIMED = ("nuscenes", "argoverse")

@@ -35,14 +35,9 @@ from tests.undefined import T0, message, names_no_definitions, package, store_of
 
 #: How one type is written: ROS 2, ROS 1, IDL, DDS, Python, and with what writers put before it.
 SPELLINGS = {
-    "ROS 2": "{}/msg/{}",
-    "ROS 1": "{}/{}",
-    "IDL": "{}::msg::{}",
-    "global IDL": "::{}::msg::{}",
-    "DDS": "{}::msg::dds_::{}_",
-    "Python": "{}.msg.{}",
-    "slash": "/{}/msg/{}",
-}
+    "ROS 2": "{}/msg/{}", "ROS 1": "{}/{}", "IDL": "{}::msg::{}", "global IDL": "::{}::msg::{}",
+    "DDS": "{}::msg::dds_::{}_", "Python": "{}.msg.{}", "slash": "/{}/msg/{}",
+}  # fmt: skip
 
 
 #: What asks for a type, with a type that it reads, and what it gives for a channel of it.

@@ -27,12 +27,8 @@ from mcaptrack.transforms import PROFILES
 from tests.worlds import boxed, ns, replace_channel, tracks_at, walk, write_channels
 
 BIRTH, END, MISS, FALSE, SWITCH = (
-    EventKind.BIRTH,
-    EventKind.END,
-    EventKind.MISS,
-    EventKind.FALSE_TRACK,
-    EventKind.SWITCH,
-)
+    EventKind.BIRTH, EventKind.END, EventKind.MISS, EventKind.FALSE_TRACK, EventKind.SWITCH,
+)  # fmt: skip
 
 
 def happened(found) -> list[tuple]:

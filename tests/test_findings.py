@@ -228,14 +228,10 @@ def looks(kind: str, n: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("kind", "codes"),
     [
-        ("stands", []),
-        ("shakes", []),
-        ("is empty", []),
-        ("is dim and noisy", []),
-        ("pans for a while", ["camera-moves"]),
-        ("is cut", ["view-lost"]),
+        ("stands", []), ("shakes", []), ("is empty", []), ("is dim and noisy", []),
+        ("pans for a while", ["camera-moves"]), ("is cut", ["view-lost"]),
     ],
-)
+)  # fmt: skip
 def test_detect_warns_of_camera_motion_but_not_of_shaking(kind, codes):
     frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
     with notices.collected() as said:

@@ -330,18 +330,12 @@ def test_a_folder_of_images_is_kept_with_how_it_was_made(tmp_path):
     options = IngestOptions(fps=Fraction(25, 2), image_format="jpeg", quality=70, camera="gate")
     report = ingest(folder, tmp_path / "a.mcap", options, progress=lambda *some: told.append(some))
     assert parameters_of(tmp_path / "a.mcap", "/gate/video") == {
-        "file": "images",
-        "image_format": "jpeg",
-        "fps": "25/2",
-        "quality": 70,
-    }
+        "file": "images", "image_format": "jpeg", "fps": "25/2", "quality": 70,
+    }  # fmt: skip
     assert told == [("ingest", number, 3) for number in (1, 2, 3)]
     assert (report.messages, report.has_labels, report.uses_camera, said(report)) == (
-        {"/gate/video": 3},
-        False,
-        True,
-        [],
-    )
+        {"/gate/video": 3}, False, True, [],
+    )  # fmt: skip
     with log.read(tmp_path / "a.mcap") as opened:
         assert [(m.t_ns, m.sequence) for m in opened.messages("/gate/video")] == [
             (0, 0),
