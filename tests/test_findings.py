@@ -9,17 +9,15 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import mcaptrack
 from mcaptrack import log, notices, pipeline
-from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.planes import AS_BEFORE, make_plane
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import TRANSFORMS, KnnDetector
+from mcaptrack.transforms import TRANSFORMS
 from tests.commands import done
 from tests.logs import write_channels
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
@@ -194,53 +192,3 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
     assert "held-back" not in {one["code"] for one in insisted["warnings"]} | {code for _, code in kept(path)}
     assert made_by(path, "/camera/retracks").parameters["side_view"] is True
-
-
-# Cameras that move
-
-_TEXTURE = np.random.default_rng(0).integers(0, 256, (30, 60), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
-
-
-def view(x: float, y: float = 40.0, walker: int | None = None) -> np.ndarray:
-    """Return a part of a large picture, with a person in it, (96, 128) uint8."""
-    image = _TEXTURE[round(y) : round(y) + 96, round(x) : round(x) + 128].copy()
-    if walker is not None:
-        image[30:60, walker : walker + 12] = 255
-    return image
-
-
-def looks(kind: str, n: int) -> np.ndarray:
-    """Return picture ``n`` of 60 from a camera with this kind of motion."""
-    walker = (n * 2) % 110
-    shake = (3 * np.sin(n * 1.7), 2 * np.cos(n * 2.3))
-    return {
-        "stands": lambda: view(100, walker=walker),
-        "shakes": lambda: view(100 + shake[0], 40 + shake[1], walker),
-        "is empty": lambda: np.full((96, 128), 90, np.uint8),
-        "is dim and noisy": lambda: (view(100, walker=walker) // 4 + np.random.default_rng(n).integers(0, 6, (96, 128))).astype(np.uint8),
-        "pans for a while": lambda: view(100 + 4 * max(0, n - 48), walker=walker),
-        "pans": lambda: view(20 + 5 * n, walker=walker),
-        "pans over a still scene": lambda: view(20 + 5 * n),
-        "is cut": lambda: view(100 if n < 30 else 300, walker=walker),
-    }[kind]()  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("kind", "codes"),
-    [
-        ("stands", []), ("shakes", []), ("is empty", []), ("is dim and noisy", []),
-        ("pans for a while", ["camera-moves"]), ("is cut", ["view-lost"]),
-    ],
-)  # fmt: skip
-def test_detect_warns_of_camera_motion_but_not_of_shaking(kind, codes):
-    frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
-    with notices.collected() as said:
-        list(KnnDetector()(frames))
-    assert [notice.code for notice in said] == codes
-
-
-@pytest.mark.parametrize("kind", ["pans", "pans over a still scene"])
-def test_detect_refuses_a_camera_in_constant_motion(kind):
-    frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
-    with pytest.raises(McaptrackError, match=r"the camera moves in \d+% of the pictures"):
-        list(KnnDetector()(frames))

@@ -137,17 +137,6 @@ def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder
     assert len(stage.others()) == len(stage.parameters())
 
 
-@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
-def test_giving_the_default_changes_nothing(stage, folder):
-    """Also ``--smooth`` where it is on and ``--no-confirm`` where it is off."""
-    values = {name: value for name, value in stage.parameters().items() if value not in (None, "")}
-    code, _, err = call(
-        stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | as_settings(values, stage.transform))
-    )
-    assert code == 0, err
-    assert stage.made(folder / "b.mcap") == stage.parameters()
-
-
 @pytest.mark.parametrize(
     ("stage", "way"),
     # Motion is made by run only where it is needed.
