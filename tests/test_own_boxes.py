@@ -164,12 +164,6 @@ def test_a_header_that_is_a_comment_names_columns(head, expected, tmp_path):
     assert (labels.format, *labels.boxes_px.tolist()) == expected
 
 
-def test_rows_without_a_box_are_frames_without_boxes(tmp_path):
-    labels = table(tmp_path, f"{HEAD},score\n0,1,2,3,4,.5\n1,,,,,\n2,NaN,nan,None,null,\n5,1,2,3,4,.5\n")
-    assert (labels.frame.tolist(), labels.labelled.tolist()) == ([0, 5], [0, 1, 2, 5])
-    assert "2 rows have no box; they only say that frames exist" in " ".join(labels.remarks)
-
-
 @pytest.mark.parametrize(
     ("columns", "words"),
     [

@@ -93,24 +93,6 @@ def test_running_a_stage_again_replaces_only_its_channels(fresh):
     assert digests(fresh) == before
 
 
-def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fresh):
-    run_stage(fresh, "track", Sort(max_age_s=0.7))
-    run_all(fresh)
-    report, _ = run_stage(fresh, "detect", KnnDetector())
-    assert report.stale == ["/camera/tracks"]
-    with log.read(fresh) as opened:
-        assert pipeline.is_stale(opened, "/camera/tracks")
-        assert not pipeline.is_stale(opened, "/camera/samples")  # not yet: it still comes from the tracks there are
-    report, said = run_all(fresh)
-    assert report.stages == ["track", "sample", "predict", "retrack", "views"]
-    assert said[0] == "/camera/tracks was made from an earlier /camera/detections: running track again, as before"
-    with log.read(fresh) as opened:
-        made = {topic: Provenance.from_metadata(c.metadata) for topic, c in opened.channels.items()}
-        assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
-        assert made["/camera/detections"].parameters["detector"] == "knn"
-        assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
-
-
 def test_a_missing_input_error_lists_channels_and_a_remedy(fresh, tmp_path):
     with log.create(tmp_path / "empty.mcap") as writer:
         writer.add_channel("/imu", ("x", "jsonschema", b"{}"), "json", {})
