@@ -1,4 +1,4 @@
-"""Recordings, logs, labels and settings with something wrong in them: read or refused in a line, soon, in little memory.
+"""Recordings and logs with something wrong in them: read or refused in a line, soon, in little memory.
 
 Nothing that a command reads is changed by it. MUTANTS in the environment sets how many are made of each kind of file,
 FIRST_MUTANT where they begin; damaged logs then go through every command instead of one.
@@ -17,7 +17,7 @@ import zstandard
 from mcap.reader import make_reader
 
 from mcaptrack import log
-from tests import bag_mutants, bounded, log_mutants, text_mutants
+from tests import bag_mutants, bounded, log_mutants
 from tests.commands import made_log
 from tests.logs import READING
 from tests.tiers import thorough
@@ -25,12 +25,6 @@ from tests.tiers import thorough
 MUTANTS = int(os.environ.get("MUTANTS", "0"))
 FIRST = int(os.environ.get("FIRST_MUTANT", "0"))
 COMMANDS = sorted(READING.keys() - {"train"})
-WITH_LABELS = (
-    "ingest {labels} --fps 10 -o {out}/a.mcap",
-    "ingest {labels} --as truth --into {log} -o {out}/a.mcap",
-    "evaluate {labels} --truth {labels}",
-)
-WITH_SETTINGS = ("track {log} -o {out}/a.mcap --config {labels}", "info {log} --config {labels}")
 #: A command, and what has to hold of what it wrote, by the exit code.
 Work = tuple[list[object], Callable[[int], bool]]
 
@@ -91,17 +85,8 @@ def logs(seed: int, inside: Path, out: Path, whole: Path) -> Iterator[Work]:
         yield [command, *READING[command](path, out)], holds
 
 
-def texts(seed: int, inside: Path, out: Path, whole: Path) -> Iterator[Work]:
-    copy, (name, data) = inside / "a.mcap", text_mutants.mutant(seed)
-    copy.write_bytes(whole.read_bytes())
-    (inside / name).write_bytes(data)
-    for line in WITH_SETTINGS if name == "set.toml" else WITH_LABELS:
-        words = [word.format(labels=inside / name, log=copy, out=out) for word in line.split()]
-        yield words, lambda code: code in (0, 3) or not list(out.glob("*.mcap"))
-
-
 @thorough
-@pytest.mark.parametrize(("make", "count"), [(recordings, 27), (logs, 12), (texts, 10)])
+@pytest.mark.parametrize(("make", "count"), [(recordings, 27), (logs, 12)])
 def test_mutants_are_read_or_refused(make, count, whole, commands, tmp_path):
     faults = {}
     for seed in range(FIRST, FIRST + (MUTANTS or count)):
@@ -117,20 +102,11 @@ def test_mutants_are_read_or_refused(make, count, whole, commands, tmp_path):
     assert not faults, "\n".join(f"{seed}: {words}" for seed, words in faults.items())
 
 
-@pytest.mark.parametrize("name", sorted(text_mutants.WHOLE.keys() - {"boxes.json", "set.toml"}))
-def test_what_is_whole_is_read(name, commands, tmp_path):
-    (tmp_path / name).write_text(text_mutants.WHOLE[name])
-    outcome = commands.run("ingest", tmp_path / name, "--fps", "10", "-o", tmp_path / "a.mcap")
-    assert outcome.code == 0, outcome.err
-
-
 def test_every_kind_changes_something_and_the_same_seed_makes_the_same(whole, tmp_path):
     data, kinds = whole.read_bytes(), log_mutants.KINDS
     made = [log_mutants.mutant(seed, data) for seed in range(len(kinds))]
     assert made == [log_mutants.mutant(seed, data) for seed in range(len(kinds))]
     assert {kind for kind, changed in made if changed != data} == kinds.keys()
-    assert [text_mutants.mutant(n) for n in range(50)] == [text_mutants.mutant(n) for n in range(50)]
-    assert {text_mutants.mutant(seed)[0] for seed in range(200)} == text_mutants.WHOLE.keys()
     for seed in range(len(bag_mutants.KINDS)):
         names = []
         for folder in (tmp_path / f"{seed} one", tmp_path / f"{seed} two"):
