@@ -17,6 +17,7 @@ from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above, repaired_tracks
 from mcaptrack.transforms import STAGES, TRANSFORMS
 from tests.commands import GROUP, call, done, zones_file
+from tests.logs import provenance_of
 from tests.robots import write_log
 from tests.tiers import one_in, thorough
 from tests.worlds import tracks_at
@@ -81,10 +82,7 @@ def test_outputs_belong_to_the_camera_of_their_source(path, stage, target):
     for again in list(STAGES)[list(STAGES).index(stage) + 1 :]:  # and what is made from it stands with all the rest
         if TRANSFORMS[again].reads is TRANSFORMS[stage].writes[""] and stage != "retrack":
             done(again, path, "--topic", target, "-q")
-            with log.read(path) as opened:
-                made = Provenance.from_metadata(opened.channel(f"/camera/{STAGES[again].output_topic}").metadata)
-                assert made is not None
-                assert made.input == target
+            assert provenance_of(path, f"/camera/{STAGES[again].output_topic}").input == target
 
 
 def test_a_stage_does_not_replace_the_source_of_its_input(path):

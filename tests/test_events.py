@@ -24,6 +24,7 @@ from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Fra
 from mcaptrack.schema.proto import parse
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.transforms import PROFILES
+from tests.logs import provenance_of
 from tests.worlds import boxed, ns, replace_channel, tracks_at, walk, write_channels
 
 BIRTH, END, MISS, FALSE, SWITCH = (
@@ -375,9 +376,8 @@ def test_events_texts_and_counts_are_channels_beside_the_tracks(place):
 
 def test_options_of_events_are_kept_until_changed(place):
     def rule():
-        with log.read(place) as opened:
-            made = Provenance.from_metadata(opened.channel("/camera/tracks/counts").metadata)
-            return made.parameters["similarity"], made.parameters["gate"]
+        made = provenance_of(place, "/camera/tracks/counts").parameters
+        return made["similarity"], made["gate"]
 
     watched(place, again=True, similarity="metres", gate_m=0.25)
     assert rule() == ("metres", 0.25)
@@ -575,10 +575,8 @@ def test_events_are_made_again_as_they_were_asked_for_unless_something_else_is(t
         made = Provenance(stage, {"asked": asked})
         path = written(tmp_path / "a.mcap", TRACKED, ("/camera/tracks/events", made, []))
         run_watch(path, options=options)
-        with log.read(path) as opened:
-            found = Provenance.from_metadata(opened.channel("/camera/tracks/events").metadata)
-        assert found is not None
-        assert found.parameters["asked"] == dict(zip(names, asked_now, strict=True))
+        found = provenance_of(path, "/camera/tracks/events").parameters["asked"]
+        assert found == dict(zip(names, asked_now, strict=True))
 
 
 def test_events_are_tallied_by_kind_for_each_channel():

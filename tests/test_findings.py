@@ -19,7 +19,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import TRANSFORMS
 from tests.commands import done
-from tests.logs import write_channels
+from tests.logs import provenance_of, write_channels
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
 runner = importlib.import_module("mcaptrack.pipeline.runner")
@@ -30,13 +30,6 @@ steps = importlib.import_module("mcaptrack.pipeline.steps")
 def path(template, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return Path(shutil.copy(template, tmp_path / "a.mcap"))
-
-
-def made_by(path: Path, topic: str) -> Provenance:
-    with log.read(path) as opened:
-        made = Provenance.from_metadata(opened.channel(topic).metadata)
-    assert made is not None
-    return made
 
 
 def written(path: Path, **tracks: list[Frame]) -> Path:
@@ -108,7 +101,7 @@ def test_every_run_repeats_the_warnings_even_with_quiet(path):
     lines = done("run", "b.mcap", "--no-tables").err
     assert f"{len(codes)}, see above: {', '.join(codes)}" in lines
     assert "the scale of the ground, from the heights of boxes" in lines
-    assert made_by(Path("b.mcap"), "/camera/tracks").warnings == []
+    assert provenance_of(Path("b.mcap"), "/camera/tracks").warnings == []
     assert {code for _, code in kept(Path("b.mcap"))} == set(codes)
 
 
@@ -191,4 +184,4 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     assert_same_rows(retracks, samples)
     insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
     assert "held-back" not in {one["code"] for one in insisted["warnings"]} | {code for _, code in kept(path)}
-    assert made_by(path, "/camera/retracks").parameters["side_view"] is True
+    assert provenance_of(path, "/camera/retracks").parameters["side_view"] is True

@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
-from mcaptrack.schema.provenance import CLOCK, Provenance
+from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest import IngestOptions, IngestReport, RecordingJob, ingest
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
@@ -27,6 +27,7 @@ from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
 from mcaptrack.sources.ingest.job import FOR_VIDEOS
 from mcaptrack.sources.ingest.labels.timeline import CameraTopics, camera_prefix, choose_camera
 from tests.bags import ROS1, STRING1, T0, bag1
+from tests.logs import provenance_of
 from tests.worlds import ns
 
 KITTI = "".join(
@@ -55,10 +56,7 @@ def said(report: IngestReport) -> list[tuple[str, str]]:
 
 
 def parameters_of(path: Path, topic: str) -> dict[str, Any]:
-    with log.read(path) as opened:
-        found = Provenance.from_metadata(opened.channel(topic).metadata)
-    assert found is not None
-    return dict(found.parameters)
+    return dict(provenance_of(path, topic).parameters)
 
 
 # Labels

@@ -17,11 +17,11 @@ import pytest
 
 from mcaptrack import log
 from mcaptrack.predictors import NAMES
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms import STAGES as STAGES_OF_LOGS
 from mcaptrack.transforms.protocol import bare_type, choices
 from tests.commands import call, done, toml_value
+from tests.logs import provenance_of
 from tests.tiers import one_in, thorough
 
 
@@ -58,10 +58,8 @@ class Stage:
 
     def made(self, path: Path) -> dict[str, Any]:
         """Return the parameters in the provenance of the channel of this stage."""
-        with log.read(path) as opened:
-            said = Provenance.from_metadata(opened.channel(self.target).metadata)
-        assert said is not None
-        return {name: value for name, value in said.parameters.items() if name in self.parameters()}
+        said = provenance_of(path, self.target).parameters
+        return {name: value for name, value in said.items() if name in self.parameters()}
 
 
 def _other(default: Any, kind: Any, declared: Any) -> Any:

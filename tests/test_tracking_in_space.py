@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 import mcaptrack
 from mcaptrack import McaptrackError, log
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, TRACKS, EventKind, Frame, Schema
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.sort import Sort
+from tests.logs import provenance_of
 from tests.space_logs import (
     LATE_NS,
     NAMES,
@@ -291,11 +291,8 @@ def test_limits_of_motion_reach_every_stage_and_are_recorded(street, tmp_path):
     taken = {name for name, stage in STAGES.items() if "class_limits" in {f.name for f in fields(stage.default)}}
     assert {"retrack", "predict"} <= taken
     assert {*taken, "track", "sample"} <= set(made.stages)
-    with log.read(path) as opened:
-        for topic in {*TRACKED, *PREDICTED} - {"/lidar/samples"}:
-            how = Provenance.from_metadata(opened.channel(topic).metadata)
-            assert how is not None
-            assert how.parameters["class_limits"] == LIMITS, topic
+    for topic in {*TRACKED, *PREDICTED} - {"/lidar/samples"}:
+        assert provenance_of(path, topic).parameters["class_limits"] == LIMITS, topic
     after = rows_of(path)
     for topic, rows in before.items():
         assert rows.tobytes() != after[topic].tobytes(), topic
