@@ -52,6 +52,14 @@ def write_with_views(opened: log.Log, prefix: str, made: dict[str, Made]) -> dic
     return dict(drawn.layouts)
 
 
+def provenance_of(path: Path | str, topic: str) -> Provenance:
+    """How a channel that mcaptrack wrote was made."""
+    with log.read(Path(path)) as opened:
+        made = Provenance.from_metadata(opened.channel(topic).metadata)
+    assert made is not None
+    return made
+
+
 def write_log(path: Path, messages, kind: str = "rows") -> None:
     with log.create(path) as writer:
         numbers = {topic: writer.add_channel(topic, SCHEMA, "json", {"about": topic}, kind) for topic in "abc"}

@@ -318,15 +318,8 @@ class TestResample:
 
     def test_rows_lie_on_the_line_between_their_neighbours(self):
         wanted = [
-            (0, 1, 0.0),
-            (0, 2, 5.0),
-            (5, 1, 0.5),
-            (5, 2, 5.5),
-            (10, 1, 1.0),
-            (10, 2, 6.0),
-            (20, 1, 2.0),
-            (20, 2, 7.0),
-        ]
+            (0, 1, 0.0), (0, 2, 5.0), (5, 1, 0.5), (5, 2, 5.5), (10, 1, 1.0), (10, 2, 6.0), (20, 1, 2.0), (20, 2, 7.0),
+        ]  # fmt: skip
         assert [row[:3] for row in self.at([0, 5, 10, 20])] == wanted
 
     def test_what_lies_inside_a_hole_was_not_seen(self):

@@ -18,7 +18,7 @@ from mcaptrack.geometry.camera_path import CameraPath, poses_of
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane, moved_planes, plane_at, scene_planes
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.staleness import planes_to_json, read_planes
+from mcaptrack.pipeline.staleness import read_planes
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.calibrations import find_calibration, is_rectified_topic, read_calibrations, see_ground
 from mcaptrack.sources.cameras import camera_at
@@ -323,15 +323,6 @@ def test_planes_of_each_picture_hold_where_tracks_are_compensated(straight, tmp_
                 found = plane_at(moved, since_ns)
                 assert found.boxes_to_metres(here) == pytest.approx(plane.boxes_to_metres(points), abs=1e-5)
                 assert found.metres_to_pixels(plane.boxes_to_metres(points)) == pytest.approx(here[:, :2], abs=1e-2)
-
-
-def test_many_planes_are_recorded_by_their_digest():
-    plane = GroundPlane((1.0, 0, 0, 0, 1, 0, 0, 0, 1), 1280, 720)
-    few = planes_to_json([(number, plane) for number in range(100)])
-    assert few[99] == [99, {"homography": [1, 0, 0, 0, 1, 0, 0, 0, 1], "width_px": 1280, "height_px": 720, "point": "foot", "assumed": False}]  # fmt: skip
-    many, other = (planes_to_json([(number, plane) for number in range(start, 101 + start)]) for start in (0, 1))
-    assert many[0] == other[0] == 101
-    assert many[1] != other[1]
 
 
 class TestCalibrations:

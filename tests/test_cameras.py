@@ -17,6 +17,7 @@ from mcaptrack.schema.provenance import Provenance, digest
 from mcaptrack.sources.cameras import camera_at, cameras, find_camera, name_above, repaired_tracks
 from mcaptrack.transforms import STAGES, TRANSFORMS
 from tests.commands import GROUP, call, done, zones_file
+from tests.logs import provenance_of
 from tests.robots import write_log
 from tests.tiers import one_in, thorough
 from tests.worlds import tracks_at
@@ -81,40 +82,7 @@ def test_outputs_belong_to_the_camera_of_their_source(path, stage, target):
     for again in list(STAGES)[list(STAGES).index(stage) + 1 :]:  # and what is made from it stands with all the rest
         if TRANSFORMS[again].reads is TRANSFORMS[stage].writes[""] and stage != "retrack":
             done(again, path, "--topic", target, "-q")
-            with log.read(path) as opened:
-                made = Provenance.from_metadata(opened.channel(f"/camera/{STAGES[again].output_topic}").metadata)
-                assert made is not None
-                assert made.input == target
-
-
-def outputs(path: Path, topic: str) -> dict[str, Any]:
-    """Return the outputs of re-tracking below a topic, with the parameters of each."""
-    with log.read(path) as opened:
-        known = {name: Provenance.from_metadata(channel.metadata) for name, channel in opened.channels.items()}
-    return {
-        name.removeprefix(topic): made.parameters["max_age_s"]
-        for name, made in known.items()
-        if made and made.transform == "retrack" and name.startswith(topic)
-    }
-
-
-@pytest.mark.parametrize(
-    ("mode", "made"), [("online", ["/online", "/predictions"]), ("offline", ["", "/full", "/decisions"])]
-)
-def test_only_existing_outputs_are_made_again(path, mode, made):
-    done("retrack", path, "--to", "/again", "--mode", mode, "--max-age-s", 1, "-q")
-    done("sample", path, "--rate-hz", 5, "-q")
-    done("run", path, "--no-tables", "-q")
-    assert outputs(path, "/again") == dict.fromkeys(made, 1)
-
-
-def test_missing_outputs_are_made_with_the_parameters_of_existing_ones(path):
-    done("drop", path, "/camera/retracks*", "-o", "dropped.mcap", "-q")
-    done("retrack", "dropped.mcap", "--mode", "online", "--max-age-s", 1, "-q")
-    said = done("run", "dropped.mcap", "--no-tables").err
-    assert "/camera/retracks is missing: running retrack, as for what it made beside it" in said
-    every = ["", "/full", "/online", "/predictions", "/decisions"]
-    assert outputs(Path("dropped.mcap"), "/camera/retracks") == dict.fromkeys(every, 1)
+            assert provenance_of(path, f"/camera/{STAGES[again].output_topic}").input == target
 
 
 def test_a_stage_does_not_replace_the_source_of_its_input(path):

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from mcaptrack import __version__, log
+from mcaptrack import __version__
 from mcaptrack.cli.demo import _next_commands
-from mcaptrack.schema import COUNTS, EVENTS, EventKind
 from mcaptrack.sources import demo
 from mcaptrack.sources.demo import read_scores
 from mcaptrack.viewing.serving import Server
@@ -50,23 +49,6 @@ class TestCommands:
         assert shown["/camera/tracks/view/image"] == {"visible": False}
         assert shown["/camera/detections/view/image"] == {"visible": False}
 
-    def test_a_second_run_changes_nothing(self, finished):
-        before = finished.read_bytes()
-        printed("run", finished)  # the log was moved, and one of the tables says where it is
-        _, err = printed("run", finished)
-        assert "nothing to do, everything is up to date" in err
-        assert finished.read_bytes() == before
-
-    def test_another_tracker_replaces_the_tracks(self, finished, tmp_path):
-        path = tmp_path / "other.mcap"
-        printed("track", finished, "--tracker", "bytetrack", "--set", "new_score=0.3", "-o", path)
-        channels = {c["topic"]: c for c in json.loads(printed("info", path, "--json")[0])["results"][0]["channels"]}
-        assert channels["/camera/tracks"]["parameters"]["tracker"] == "bytetrack"
-        assert channels["/camera/tracks"]["parameters"]["new_score"] == 0.3
-        code, _, err = call("track", path, "--tracker", "ocsort", "--set", "new_score=0.3")
-        assert code == 1
-        assert err == "mcaptrack: --set new_score is an option of bytetrack, not of ocsort\n"
-
     def test_a_stage_runs_missing_inputs_and_says_so(self, fresh):
         _, err = printed("track", fresh)
         assert "/camera/detections is missing: running detect" in err
@@ -76,90 +58,6 @@ class TestCommands:
         assert printed("track", fresh, "-q") == ("", "")
         _, err = printed("track", fresh, "--max-age-s", 3)
         assert not {"\x1b", "\r"} & set(err)
-
-    def test_info_shows_channels_and_lineage(self, finished):
-        out, err = printed("info", finished)
-        assert err == ""
-        for words in ("/camera/retracks/online", "foxglove.CompressedVideo", "lineage"):
-            assert words in out
-        assert "/view/image" in out
-        tree = out[out.index("lineage") :]
-        assert [line.split()[-2] for line in tree.splitlines() if "detections" in line or "samples" in line] == [
-            "/camera/detections",
-            "/camera/samples",
-        ]
-
-    def test_output_profile_and_mode_of_retrack(self, finished, tmp_path):
-        before = finished.read_bytes()
-        words = ("--profile", "paper", "--set", "sigma_m=2", "--mode", "offline")
-        printed("retrack", finished, *words, "-o", tmp_path / "p.mcap")
-        assert finished.read_bytes() == before
-        (result,) = json.loads(printed("info", tmp_path / "p.mcap", "--json")[0])["results"]
-        made = {channel["topic"]: channel["parameters"] for channel in result["channels"]}
-        assert (made["/camera/retracks"]["distance"], made["/camera/retracks"]["sigma_m"]) == ("mean", 2.0)
-        assert made["/camera/retracks/online"]["retracker"] == "likelihood"  # only the other output was made
-
-
-class TestEvaluate:
-    def test_scores_as_a_table(self, finished):
-        out, _ = printed("evaluate", finished)
-        assert out.startswith("within 1 m: IDF1 ")
-        assert out.count("/camera/samples  ") == 2  # its scores, and its forecasts
-        out, _ = printed("evaluate", finished, "--all")
-        for words in ("IDF1", "IoU 0.5", "0.5 m", "2 m", "/camera/retracks/online", "forecasts of", "ADE m"):
-            assert words in out
-
-    def test_scores_as_json(self, finished):
-        rows = json.loads(printed("evaluate", finished, "--json")[0])["results"]
-        keys = {
-            "sequence", "tracks", "mode", "similarity", "gate", "rules", "MOTA", "IDF1", "IDP", "IDR", "HOTA", "DetA",
-            "AssA", "LocA", "IDSW", "FP", "FN", "Frag", "MT", "PT", "ML", "GT",
-        }  # fmt: skip
-        assert all(keys <= set(row) for row in rows)
-        modes = {row["tracks"]: row["mode"] for row in rows}
-        assert modes == {
-            "/camera/tracks": None,
-            "/camera/samples": None,
-            "/camera/retracks": "offline",
-            "/camera/retracks/online": "online",
-        }
-        assert {row["gate"] for row in rows if row["similarity"] == "metres"} == {0.5, 1.0, 2.0}
-        displaced = [row for row in rows if "displacement" in row]
-        assert {row["tracks"] for row in displaced} == {"/camera/samples", "/camera/retracks/online"}
-        wanted = {
-            "ADE_m", "FDE_m", "ADE_squared_m2", "recall", "AADE_m", "false_forecasts_per_frame", "consistency_m",
-            "NLL", "reliability", "coverage_50", "coverage_90", "coverage_95",
-        }  # fmt: skip
-        assert wanted <= set(displaced[0]["displacement"])
-
-    def test_several_logs_have_a_combined_row(self, finished, tmp_path):
-        (tmp_path / "other.mcap").write_bytes(finished.read_bytes())
-        words = ("--similarity", "metres", "--gate-m", "1", "--json")
-        rows = json.loads(printed("evaluate", finished, tmp_path / "other.mcap", *words)[0])["results"]
-        combined = {row["tracks"]: row for row in rows if row["sequence"] == "COMBINED"}
-        single = {row["tracks"]: row for row in rows if row["sequence"] == "walk"}
-        assert combined["/camera/samples"]["FN"] == 2 * single["/camera/samples"]["FN"]
-        assert combined["/camera/samples"]["MOTA"] == pytest.approx(single["/camera/samples"]["MOTA"])
-
-    def test_tracks_in_files_are_scored_without_a_log(self, footage):
-        words = ("evaluate", footage.ground_truth, "--truth", footage.ground_truth, "--json")
-        rows = json.loads(printed(*words)[0])["results"]
-        assert [(row["similarity"], row["MOTA"], row["IDF1"]) for row in rows] == [("iou", 1.0, 1.0)]
-        rows = json.loads(printed(*words, "--ground-plane", footage.ground_plane)[0])["results"]
-        assert [row["similarity"] for row in rows] == ["iou", "metres", "metres", "metres"]
-
-
-class TestConfig:
-    def test_what_a_file_sets_for_another_tracker_stays_out(self, fresh, tmp_path):
-        (tmp_path / "own.toml").write_text('[track]\ntracker = "ocsort"\nset = ["inertia=0.3"]\n')
-
-        def made(*words):
-            printed("track", fresh, "-q", "--config", "own.toml", *words, folder=tmp_path)
-            (result,) = json.loads(printed("info", fresh, "--json")[0])["results"]
-            return next(c["parameters"] for c in result["channels"] if c["topic"] == "/camera/tracks")
-
-        assert made()["inertia"] == 0.3
-        assert "inertia" not in made("--tracker", "sort")
 
 
 @pytest.fixture(scope="module")
@@ -403,24 +301,6 @@ def test_recover_saves_intact_chunks_and_exits_with_3_after_losses(finished, tmp
     assert (code, "is both input and output" in err) == (1, True)
     _, err = printed("recover", finished, "-o", tmp_path / "all.mcap")
     assert "nothing was lost" in err
-
-
-def test_run_writes_events_unless_told_not_to(fresh, finished):
-    """Sums of events and of counts are the numbers that evaluate prints, matched by overlap."""
-    scores = json.loads(printed("evaluate", finished, "--json", "--similarity", "iou", "--topic", "/camera/tracks")[0])
-    (score,) = scores["results"]
-    with log.read(finished) as opened:
-        counts = opened.rows("/camera/tracks/counts", COUNTS).rows
-        events = opened.rows("/camera/tracks/events", EVENTS).rows
-        assert "/camera/retracks/events/view/log" in opened.channels
-    assert counts["mota"][-1] == pytest.approx(score["MOTA"], abs=1e-12)
-    assert (counts["misses"].sum(), counts["false_tracks"].sum()) == (score["FN"], score["FP"])
-    assert (events["kind"] == EventKind.SWITCH).sum() == counts["switches"][-1] == score["IDSW"]
-    printed("run", fresh, "--no-events", "--no-tables")
-    out, _ = printed("run", fresh, "--no-tables", "--json")
-    (result,) = json.loads(out)["results"]
-    assert result["stages"] == ["events"]
-    assert result["events"]["/camera/tracks"]["birth"] == counts["born"][-1]
 
 
 def test_drop_removes_a_channel_and_its_views_only(finished, tmp_path):

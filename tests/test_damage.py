@@ -129,12 +129,8 @@ def _damages(path: Path) -> dict[str, tuple[bytes, set[str]]]:
 #: Damages that lose nothing at all, and those that take no message away.
 HARMLESS = {"the summary", "where the summary is", "cut off in the summary"}
 NO_MESSAGES = HARMLESS | {
-    "a chunk's times",
-    "not an MCAP file",
-    "an attachment",
-    "a chunk twice",
-    "an attachment's length",
-}
+    "a chunk's times", "not an MCAP file", "an attachment", "a chunk twice", "an attachment's length",
+}  # fmt: skip
 
 
 def test_damage_is_found_by_name_and_what_is_whole_is_saved(chunked, tmp_path):

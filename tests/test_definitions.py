@@ -7,6 +7,7 @@ import re
 import sqlite3
 import struct
 import time
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +35,9 @@ from tests.undefined import T0, message, names_no_definitions, package, store_of
 
 #: How one type is written: ROS 2, ROS 1, IDL, DDS, Python, and with what writers put before it.
 SPELLINGS = {
-    "ROS 2": "{}/msg/{}",
-    "ROS 1": "{}/{}",
-    "IDL": "{}::msg::{}",
-    "global IDL": "::{}::msg::{}",
-    "DDS": "{}::msg::dds_::{}_",
-    "Python": "{}.msg.{}",
-    "slash": "/{}/msg/{}",
-}
+    "ROS 2": "{}/msg/{}", "ROS 1": "{}/{}", "IDL": "{}::msg::{}", "global IDL": "::{}::msg::{}",
+    "DDS": "{}::msg::dds_::{}_", "Python": "{}.msg.{}", "slash": "/{}/msg/{}",
+}  # fmt: skip
 
 
 #: What asks for a type, with a type that it reads, and what it gives for a channel of it.
@@ -164,20 +160,23 @@ def test_a_type_is_the_same_in_every_spelling(tmp_path, kind):
     assert any(wanted[0])
     assert wanted[1]
     read = rows(tmp_path / "a.mcap")
-    for spelling in SPELLINGS.values():
-        spelt = spelling.format(*name.split("/"))
-        assert plain_name(spelt) == plain_name(name)
-        for encoding, definition in (
-            ("ros2msg", text),
-            ("ros2msg", text.replace("\n", "\r\n").replace("=" * 80, "=" * 79)),
-            ("ros2idl", as_idl(types, False)),
-            ("omgidl", as_idl(types, False)),
-            ("omgidl", as_idl(types, True)),
-            ("ros2msg", as_idl(types, False)),  # of a writer that says what it isn't
-        ):
-            path = write(tmp_path / "b.mcap", spelt, encoding, definition, payloads)
-            assert answers(path, asked) == wanted, (spelt, encoding)
-            assert rows(path) == read, (spelt, encoding)
+    written = [
+        ("ros2msg", text),
+        ("ros2msg", text.replace("\n", "\r\n").replace("=" * 80, "=" * 79)),
+        ("ros2idl", as_idl(types, False)),
+        ("omgidl", as_idl(types, False)),
+        ("omgidl", as_idl(types, True)),
+        ("ros2msg", as_idl(types, False)),  # of a writer that says what it isn't
+    ]
+    spelt = [spelling.format(*name.split("/")) for spelling in SPELLINGS.values()]
+    assert {plain_name(one) for one in spelt} == {plain_name(name)}
+    for one, (encoding, definition) in [
+        *zip(spelt, cycle(written), strict=False),
+        *((spelt[4], way) for way in written),
+    ]:
+        path = write(tmp_path / "b.mcap", one, encoding, definition, payloads)
+        assert answers(path, asked) == wanted, (one, encoding)
+        assert rows(path) == read, (one, encoding)
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from mcaptrack.pipeline.scores import DOUBTFUL, score_map, score_range, without_
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import GroundTracker
+from tests.tiers import one_in
 
 NAMES = ((1, "pedestrian"), (3, "car"))
 FRAMES, STEP_NS = 200, 100_000_000
@@ -107,7 +108,7 @@ def mota(scene: Scene, score: np.ndarray, kind: int) -> float:
     return 100 * (1 - (counts["FP"] + counts["FN"] + counts["IDSW"]) / sum(map(len, true)))
 
 
-@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("scale", one_in(3, SCALES))
 def test_what_scores_mean_is_found_without_truth(scale):
     """In every class: the order stays, likelihoods are shares of real detections, tracks as good as with true ones."""
     off, worse = [], []

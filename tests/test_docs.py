@@ -35,7 +35,10 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 COMMANDS = GROUP.commands
 #: Pages that take long, and whose commands other tests run; those of README.md tools/readme.py runs in an environment of
 #: its own.
-LONG = {"README.md", "ablation.md", "fleet.md", "stages.md", "tuning.md"}
+LONG = {
+    "README.md", "ablation.md", "camera-motion.md", "extend.md", "fleet.md", "python.md", "robots.md", "sql.md", "stages.md",
+    "tuning.md", "tutorial.md",
+}  # fmt: skip
 #: What a page finds where it names it: a copy of a prepared file or folder.
 PREPARED = {
     "log.mcap": "log.mcap",

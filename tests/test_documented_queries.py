@@ -40,10 +40,12 @@ from mcaptrack.tables.export import export
 from tests.logs import write_channels
 from tests.test_query import PRELUDE
 from tests.test_zones import HOLED, LINE, SQUARE, collection, feature
+from tests.tiers import thorough
 from tests.worlds import ns, tracks_at
 from tools import pages
 from tools.pages import ROOT
 
+pytestmark = thorough
 NS = 1_000_000_000
 SCENE = replace(demo_scene(), fps=7, width_px=480, height_px=270)
 ZONES = collection(

@@ -25,6 +25,7 @@ from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import Sort
 from mcaptrack.transforms.motion import EstimateMotion
 from tests.commands import done
+from tests.logs import provenance_of
 from tests.tiers import thorough
 from tests.worlds import ns
 
@@ -93,10 +94,7 @@ def path(template, tmp_path) -> Path:
 
 
 def plane_of(path: Path) -> Provenance:
-    with log.read(path) as opened:
-        made = Provenance.from_metadata(opened.channel("/camera/ground_plane").metadata)
-    assert made is not None
-    return made
+    return provenance_of(path, "/camera/ground_plane")
 
 
 def test_run_estimates_a_plane_from_boxes_and_says_how_well_it_fits(template):

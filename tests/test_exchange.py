@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 import zipfile
 from itertools import pairwise
@@ -327,14 +326,6 @@ class TestCommand:
         with pytest.raises(McaptrackError, match=r"pip install \"mcaptrack\[rerun\]\""):
             mcaptrack.export(template, tmp_path / "a.rrd", form="rerun")
         assert not list(tmp_path.iterdir())
-
-    def test_a_recording_of_rerun_has_pictures_boxes_and_forecasts(self, template, tmp_path):
-        pytest.importorskip("rerun", reason="the extra rerun is not installed")
-        result = mcaptrack.export(template, tmp_path / "a.rrd", form="rerun")
-        command = [sys.executable, "-m", "rerun_cli", "rrd", "print", tmp_path / "a.rrd"]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        assert list(result.rows) == ["/camera/retracks/full"]
-        assert all(f"/{name}" in said for name in ("camera", "camera/boxes", "ground/trails", "ground/forecasts"))
 
     def test_frames_and_sizes_of_coco_are_those_of_the_pictures(self, template, tmp_path):
         mcaptrack.export(template, tmp_path / "a.json", form="coco", topic="/camera/truth")

@@ -37,14 +37,8 @@ def exported(path, folder, **options):
 def test_a_log_becomes_a_folder_that_duckdb_joins(tmp_path):
     done = exported(some_log(tmp_path / "walk = 1.mcap"), tmp_path / "tables")
     assert done.rows == dict.fromkeys(tables.TABLES, 0) | {
-        "channels": 4,
-        "detections": 3,
-        "frames": 10,
-        "metrics": 3,
-        "recordings": 1,
-        "track_summary": 4,
-        "tracks": 12,
-    }
+        "channels": 4, "detections": 3, "frames": 10, "metrics": 3, "recordings": 1, "track_summary": 4, "tracks": 12,
+    }  # fmt: skip
     folder = tmp_path / "tables"
     assert ask("select topic, t_ns, rows from '@/frames/*/*.parquet' where rows = 0 order by all", folder) == [
         ("/camera/detections", ns(2), 0),
@@ -96,11 +90,8 @@ def test_recordings_say_what_the_log_is(tmp_path):
     with log.read(plain) as a, log.read(planar) as b:
         first, second = (LogTables(opened).table("recordings").to_pylist()[0] for opened in (a, b))
     assert (first["file"], first["messages"], first["duration_s"], first["ground_plane"]) == (
-        "plain.mcap",
-        14,
-        3.000000007,
-        None,
-    )
+        "plain.mcap", 14, 3.000000007, None,
+    )  # fmt: skip
     assert first["size_bytes"] == plain.stat().st_size
     assert second["ground_plane"] == "assumed"
     assert json.loads(first["source"]) == {"/camera/truth": {"max_age_s": 1.4}}

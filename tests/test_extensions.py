@@ -27,10 +27,11 @@ from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS
 from mcaptrack.schema import DETECTIONS, TRACKS
-from mcaptrack.schema.provenance import Plugin, Provenance
+from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources import fixed_frame
 from mcaptrack.testing import LawError
 from tests.commands import call, done
+from tests.logs import provenance_of
 from tools import pages
 
 PAGE = pages.blocks(pages.ROOT / "docs" / "extend.md")
@@ -82,13 +83,6 @@ def rows_of(path: str, topic: str) -> Any:
     with log.read(Path(path)) as opened:
         frames = list(opened.frames(topic, TRACKS if "detections" not in topic else DETECTIONS))
     return [str((frame.t_ns, frame.index, frame.rows.tolist())) for frame in frames]  # NaN is not equal to itself
-
-
-def provenance_of(path: str, topic: str) -> Provenance:
-    with log.read(Path(path)) as opened:
-        found = Provenance.from_metadata(opened.channel(topic).metadata)
-    assert found is not None
-    return found
 
 
 def one_line(*words: str, code: int = 1) -> str:

@@ -9,19 +9,17 @@ from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import mcaptrack
 from mcaptrack import log, notices, pipeline
-from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline.planes import AS_BEFORE, make_plane
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import TRANSFORMS, KnnDetector
+from mcaptrack.transforms import TRANSFORMS
 from tests.commands import done
-from tests.logs import write_channels
+from tests.logs import provenance_of, write_channels
 from tests.worlds import assert_same_rows, ns, tracks_at, walk
 
 runner = importlib.import_module("mcaptrack.pipeline.runner")
@@ -32,13 +30,6 @@ steps = importlib.import_module("mcaptrack.pipeline.steps")
 def path(template, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return Path(shutil.copy(template, tmp_path / "a.mcap"))
-
-
-def made_by(path: Path, topic: str) -> Provenance:
-    with log.read(path) as opened:
-        made = Provenance.from_metadata(opened.channel(topic).metadata)
-    assert made is not None
-    return made
 
 
 def written(path: Path, **tracks: list[Frame]) -> Path:
@@ -110,7 +101,7 @@ def test_every_run_repeats_the_warnings_even_with_quiet(path):
     lines = done("run", "b.mcap", "--no-tables").err
     assert f"{len(codes)}, see above: {', '.join(codes)}" in lines
     assert "the scale of the ground, from the heights of boxes" in lines
-    assert made_by(Path("b.mcap"), "/camera/tracks").warnings == []
+    assert provenance_of(Path("b.mcap"), "/camera/tracks").warnings == []
     assert {code for _, code in kept(Path("b.mcap"))} == set(codes)
 
 
@@ -183,11 +174,6 @@ def side_by_side(frames: int = 60) -> list[str]:
     return [f"{n},-1,{x},20,20,60,1,-1,-1,-1" for n in range(1, frames) for x in (n * 3, 200 - n * 3)]
 
 
-def downwards(frames: int = 60) -> list[str]:
-    """Return tracks of people seen from above, with paths over the whole picture."""
-    return [f"{n},-1,{x},{n * 4},20,40,1,-1,-1,-1" for n in range(1, frames) for x in (100, 300)]
-
-
 def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     path = ingested(tmp_path / "a.mcap", side_by_side())
     data = json.loads(done("run", path, "--no-tables", "--json", "-q").out)
@@ -198,104 +184,4 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     assert_same_rows(retracks, samples)
     insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
     assert "held-back" not in {one["code"] for one in insisted["warnings"]} | {code for _, code in kept(path)}
-    assert made_by(path, "/camera/retracks").parameters["side_view"] is True
-
-
-@pytest.fixture(scope="module")
-def short(tmp_path_factory) -> Path:
-    """A log of 14 pictures, 1.3 s, of two people seen from above, with their samples."""
-    folder = tmp_path_factory.mktemp("short")
-    (folder / "plane.txt").write_text("0.05,0,0\n0,0.05,0\n0,0,1\n")
-    path = ingested(folder / "a.mcap", downwards(15), "--ground-plane", folder / "plane.txt")
-    done("sample", path, "-q")
-    return path
-
-
-def test_a_short_sequence_keeps_its_people(short, tmp_path):
-    path = shutil.copy(short, tmp_path / "a.mcap")
-    assert json.loads(done("retrack", path, "--json", "-q").out)["warnings"] == []
-    with log.read(path) as opened:
-        kept_people = np.unique(opened.rows("/camera/retracks", TRACKS).rows["track_id"])
-    assert len(kept_people) == 2
-
-
-@pytest.mark.parametrize(
-    ("setting", "reason"),
-    [
-        ("track_confidence=0", "the longest track lasts 1.2 s; those under 2 s are left out (min_track_s)"),
-        ("track_confidence=1", "no track is likely enough to be a person (track_confidence)"),
-    ],
-)
-def test_why_nobody_is_kept_is_said(setting, reason, short, tmp_path):
-    path = shutil.copy(short, tmp_path / "a.mcap")
-    (said,) = json.loads(done("retrack", path, "--set", setting, "--json", "-q").out)["warnings"]
-    assert said["code"] == "nothing-found"
-    assert reason in said["message"]
-
-
-# Cameras that move
-
-_TEXTURE = np.random.default_rng(0).integers(0, 256, (30, 60), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
-
-
-def view(x: float, y: float = 40.0, walker: int | None = None) -> np.ndarray:
-    """Return a part of a large picture, with a person in it, (96, 128) uint8."""
-    image = _TEXTURE[round(y) : round(y) + 96, round(x) : round(x) + 128].copy()
-    if walker is not None:
-        image[30:60, walker : walker + 12] = 255
-    return image
-
-
-def looks(kind: str, n: int) -> np.ndarray:
-    """Return picture ``n`` of 60 from a camera with this kind of motion."""
-    walker = (n * 2) % 110
-    shake = (3 * np.sin(n * 1.7), 2 * np.cos(n * 2.3))
-    return {
-        "stands": lambda: view(100, walker=walker),
-        "shakes": lambda: view(100 + shake[0], 40 + shake[1], walker),
-        "is empty": lambda: np.full((96, 128), 90, np.uint8),
-        "is dim and noisy": lambda: (view(100, walker=walker) // 4 + np.random.default_rng(n).integers(0, 6, (96, 128))).astype(np.uint8),
-        "pans for a while": lambda: view(100 + 4 * max(0, n - 48), walker=walker),
-        "pans": lambda: view(20 + 5 * n, walker=walker),
-        "pans over a still scene": lambda: view(20 + 5 * n),
-        "is cut": lambda: view(100 if n < 30 else 300, walker=walker),
-    }[kind]()  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("kind", "codes"),
-    [
-        ("stands", []),
-        ("shakes", []),
-        ("is empty", []),
-        ("is dim and noisy", []),
-        ("pans for a while", ["camera-moves"]),
-        ("is cut", ["view-lost"]),
-    ],
-)
-def test_detect_warns_of_camera_motion_but_not_of_shaking(kind, codes):
-    frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
-    with notices.collected() as said:
-        list(KnnDetector()(frames))
-    assert [notice.code for notice in said] == codes
-
-
-@pytest.mark.parametrize("kind", ["pans", "pans over a still scene"])
-def test_detect_refuses_a_camera_in_constant_motion(kind):
-    frames = [Frame(ns(n / 10), n, looks(kind, n)) for n in range(60)]
-    with pytest.raises(McaptrackError, match=r"the camera moves in \d+% of the pictures"):
-        list(KnnDetector()(frames))
-
-
-def test_later_stages_repeat_the_warning_of_camera_motion(tmp_path):
-    import cv2
-
-    (tmp_path / "pictures").mkdir()
-    for n in range(60):
-        cv2.imwrite(str(tmp_path / "pictures" / f"{n:03}.png"), looks("pans for a while", n))
-    path = tmp_path / "a.mcap"
-    done("ingest", tmp_path / "pictures", "--fps", "10", "--image-format", "png", "-o", path, "-q")
-    for command in ("detect", "track"):
-        outcome = done(command, path, "--json", "-q")
-        assert "camera-moves" in [one["code"] for one in json.loads(outcome.out)["warnings"]]
-        assert f"warning: {path}: the camera moves in" in outcome.err
+    assert provenance_of(path, "/camera/retracks").parameters["side_view"] is True

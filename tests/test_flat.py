@@ -128,11 +128,8 @@ def test_protobuf_is_read_by_the_definition_in_the_log(tmp_path, state):
     assert (ns(table, "stamp"), first["took_ns"]) == ([5_000_000_007, None], -1_000_000_005)
     assert (first["track_at_x"], first["track_at_y"]) == (5e-324, float(np.float32(0.1)))
     assert (first["ids"], first["modes"], first["mode"], first["big"]) == (
-        [-1, 2],
-        ["IDLE", "DRIVE"],
-        "DRIVE",
-        2**64 - 1,
-    )
+        [-1, 2], ["IDLE", "DRIVE"], "DRIVE", 2**64 - 1,
+    )  # fmt: skip
     assert math.copysign(1, first["maybe"]) == -1
     assert (first["counts"], first["words"], first["inner_words"]) == ([{"key": "a", "value": 3}], 'a,"b"\n', "within")
     assert first["track_more"] == [{"x": math.inf, "y": 0.0}]

@@ -58,16 +58,9 @@ def test_totals_by_hand():
     assert found.pop("hours") == pytest.approx(2 / 60)
     assert found.pop("median_IDF1") == pytest.approx(0.7)
     assert found == {
-        "logs": 3,
-        "bytes": 18_000_000,
-        "tracks": 10,
-        "scored": 2,
-        "IDSW": 4,
-        "with_warnings": 1,
-        "without_tracks": 1,
-        "empty": 1,
-        "versions": {"": 1, "0.3.0": 2},
-    }
+        "logs": 3, "bytes": 18_000_000, "tracks": 10, "scored": 2, "IDSW": 4, "with_warnings": 1, "without_tracks": 1,
+        "empty": 1, "versions": {"": 1, "0.3.0": 2},
+    }  # fmt: skip
 
 
 def test_the_worst_logs_come_first_and_those_without_a_value_not_at_all():

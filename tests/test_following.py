@@ -18,8 +18,8 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.pipeline import following
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
-from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
+from tests.logs import provenance_of
 from tests.places import CAMERAS, NS, PEOPLE, walk, write_log
 
 FPS, FRAMES = 10, 210
@@ -157,8 +157,7 @@ def test_a_second_run_has_nothing_to_do_until_the_log_before_changes(parts, tmp_
     alone = mcaptrack.run(paths[1], force=True, tables=False)
     said = [notice.message for notice in alone.warnings if notice.code == "other-settings"]
     assert [one.partition(" ")[0] for one in said] == ["/camera/tracks", "/camera/retracks"]
-    with log.read(paths[1]) as opened:
-        assert Provenance.from_metadata(opened.channel("/camera/tracks").metadata).continued == {}
+    assert provenance_of(paths[1], "/camera/tracks").continued == {}
 
 
 def test_the_command_line_takes_logs_in_their_order(parts, tmp_path, monkeypatch):

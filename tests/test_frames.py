@@ -408,10 +408,6 @@ class TestReading:
             assert fixed_frame.transforms_of(opened) is None
 
 
-def data(*words: object) -> list[dict]:
-    return json.loads(done(*words, "--json").out)["results"]
-
-
 def packed(parent: str, child: str, t_ns: int, x: float = 0.0) -> bytes:
     one = FrameTransform(parent_frame_id=parent, child_frame_id=child)
     one.timestamp.seconds, one.timestamp.nanos = divmod(t_ns, S)

@@ -78,17 +78,8 @@ def test_boxes_of_all_cameras_are_at_the_times_of_the_slowest(steps_s, late_s, w
                         (camera, one.frames[k].t_ns, row, *foot, spread, 0, spread, box["score"], box["class_id"])
                     )
         names = (
-            "camera",
-            "picture_ns",
-            "box_row",
-            "x_m",
-            "y_m",
-            "cov_xx_m2",
-            "cov_xy_m2",
-            "cov_yy_m2",
-            "score",
-            "class_id",
-        )
+            "camera", "picture_ns", "box_row", "x_m", "y_m", "cov_xx_m2", "cov_xy_m2", "cov_yy_m2", "score", "class_id",
+        )  # fmt: skip
         got = np.array([frame.rows[name].astype(float) for name in names]).T
         np.testing.assert_allclose(got, np.array(wanted, float).reshape(-1, len(names)), rtol=1e-6, atol=1e-9)
 

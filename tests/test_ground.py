@@ -170,20 +170,11 @@ def test_the_documentation_has_the_table_of_limits():
 @pytest.mark.parametrize(
     ("name", "row"),
     {
-        "vehicle.bus.rigid": "bus",
-        "human.pedestrian.adult": "person",
-        "REGULAR_VEHICLE": "car",
-        "LARGE_VEHICLE": "truck",
-        "MOTORCYCLIST": "motorcycle",
-        "Cyclist": "bicycle",
-        "traffic_cone": "object",
-        "Person_sitting": "person",
-        "TYPE_VEHICLE": "car",
-        "BoxTruck": "truck",
-        "": "unknown",
-        "carpet": "unknown",
+        "vehicle.bus.rigid": "bus", "human.pedestrian.adult": "person", "REGULAR_VEHICLE": "car",
+        "LARGE_VEHICLE": "truck", "MOTORCYCLIST": "motorcycle", "Cyclist": "bicycle", "traffic_cone": "object",
+        "Person_sitting": "person", "TYPE_VEHICLE": "car", "BoxTruck": "truck", "": "unknown", "carpet": "unknown",
     }.items(),
-)
+)  # fmt: skip
 def test_names_of_data_sets_have_a_row(name: str, row: str):
     assert limits_row(name) == row
 
@@ -335,14 +326,9 @@ def test_forecasts_of_retracked_cars_are_those_of_predict():
 
 #: Mean length, width and height in metres of boxes of the public data set nuScenes (its training split).
 MEAN_SIZES = {
-    "car": (4.63, 1.97, 1.74),
-    "truck": (6.93, 2.51, 2.84),
-    "bus": (11.1, 2.95, 3.47),
-    "trailer": (12.3, 2.90, 3.87),
-    "motorcycle": (2.11, 0.77, 1.47),
-    "bicycle": (1.70, 0.60, 1.28),
-    "person": (0.73, 0.67, 1.77),
-}
+    "car": (4.63, 1.97, 1.74), "truck": (6.93, 2.51, 2.84), "bus": (11.1, 2.95, 3.47), "trailer": (12.3, 2.90, 3.87),
+    "motorcycle": (2.11, 0.77, 1.47), "bicycle": (1.70, 0.60, 1.28), "person": (0.73, 0.67, 1.77),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MEAN_SIZES)

@@ -21,7 +21,6 @@ MOT15 = "1,3,10,20,4,8,1,-1,-1,-1\n2,3,11,20,4,8,0.5,-1,-1,-1\n1,5,50,60,4,8,1,-
 
 
 TRAJNET = "0 7 1.5 2.5\n12 7 1.6 2.5\n12 9 3.0 4.0\n24 7 1.7 2.5\n"
-OBSMAT = "780 1 8.46 0 3.59 1.67 0 0.17\n786 1 9.13 0 3.66 1.67 0 0.17\n"
 
 
 def write(path: Path, text: str) -> Path:
@@ -30,18 +29,6 @@ def write(path: Path, text: str) -> Path:
 
 
 class TestLabels:
-    @pytest.mark.parametrize("text", [TRAJNET, TRAJNET.replace(" ", ","), TRAJNET.replace(" ", "\t")])
-    def test_trajnet_by_hand(self, tmp_path, text):
-        labels = read_labels(write(tmp_path / "a.txt", text))
-        assert (labels.format, labels.step) == ("trajnet", 12)
-        assert labels.xy_m.tolist() == [[1.5, 2.5], [1.6, 2.5], [3.0, 4.0], [1.7, 2.5]]
-        assert labels.boxes_px is None
-
-    def test_obsmat_by_hand(self, tmp_path):
-        labels = read_labels(write(tmp_path / "obsmat.txt", OBSMAT))
-        assert (labels.format, labels.step) == ("obsmat", 6)
-        assert labels.xy_m.tolist() == [[8.46, 3.59], [9.13, 3.66]]
-
     def test_what_is_no_text_is_said(self, tmp_path):
         (tmp_path / "a.txt").write_bytes(b"\xff\xfe\x00\x00" * 10)
         with pytest.raises(McaptrackError, match="is not text in UTF-8"):

@@ -15,7 +15,7 @@ from mcaptrack.schema.camera_motion import frames_to_path
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.job import motion_frames, read_motions
 from tests.commands import call, done
-from tests.logs import add_rows
+from tests.logs import add_rows, provenance_of
 from tests.worlds import boxes_at, ns, write_clip
 
 STEP = -40.0
@@ -63,10 +63,9 @@ def test_tracks_follow_the_motion_that_was_ingested_beside_boxes(folder):
     assert said["summary"]["camera_motion"] == "moving"
     assert "motion" not in said["stages"]
     assert tracks("a.mcap") == 2
-    with log.read(Path("a.mcap")) as opened:
-        how = Provenance.from_metadata(opened.channel("/camera/tracks").metadata)
-        assert how.references == {"/camera/motion": made.digest}
-        assert "camera_path" not in how.parameters
+    how = provenance_of("a.mcap", "/camera/tracks")
+    assert how.references == {"/camera/motion": made.digest}
+    assert "camera_path" not in how.parameters
     done("run", "a.mcap", "--camera-motion", "off", "--no-tables", "-q")
     assert tracks("a.mcap") > 4
     assert json.loads(done("run", "a.mcap", "--no-tables", "--json", "-q").out)["results"][0]["stages"] == []

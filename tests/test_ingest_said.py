@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
-from mcaptrack.schema.provenance import CLOCK, Provenance
+from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest import IngestOptions, IngestReport, RecordingJob, ingest
 from mcaptrack.sources.ingest.bags import decompression, plain_yaml
 from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
@@ -27,6 +27,7 @@ from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
 from mcaptrack.sources.ingest.job import FOR_VIDEOS
 from mcaptrack.sources.ingest.labels.timeline import CameraTopics, camera_prefix, choose_camera
 from tests.bags import ROS1, STRING1, T0, bag1
+from tests.logs import provenance_of
 from tests.worlds import ns
 
 KITTI = "".join(
@@ -55,10 +56,7 @@ def said(report: IngestReport) -> list[tuple[str, str]]:
 
 
 def parameters_of(path: Path, topic: str) -> dict[str, Any]:
-    with log.read(path) as opened:
-        found = Provenance.from_metadata(opened.channel(topic).metadata)
-    assert found is not None
-    return dict(found.parameters)
+    return dict(provenance_of(path, topic).parameters)
 
 
 # Labels
@@ -330,18 +328,12 @@ def test_a_folder_of_images_is_kept_with_how_it_was_made(tmp_path):
     options = IngestOptions(fps=Fraction(25, 2), image_format="jpeg", quality=70, camera="gate")
     report = ingest(folder, tmp_path / "a.mcap", options, progress=lambda *some: told.append(some))
     assert parameters_of(tmp_path / "a.mcap", "/gate/video") == {
-        "file": "images",
-        "image_format": "jpeg",
-        "fps": "25/2",
-        "quality": 70,
-    }
+        "file": "images", "image_format": "jpeg", "fps": "25/2", "quality": 70,
+    }  # fmt: skip
     assert told == [("ingest", number, 3) for number in (1, 2, 3)]
     assert (report.messages, report.has_labels, report.uses_camera, said(report)) == (
-        {"/gate/video": 3},
-        False,
-        True,
-        [],
-    )
+        {"/gate/video": 3}, False, True, [],
+    )  # fmt: skip
     with log.read(tmp_path / "a.mcap") as opened:
         assert [(m.t_ns, m.sequence) for m in opened.messages("/gate/video")] == [
             (0, 0),

@@ -242,15 +242,10 @@ def test_a_column_of_classes_has_a_limit_of_names(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "frames", "step"),
     [
-        ("mot", [1, 13, 25], 12),
-        ("mot", [1, 13, 19], 6),
-        ("mot", [1, 13], 1),
-        ("trajnet", [0, 10], 10),
-        ("trajnet", [0, 10, 25], 5),
-        ("trajnet", [4], 1),
-        ("obsmat", [4, 10], 6),
+        ("mot", [1, 13, 25], 12), ("mot", [1, 13, 19], 6), ("mot", [1, 13], 1), ("trajnet", [0, 10], 10),
+        ("trajnet", [0, 10, 25], 5), ("trajnet", [4], 1), ("obsmat", [4, 10], 6),
     ],
-)
+)  # fmt: skip
 def test_the_step_of_labelled_frames(name, frames, step, tmp_path):
     row = {"mot": "{},1,1,1,1,1", "trajnet": "{} 1 1 1", "obsmat": "{} 1 1 1 1 1 1 1"}[name]
     assert read_labels(written(tmp_path / "a.txt", "\n".join(map(row.format, frames)))).step == step

@@ -9,7 +9,6 @@ import doctest
 import importlib
 import inspect
 import json
-import logging
 import math
 import os
 import re
@@ -23,11 +22,9 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import log
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.errors import McaptrackError
 from mcaptrack.errors import call as proposed
-from mcaptrack.schema import TRACKS
 from mcaptrack.sources import demo
 from mcaptrack.transforms import ByteTrack
 from tests.commands import GROUP, call, done
@@ -74,11 +71,6 @@ def place(template, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def rows(path: Path, topic: str) -> bytes:
-    with log.read(path) as opened:
-        return opened.rows(topic, TRACKS).rows.tobytes()
-
-
 class TestTheSameAsTheCommandLine:
     def test_track_with_options_gives_the_same_rows(self, place):
         mcaptrack.track("log.mcap", tracker="bytetrack", max_age_s=0.5, output="library.mcap")
@@ -111,13 +103,6 @@ class TestResults:
         assert result.tracks["/camera/tracks"] == len(
             np.unique(mcaptrack.open("b.mcap").array("tracks", "/camera/tracks")["track_id"])
         )
-
-    def test_notes_are_logged_and_in_the_result(self, place, caplog):
-        done("drop", "log.mcap", "/camera/tracks")
-        with caplog.at_level(logging.INFO, "mcaptrack"):
-            notes = mcaptrack.sample("log.mcap").notes
-        assert notes == ("/camera/tracks is missing: running track",)
-        assert [record.getMessage() for record in caplog.records] == list(notes)
 
     def test_warnings_are_python_warnings_at_the_line_of_the_caller_and_in_the_result(self, place):
         done("ingest", "video.mp4", "-o", "plain.mcap")
@@ -307,11 +292,6 @@ class TestChecked:
 
 class TestWordsOfTheCommandLine:
     """The library names parameters and functions; the command line shows options and commands."""
-
-    def test_parameters_become_options(self):
-        assert with_flags("give it with `fps=`") == "give it with --fps"
-        assert with_flags("`first_frame=3` or `force=True`") == "--first-frame 3 or --force"
-        assert with_flags("`not a parameter` stays, `x=` too") == "`not a parameter` stays, --x too"
 
     def test_options_are_those_of_the_command_that_runs(self, place):
         err = call("ingest", "video.mp4", "-o", "log.mcap").err

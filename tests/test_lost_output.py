@@ -59,13 +59,8 @@ for line in sys.stdin:
 """
 #: What becomes of stdout and stderr; others are the names of files.
 STREAMS = [
-    ("closed", "closed"),
-    ("closed", "err"),
-    ("full", "err"),
-    ("out", "full"),
-    ("out", "closed"),
-    ("nobody", "nobody"),
-]
+    ("closed", "closed"), ("closed", "err"), ("full", "err"), ("out", "full"), ("out", "closed"), ("nobody", "nobody"),
+]  # fmt: skip
 #: Command lines that print; those that write a log are the first.
 LINES = [
     "drop a.mcap /camera/predictions",

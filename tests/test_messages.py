@@ -80,7 +80,7 @@ def test_messages_are_those_of_the_mcap_package_in_the_same_order(mixed, name, s
         monkeypatch.setattr(batches, "OPEN_BYTES", 500)
         monkeypatch.setattr(batches, "_KEPT_BYTES", 0)
     with mcaptrack.open(mixed[name]) as opened:
-        for topics, (start, end) in product(TOPICS, RANGES):
+        for topics, (start, end) in [*product(TOPICS[:1], RANGES), *product(TOPICS[1:], RANGES[:4:3])]:
             wanted = by_mcap(mixed[name], topics, start, end)
             assert [found[:3] for found in opened.messages(topics, start, end, decode=False)] == wanted
             backwards = opened.messages(topics, start, end, decode=False, reverse=True)

@@ -405,19 +405,10 @@ def test_counts_of_boxes_equal_motmetrics(sequence):
         apart = np.where(near >= 0.5, 1 - near, np.nan)
         accumulator.update(list(people), list(found), apart)
     names = {
-        "num_switches": "IDSW",
-        "num_false_positives": "FP",
-        "num_misses": "FN",
-        "num_fragmentations": "Frag",
-        "mostly_tracked": "MT",
-        "partially_tracked": "PT",
-        "mostly_lost": "ML",
-        "num_unique_objects": "GT",
-        "idf1": "IDF1",
-        "idp": "IDP",
-        "idr": "IDR",
-        "mota": "MOTA",
-    }
+        "num_switches": "IDSW", "num_false_positives": "FP", "num_misses": "FN", "num_fragmentations": "Frag",
+        "mostly_tracked": "MT", "partially_tracked": "PT", "mostly_lost": "ML", "num_unique_objects": "GT",
+        "idf1": "IDF1", "idp": "IDP", "idr": "IDR", "mota": "MOTA",
+    }  # fmt: skip
     theirs = motmetrics.metrics.create().compute(accumulator, metrics=list(names), name="x").loc["x"]
     ours = summary(score(part, "motmetrics"))
     for name, ours_name in names.items():

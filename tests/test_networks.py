@@ -19,11 +19,11 @@ from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.predictors.red import Red
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.training.walks import walks
 from mcaptrack.training.windows import Windows, ar1
 from mcaptrack.transforms import Predict
+from tests.logs import provenance_of
 from tests.onnx_graphs import INT64, model, node, tensor, value
 
 #: Small networks, and what torch made of the same numbers.
@@ -129,8 +129,7 @@ class TestShippedWeights:
                 pipeline.run(
                     opened, "/camera", pipeline.plan_stage(opened, "/camera", "predict", Predict(predictor=name))
                 )
-            with log.read(path) as opened:
-                made = Provenance.from_metadata(opened.channels["/camera/predictions"].metadata)
+            made = provenance_of(path, "/camera/predictions")
             shipped = load(SHIPPED / "red.safetensors").sha256
             assert made.weights_sha256 == (shipped if name == "red" else "")
 

@@ -313,13 +313,10 @@ class TestSizes:
     @pytest.mark.parametrize(
         ("picture", "expected"),
         [
-            ((480, 360), "960x736"),
-            ((1280, 720), "1280x736"),
-            ((1920, 1080), "1344x768"),
-            ((100, 50), "224x128"),
+            ((480, 360), "960x736"), ((1280, 720), "1280x736"), ((1920, 1080), "1344x768"), ((100, 50), "224x128"),
             ((960, 800), "960x800"),
         ],
-    )
+    )  # fmt: skip
     def test_the_size_of_the_picture_is_rounded_up_and_kept_within_limits(self, picture, expected):
         from mcaptrack.transforms.detect.onnx.detector import size_for
 

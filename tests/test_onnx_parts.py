@@ -139,19 +139,11 @@ COUNT = len(places(8, 16, 32))
 @pytest.mark.parametrize(
     ("shape", "kind"),
     [
-        ((1, 5, COUNT), "columns"),
-        ((1, 84, COUNT), "columns"),
-        ((1, 4, COUNT), None),
-        ((1, 3 * COUNT, 6), "anchors"),
-        ((1, 3 * COUNT, 5), None),
-        ((1, COUNT, 5), "rows"),
-        ((1, COUNT, 4), None),
-        ((1, COUNT, 6), "rows"),
-        ((1, 300, 6), "boxes"),
-        ((1, 300, 7), None),
-        ((300, 6), None),
+        ((1, 5, COUNT), "columns"), ((1, 84, COUNT), "columns"), ((1, 4, COUNT), None), ((1, 3 * COUNT, 6), "anchors"),
+        ((1, 3 * COUNT, 5), None), ((1, COUNT, 5), "rows"), ((1, COUNT, 4), None), ((1, COUNT, 6), "rows"),
+        ((1, 300, 6), "boxes"), ((1, 300, 7), None), ((300, 6), None),
     ],
-)
+)  # fmt: skip
 def test_the_shape_of_one_output_tells_how_boxes_are_arranged(shape, kind):
     assert layouts.ultralytics_kind({"out": array(*shape)}, SIZE) == kind
     assert layouts.ultralytics_kind({"out": array(*shape), "more": array(1)}, SIZE) is None

@@ -17,11 +17,11 @@ import pytest
 
 from mcaptrack import log
 from mcaptrack.predictors import NAMES
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms import STAGES as STAGES_OF_LOGS
 from mcaptrack.transforms.protocol import bare_type, choices
 from tests.commands import call, done, toml_value
+from tests.logs import provenance_of
 from tests.tiers import one_in, thorough
 
 
@@ -58,10 +58,8 @@ class Stage:
 
     def made(self, path: Path) -> dict[str, Any]:
         """Return the parameters in the provenance of the channel of this stage."""
-        with log.read(path) as opened:
-            said = Provenance.from_metadata(opened.channel(self.target).metadata)
-        assert said is not None
-        return {name: value for name, value in said.parameters.items() if name in self.parameters()}
+        said = provenance_of(path, self.target).parameters
+        return {name: value for name, value in said.items() if name in self.parameters()}
 
 
 def _other(default: Any, kind: Any, declared: Any) -> Any:
@@ -135,17 +133,6 @@ def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder
     assert code == 0, err
     assert stage.made(folder / "b.mcap") == stage.others()
     assert len(stage.others()) == len(stage.parameters())
-
-
-@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
-def test_giving_the_default_changes_nothing(stage, folder):
-    """Also ``--smooth`` where it is on and ``--no-confirm`` where it is off."""
-    values = {name: value for name, value in stage.parameters().items() if value not in (None, "")}
-    code, _, err = call(
-        stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen) | as_settings(values, stage.transform))
-    )
-    assert code == 0, err
-    assert stage.made(folder / "b.mcap") == stage.parameters()
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import mcaptrack
 from mcaptrack import log
@@ -20,7 +17,6 @@ from mcaptrack.sources.ingest.labels.reading import read_labels
 
 SIZE = (256, 128)
 CLASSES = ["person", "bicycle", "dog"]
-CATEGORIES = [{"id": 5, "name": "dog"}, {"id": 1, "name": "person"}, {"id": 2, "name": "bicycle"}]
 #: Frame, left, top, width, height, score, class, id: dyadic, so that every format holds them exactly.
 Row = tuple[int, float, float, float, float, float, str, int]
 
@@ -30,24 +26,6 @@ def written(folder: Path, name: str, text: str) -> Path:
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(text.encode())
     return path
-
-
-def as_coco(folder: Path, rows: list[Row]) -> Path:
-    images = [{"id": 100 + frame, "file_name": f"a/{frame:06}.jpg", "width": 256, "height": 128} for frame in range(7)]
-    entries = [
-        {"image_id": 100 + frame, "category_id": 1 + CLASSES.index(name), "bbox": box, "score": score, "track_id": one}
-        for frame, *box, score, name, one in rows
-    ]
-    content = {"images": images[::-1], "annotations": entries, "categories": CATEGORIES}
-    return written(folder, "a.json", "\ufeff" + json.dumps(content))
-
-
-def as_results(folder: Path, rows: list[Row]) -> Path:
-    entries = [
-        {"image_id": f"{frame}", "category_id": CLASSES.index(name) + 1, "bbox": box, "score": score}
-        for frame, *box, score, name, _ in rows
-    ]
-    return written(folder, "r.json", json.dumps(entries))
 
 
 def as_yolo(folder: Path, rows: list[Row]) -> Path:
@@ -70,88 +48,6 @@ def _sink(row: Row) -> dict[str, object]:
 def as_supervision(folder: Path, rows: list[Row]) -> Path:
     table = [_sink(row) for row in rows]
     return written(folder, "s.csv", "\n".join([",".join(table[0]), *(",".join(map(str, r.values())) for r in table)]))
-
-
-def as_supervision_json(folder: Path, rows: list[Row]) -> Path:
-    return written(folder, "s.json", json.dumps([_sink(row) | {"frame_index": str(row[0])} for row in rows]))
-
-
-def as_csv(folder: Path, rows: list[Row]) -> Path:
-    lines = ["Track ID;Frame;left;top;right;bottom;conf;label;note"]
-    for frame, x, y, w, h, score, name, one in rows:
-        cells = [one, frame, x, y, x + w, y + h, score, name]
-        lines.append(";".join(str(cell).replace(".", ",") for cell in cells) + ';"a;b"')
-    return written(folder, "a.csv", "\ufeff" + "\r\n".join(lines))
-
-
-def as_mot(folder: Path, rows: list[Row]) -> Path:
-    lines = [
-        f"{row[0]},{row[7]},{row[1]},{row[2]},{row[3]},{row[4]},{row[5]},{1 + CLASSES.index(row[6])}" for row in rows
-    ]
-    return written(folder, "mot.txt", "\n".join(lines))
-
-
-def as_kitti(folder: Path, rows: list[Row]) -> Path:
-    kinds = {"person": "Pedestrian", "bicycle": "Cyclist"}
-    lines = [
-        f"{frame} {one} {kinds[name]} 0 0 0 {x} {y} {x + w} {y + h} 1 1 1 1 1 1 0 {score}"
-        for frame, x, y, w, h, score, name, one in rows
-    ]
-    return written(folder, "kitti.txt", "\n".join(lines))
-
-
-WRITERS: dict[str, Callable[[Path, list[Row]], Path]] = {
-    "coco": as_coco,
-    "coco results": as_results,
-    "yolo": as_yolo,
-    "supervision": as_supervision,
-    "supervision JSON": as_supervision_json,
-    "csv": as_csv,
-    "mot": as_mot,
-    "kitti": as_kitti,
-}
-ROWS = st.lists(
-    st.tuples(
-        st.integers(0, 6),
-        *[st.integers(0, 800).map(lambda n: n / 8)] * 2,
-        *[st.integers(1, 800).map(lambda n: n / 8)] * 2,
-        st.integers(0, 64).map(lambda n: n / 64),
-        st.sampled_from(CLASSES[:2]),
-        st.integers(0, 99),
-    ),
-    min_size=1,
-    max_size=12,
-    unique_by=lambda row: (row[0], row[-1]),
-)
-
-
-@given(rows=ROWS, order=st.randoms(use_true_random=False))
-@settings(max_examples=10, deadline=None)
-def test_boxes_come_back_from_every_format_in_any_order_of_lines(rows, order, tmp_path_factory):
-    rows = [*rows, (5, 64.0, 64.0, 100.5, 32.0, 0.5, "person", 100)]  # never shares of the picture's size
-    order.shuffle(rows)
-    people = [row for row in rows if row[6] == "person"]
-    for kind, write in WRITERS.items():
-        folder = tmp_path_factory.mktemp("rows")
-        labels = read_labels(write(folder, rows), role="detections", first_frame=0)
-        assert labels.format == kind.split()[0]
-        scale = (*SIZE, *SIZE) if labels.is_normalised else (1, 1, 1, 1)
-        found = np.column_stack([labels.frame, labels.boxes_px * scale, labels.score, labels.class_id == 1])
-        expected = np.array([[*row[:6], row[6] == "person"] for row in rows])
-        assert np.abs(found[np.lexsort(found.T)] - expected[np.lexsort(expected.T)]).max() < 1e-6, kind
-        assert 0 not in labels.class_id
-        all_frames = kind in ("coco", "yolo")  # these name pictures without boxes
-        assert labels.labelled.tolist() == (list(range(7)) if all_frames else sorted({row[0] for row in rows})), kind
-        if kind != "coco results":  # these hold neither names nor ids
-            assert sorted(zip(labels.frame.tolist(), labels.id.tolist(), strict=True)) == sorted(
-                (row[0], row[-1]) for row in rows
-            )
-        if kind not in ("coco results", "mot", "kitti"):  # nor do these hold such names
-            names = [labels.classes[number] for number in labels.class_id.tolist()]
-            assert sorted(zip(labels.id.tolist(), names, strict=True)) == sorted((row[-1], row[6]) for row in rows)
-        if kind not in ("coco results", "mot"):  # tracks and truth are of people alone
-            tracks = read_labels(write(folder, rows), role="tracks", first_frame=0)
-            assert sorted(tracks.id.tolist()) == sorted(row[-1] for row in people)
 
 
 def test_times_are_frames_and_gaps_are_empty_frames(tmp_path):
@@ -266,12 +162,6 @@ def test_a_width_and_height_beside_two_corners_are_those_of_the_picture(tmp_path
 def test_a_header_that_is_a_comment_names_columns(head, expected, tmp_path):
     labels = table(tmp_path, f"{head}\n1,2,3,10,10,5\n")
     assert (labels.format, *labels.boxes_px.tolist()) == expected
-
-
-def test_rows_without_a_box_are_frames_without_boxes(tmp_path):
-    labels = table(tmp_path, f"{HEAD},score\n0,1,2,3,4,.5\n1,,,,,\n2,NaN,nan,None,null,\n5,1,2,3,4,.5\n")
-    assert (labels.frame.tolist(), labels.labelled.tolist()) == ([0, 5], [0, 1, 2, 5])
-    assert "2 rows have no box; they only say that frames exist" in " ".join(labels.remarks)
 
 
 @pytest.mark.parametrize(

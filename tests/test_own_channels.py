@@ -510,13 +510,8 @@ class TestOwnForecasts:
     @staticmethod
     def steps(**columns: Any) -> np.ndarray:
         usual = {
-            "t_ns": [7, 7],
-            "track_id": [1, 1],
-            "step": [1, 2],
-            "ahead_s": [0.4, 0.8],
-            "x_m": [0.0, 1],
-            "y_m": [0.0, 0],
-        }
+            "t_ns": [7, 7], "track_id": [1, 1], "step": [1, 2], "ahead_s": [0.4, 0.8], "x_m": [0.0, 1], "y_m": [0.0, 0],
+        }  # fmt: skip
         return cars(**(usual | columns))
 
     FAULTS = [

@@ -349,13 +349,10 @@ def vp9_header(bits):
 @pytest.mark.parametrize(
     ("matrix", "is_full", "pixels"),
     [
-        (1, False, "yuv420p"),
-        (5, False, "yuv420p"),
-        (1, True, "yuvj420p"),
-        (9, False, "yuv420p10le"),
+        (1, False, "yuv420p"), (5, False, "yuv420p"), (1, True, "yuvj420p"), (9, False, "yuv420p10le"),
         (1, False, "yuv444p"),
     ],
-)
+)  # fmt: skip
 def test_colours_stay_what_they_are_whatever_the_numbers_mean(tmp_path, matrix, is_full, pixels):
     """BT.709, BT.601 and BT.2020, limited and full range."""
     path, colours = tmp_path / "a.mp4", ((30, 60, 200), (200, 160, 40))

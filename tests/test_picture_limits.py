@@ -53,14 +53,8 @@ def test_pixels_of_many_bytes_are_counted():
 
 
 HEADS = [
-    b"\x89PNG\r\n\x1a\n",
-    b"\xff\xd8\xff\xe0",
-    b"BM",
-    b"RIFF0000WEBPVP8 ",
-    b"II*\0\x08\0\0\0",
-    b"0000ftypavif",
-    b"",
-]
+    b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0", b"BM", b"RIFF0000WEBPVP8 ", b"II*\0\x08\0\0\0", b"0000ftypavif", b"",
+]  # fmt: skip
 
 
 @given(st.sampled_from(HEADS), st.binary(max_size=60))

@@ -16,9 +16,8 @@ import zstandard
 from mcap.writer import Writer
 
 import mcaptrack
-from mcaptrack import log
-from mcaptrack.schema.provenance import Provenance
 from tests.commands import call
+from tests.logs import provenance_of
 from tests.ros_messages import pixels, ros_writer
 from tests.worlds import small_scene
 
@@ -134,9 +133,8 @@ def test_the_same_people_are_found_and_the_range_is_said_and_kept(tmp_path, boxe
     assert len(notices) == bool(span)
     if span:
         assert re.search(f"{TOPIC}: values from .*{span}.* are shown as black to white", notices[0])
-    with log.read(path) as opened:
-        how = Provenance.from_metadata(opened.channel("/cam/detections").metadata)
-        assert [text for code, text in how.warnings if code == "pictures"] == notices
+    how = provenance_of(path, "/cam/detections")
+    assert [text for code, text in how.warnings if code == "pictures"] == notices
 
 
 def test_mosaics_in_still_images_have_colours(tmp_path):
@@ -222,8 +220,7 @@ def test_forms_of_the_same_pictures_are_one_camera(tmp_path, topics):
     result = mcaptrack.run(written(tmp_path / "a.mcap", channels, 2.0), tables=False)
     made = [name for name in result.channels if name.endswith("/detections")]
     assert len(made) == 1
-    with log.read(tmp_path / "a.mcap") as opened:
-        assert Provenance.from_metadata(opened.channel(made[0]).metadata).input == topics[0]
+    assert provenance_of(tmp_path / "a.mcap", made[0]).input == topics[0]
 
 
 def test_the_eyes_of_a_stereo_camera_are_two_cameras(tmp_path):

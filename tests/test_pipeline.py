@@ -9,15 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 
 import mcaptrack
 from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
 from mcaptrack.notices import collected
-from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS
+from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
@@ -30,11 +28,6 @@ from mcaptrack.transforms import (
     Sort,
 )
 from tests.worlds import small_scene
-
-ROWS = (
-    *("detections", "tracks", "samples", "predictions", "retracks"),
-    *(f"retracks/{one}" for one in ("online", "predictions", "decisions")),
-)
 
 
 @pytest.fixture(scope="module")
@@ -87,19 +80,6 @@ def digests(path: Path) -> dict[str, str]:
         }
 
 
-def test_missing_inputs_are_made_first_and_reported(fresh):
-    report, said = run_stage(fresh, "retrack", Retrack())
-    assert report.stages == ["detect", "track", "sample", "retrack", "views"]
-    assert said == [
-        "/camera/detections is missing: running detect",
-        "/camera/tracks is missing: running track",
-        "/camera/samples is missing: running sample",
-    ]
-    with log.read(fresh) as opened:
-        assert {"/camera/retracks", "/camera/retracks/online", "/camera/retracks/predictions"} <= set(opened.channels)
-        assert "/camera/predictions" not in opened.channels
-
-
 def test_running_a_stage_again_replaces_only_its_channels(fresh):
     run_all(fresh)
     before = digests(fresh)
@@ -111,32 +91,6 @@ def test_running_a_stage_again_replaces_only_its_channels(fresh):
     assert "/camera/retracks/predictions" in changed
     run_stage(fresh, "retrack", Retrack())
     assert digests(fresh) == before
-
-
-def test_outdated_channels_are_reported_and_made_again_with_their_parameters(fresh):
-    run_stage(fresh, "track", Sort(max_age_s=0.7))
-    run_all(fresh)
-    report, _ = run_stage(fresh, "detect", KnnDetector())
-    assert report.stale == ["/camera/tracks"]
-    with log.read(fresh) as opened:
-        assert pipeline.is_stale(opened, "/camera/tracks")
-        assert not pipeline.is_stale(opened, "/camera/samples")  # not yet: it still comes from the tracks there are
-    report, said = run_all(fresh)
-    assert report.stages == ["track", "sample", "predict", "retrack", "views"]
-    assert said[0] == "/camera/tracks was made from an earlier /camera/detections: running track again, as before"
-    with log.read(fresh) as opened:
-        made = {topic: Provenance.from_metadata(c.metadata) for topic, c in opened.channels.items()}
-        assert made["/camera/tracks"].parameters["max_age_s"] == 0.7
-        assert made["/camera/detections"].parameters["detector"] == "knn"
-        assert [topic for topic in opened.channels if pipeline.is_stale(opened, topic)] == []
-
-
-def test_writing_to_another_file_leaves_the_log_unchanged(fresh, tmp_path):
-    before = fresh.read_bytes()
-    run_stage(fresh, "detect", KnnDetector(), output=tmp_path / "b.mcap")
-    assert fresh.read_bytes() == before
-    with log.read(tmp_path / "b.mcap") as opened:
-        assert "/camera/detections" in opened.channels
 
 
 def test_a_missing_input_error_lists_channels_and_a_remedy(fresh, tmp_path):
@@ -156,53 +110,7 @@ def test_a_missing_input_error_lists_channels_and_a_remedy(fresh, tmp_path):
         run_stage(fresh, "track", Sort(), source="/camera/video")
 
 
-def test_two_cameras_share_a_log(footage, fresh):
-    with log.read(fresh) as opened:
-        ingest(footage.video, fresh, IngestOptions(camera="gate"), into=opened)
-    with log.read(fresh) as opened:
-        assert pipeline.find_camera(opened, None) == "/camera"
-        assert pipeline.find_camera(opened, "gate") == "/gate"
-        assert pipeline.find_camera(opened, None, "/gate/video") == "/gate"
-        pipeline.run(opened, "/gate", pipeline.plan_stage(opened, "/gate", "detect", KnnDetector()))
-    with log.read(fresh) as opened:
-        assert "/gate/detections" in opened.channels
-        assert "/camera/detections" not in opened.channels
-
-
 class TestCompleteRun:
-    def test_the_log_has_all_channels(self, finished):
-        with log.read(finished) as opened:
-            pictures = opened.times("/camera/video").tolist()
-            for name in ROWS:
-                assert f"/camera/{name}" in opened.channels
-            on_pictures = ("tracks", "predictions", "retracks/full", "retracks/predictions", "truth")
-            drawn = {"detections/view/image", "ground_plane/view/scene", "view/tf"}
-            drawn |= {f"{name}/view/{kind}" for name in on_pictures for kind in ("image", "scene")}
-            assert {topic for topic in opened.channels if "/view/" in topic} == {f"/camera/{name}" for name in drawn}
-            for name in ("detections", *on_pictures):
-                assert opened.times(f"/camera/{name}/view/image").tolist() == pictures
-            assert [f.t_ns for f in opened.frames("/camera/detections", DETECTIONS)] == pictures
-            ticks = opened.times("/camera/samples").tolist()
-            assert ticks == [round(0.4e9 * n) for n in range(len(ticks))]
-            assert opened.times("/camera/retracks").tolist() == opened.times("/camera/predictions").tolist() == ticks
-            assert [listed.name for listed in opened.index.attachments] == [
-                "mcaptrack.layout.json",
-                "mcaptrack.comparing.layout.json",
-                "mcaptrack.predictions.layout.json",
-            ]
-
-    def test_the_mcap_library_reads_the_same_messages(self, finished):
-        with log.read(finished) as opened, finished.open("rb") as stream:
-            reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-            frames = {topic: iter(opened.frames(topic, TRACKS)) for topic in ("/camera/tracks", "/camera/retracks")}
-            for _, _, message, decoded in reader.iter_decoded_messages(topics=list(frames)):
-                topic = next(t for t in frames if opened.channels[t].id == message.channel_id)
-                frame = next(frames[topic])
-                assert (message.log_time, message.sequence) == (frame.t_ns, frame.index)
-                assert [row.track_id for row in decoded.rows] == frame.rows["track_id"].tolist()
-                np.testing.assert_array_equal([row.x_m for row in decoded.rows], frame.rows["x_m"])
-            assert all(next(rest, None) is None for rest in frames.values())
-
     def test_every_channel_has_its_provenance(self, finished):
         with log.read(finished) as opened:
             for topic, channel in opened.channels.items():

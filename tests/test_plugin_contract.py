@@ -23,11 +23,11 @@ from mcaptrack.pipeline.write import ATTACHMENTS
 from mcaptrack.registry import Entry, find
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import DETECTIONS, TRACKS
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.testing import LawError, check_predictor, check_transform, sample_frames
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.stages import FULL, RESERVED
 from tests.commands import call, done, made_log
+from tests.logs import provenance_of
 from tests.test_plugins import MODULE
 from tests.tiers import one_in
 
@@ -313,7 +313,5 @@ def test_a_run_says_what_a_class_has_changed(logs, place, kind, name):
     assert said.count(f"the import of {what} the working folder; this was undone") == 1
     assert said.count(f"{what} NumPy's handling of errors; this was undone") == 1
     assert said.count("this was undone") == 2
-    with log.read(Path("a.mcap")) as opened:
-        how = Provenance.from_metadata(opened.channels[f"/camera/{COMMANDS[kind][1]}"].metadata)
-    assert how is not None
+    how = provenance_of("a.mcap", f"/camera/{COMMANDS[kind][1]}")
     assert [code for code, text in how.warnings if "NumPy" in text] == ["other"]  # later runs say it again

@@ -23,6 +23,7 @@ from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import STAGES
 from tests.commands import call, done, made_log
 from tests.distributions import package
+from tests.logs import provenance_of
 
 MODULE = """
 from dataclasses import dataclass
@@ -142,10 +143,7 @@ def uncached() -> None:
 
 
 def made(topic: str) -> Provenance:
-    with log.read(Path("a.mcap")) as opened:
-        found = Provenance.from_metadata(opened.channels[topic].metadata)
-    assert found is not None
-    return found
+    return provenance_of("a.mcap", topic)
 
 
 def codes(*words: str) -> list[str]:

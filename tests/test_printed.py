@@ -379,17 +379,10 @@ def of_mistakes(to: Transcript) -> None:
 
 
 PARTS: Sequence[tuple[str, Callable[[Transcript], None]]] = (
-    ("A log of labels", of_a_log),
-    ("Runs and stages", of_runs),
-    ("Zones", of_zones),
-    ("Contents", of_contents),
-    ("Check and recover", of_upkeep),
-    ("Calibrate", of_calibration),
-    ("Tune", of_tuning),
-    ("Query", of_answers),
-    ("Many logs", of_many_logs),
-    ("Mistakes", of_mistakes),
-)
+    ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Zones", of_zones), ("Contents", of_contents),
+    ("Check and recover", of_upkeep), ("Calibrate", of_calibration), ("Tune", of_tuning), ("Query", of_answers),
+    ("Many logs", of_many_logs), ("Mistakes", of_mistakes),
+)  # fmt: skip
 
 
 def test_commands_print_what_the_snapshot_has(tmp_path, monkeypatch):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import doctest
 from itertools import groupby
 
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcaptrack.geometry import neighbours, ragged
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 
@@ -46,8 +44,3 @@ def test_near_pairs_are_all_pairs_of_a_group_nearer_than_the_distance(points):
         for b in range(a + 1, len(points))
         if points[a][0] == points[b][0] and np.hypot(*np.subtract(points[a][1:], points[b][1:])) < 2.0
     ]
-
-
-def test_examples_run():
-    for module in (ragged, neighbours):
-        assert doctest.testmod(module).failed == 0

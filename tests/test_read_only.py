@@ -146,13 +146,8 @@ def template(template, tmp_path_factory) -> Path:
 
 #: Names of what belongs to a log or could pass for it.
 NAMES_BESIDE = (
-    "a.mcap.journal",
-    "a.results.mcap",
-    "a.results.mcap.journal",
-    "a.layout.json",
-    "a.tables",
-    ".a.mcap.1.ab.part",
-)
+    "a.mcap.journal", "a.results.mcap", "a.results.mcap.journal", "a.layout.json", "a.tables", ".a.mcap.1.ab.part",
+)  # fmt: skip
 
 
 #: What stands under these names: nothing, noise, or emptiness.

@@ -95,12 +95,8 @@ def test_every_file_of_the_conformance_suite_holds_what_is_written_beside_it(dat
                 chunk = chunks[int(f["chunk_start_offset"])]
                 sizes = (chunk.chunk_length, chunk.compressed_size, chunk.uncompressed_size)
                 names = (
-                    "chunk_length",
-                    "compressed_size",
-                    "uncompressed_size",
-                    "message_start_time",
-                    "message_end_time",
-                )
+                    "chunk_length", "compressed_size", "uncompressed_size", "message_start_time", "message_end_time",
+                )  # fmt: skip
                 assert tuple(int(f[name]) for name in names) == (
                     *sizes, chunk.message_start_time, chunk.message_end_time,
                 )  # fmt: skip

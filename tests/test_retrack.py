@@ -10,12 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Rows, framing
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_odds_in_log, stand_throughout
@@ -24,6 +22,7 @@ from mcaptrack.transforms.retrack.methods import KeptIds
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
 from mcaptrack.transforms.retrack.online_tracker import GrowingHull
 from tests.commands import call
+from tests.logs import provenance_of
 from tests.references.false_tracks import log_odds_in_log as in_log
 from tests.references.false_tracks import person_features
 from tests.references.offline import Motion
@@ -134,10 +133,7 @@ def walked(tmp_path, monkeypatch):
 
 
 def made(path) -> dict[str, object]:
-    with log.read(path) as opened:
-        said = Provenance.from_metadata(opened.channel("/camera/retracks").metadata)
-    assert said is not None
-    return dict(said.parameters)
+    return dict(provenance_of(path, "/camera/retracks").parameters)
 
 
 def test_a_profile_names_its_method_and_options_of_another_are_refused(walked):

@@ -77,15 +77,10 @@ def jump(to_m: float, name: int, gap: int, beside_m: float | None) -> list[Frame
 
 #: The id after the gap, the ticks of the gap, and how far beside somebody else is.
 JUMPS = {
-    "same id": (7, 0, None),
-    "known id": (9, 0, None),
-    "new id": (99, 0, None),
-    "new id after a gap": (99, 1, None),
-    "same id after a gap": (7, 2, None),
-    "in a crowd": (7, 0, 1.65),
-    "beside a crowd": (7, 0, 1.75),
+    "same id": (7, 0, None), "known id": (9, 0, None), "new id": (99, 0, None), "new id after a gap": (99, 1, None),
+    "same id after a gap": (7, 2, None), "in a crowd": (7, 0, 1.65), "beside a crowd": (7, 0, 1.75),
     "known id in a crowd": (9, 2, 1.0),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "gap", "beside_m"), one_in(2, JUMPS.values()), ids=JUMPS)

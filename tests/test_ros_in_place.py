@@ -296,12 +296,9 @@ def test_rows_of_a_user_are_counted(copied):
         assert opened.write("/lidar/tracks/mine/tracks", rows, sidecar=False)
     topics = {one["topic_metadata"]["name"]: one for one in metadata(copied)["topics_with_message_count"]}
     assert topics["/lidar/tracks/mine/tracks"]["topic_metadata"] == {
-        "name": "/lidar/tracks/mine/tracks",
-        "type": "mcaptrack_msgs/msg/Tracks",
-        "serialization_format": "cdr",
-        "offered_qos_profiles": "",
-        "type_description_hash": "",
-    }
+        "name": "/lidar/tracks/mine/tracks", "type": "mcaptrack_msgs/msg/Tracks", "serialization_format": "cdr",
+        "offered_qos_profiles": "", "type_description_hash": "",
+    }  # fmt: skip
     first_ns = metadata(copied)["starting_time"]["nanoseconds_since_epoch"]
     with mcaptrack.open(copied) as opened:
         early = [mcaptrack.detections([[1, 2, 3, 4]], t_ns=first_ns - 5, box_format="xywh")]

@@ -124,12 +124,9 @@ OWN = {
     "sort": {},
     "bytetrack": {"high_score": [0.5, 0.7], "new_score": [0.4, 0.6], "low_min_iou": [0.1, 0.5]},
     "ocsort": {
-        "inertia": [0.0, 0.2, 0.6],
-        "direction_frames": [2, 3, 5],
-        "recover": [False, True],
-        "reupdate": [False, True],
+        "inertia": [0.0, 0.2, 0.6], "direction_frames": [2, 3, 5], "recover": [False, True], "reupdate": [False, True],
     },
-}
+}  # fmt: skip
 
 
 def walking(rng: np.random.Generator, count: int = 45) -> list[Frame]:

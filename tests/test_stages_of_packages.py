@@ -13,8 +13,8 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS
-from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
+from tests.logs import provenance_of
 from tests.test_extensions import add, one_line, site  # noqa: F401  # a fixture
 
 #: A stage that counts the zone visits and the tracks of the first frame.
@@ -48,19 +48,12 @@ def path(finished, tmp_path) -> Path:
     return Path(shutil.copy(finished, tmp_path / "log.mcap"))
 
 
-def made(path: Path, topic: str) -> Provenance:
-    with log.read(path) as opened:
-        provenance = Provenance.from_metadata(opened.channel(topic).metadata)
-    assert provenance is not None
-    return provenance
-
-
 @pytest.mark.usefixtures("site")
 def test_settings_of_a_stage_are_its_own_and_no_matter_for_other_commands(path):
     Path("mcaptrack.toml").write_text("[speed]\nmax-gap-s = 0.5\n")
     done("info", path)
     done("speed", path)
-    assert made(path, "/camera/speed").parameters["max_gap_s"] == 0.5
+    assert provenance_of(path, "/camera/speed").parameters["max_gap_s"] == 0.5
 
 
 @pytest.mark.usefixtures("site")
@@ -82,7 +75,7 @@ def test_the_speed_of_the_page_is_that_of_the_positions(path):
     found = sorted((row["track_id"], row["speed_m_per_s"]) for row in table)
     assert len(found) > 30
     np.testing.assert_allclose(found, sorted(wanted), rtol=1e-5)
-    assert made(path, "/camera/speed").plugins["transform"][:3] == ("speed", "speed:Speed", "my-trackers")
+    assert provenance_of(path, "/camera/speed").plugins["transform"][:3] == ("speed", "speed:Speed", "my-trackers")
 
 
 def test_run_makes_its_channel_again_and_never_first(site, path, monkeypatch):  # noqa: F811
@@ -92,7 +85,7 @@ def test_run_makes_its_channel_again_and_never_first(site, path, monkeypatch):  
     assert "/camera/speed" in mcaptrack.retrack(path, profile="paper").stale
     result = mcaptrack.run(path, tables=False, events=False)
     assert result.stages == ("speed", "views")
-    assert made(path, "/camera/speed").parameters["max_gap_s"] == 0.5
+    assert provenance_of(path, "/camera/speed").parameters["max_gap_s"] == 0.5
     shutil.rmtree(site / "my_trackers-1.0.dist-info")
     for choice in ({"retracker": "likelihood"}, {}):  # the run that outdates it, and those after it
         said = [notice.message for notice in mcaptrack.run(path, tables=False, events=False, **choice).warnings]
@@ -112,7 +105,7 @@ def test_a_stage_reads_channels_beside_its_input_and_is_outdated_by_them(site, p
         visits = len(recording.array("zone_visits", "/camera/tracks/zones/visits"))
         assert visits > 0
         assert set(recording.array("/camera/tracks/visits")["visits"].tolist()) == {visits}
-    assert [*made(path, "/camera/tracks/visits").references] == ["/camera/tracks/zones/visits"]
+    assert [*provenance_of(path, "/camera/tracks/visits").references] == ["/camera/tracks/zones/visits"]
     mcaptrack.zones(path, zones=ZONE | {"coordinates": [[[-99, -99], [-90, -99], [-90, -90], [-99, -99]]]})
     assert json.loads(done("info", path, "--json").out)
     assert "visits" in mcaptrack.run(path, tables=False).stages
@@ -164,4 +157,4 @@ def test_a_broken_stage_is_said_in_one_line(site, path, change, said):  # noqa: 
 def test_a_stage_has_no_name_of_ours(site, path):  # noqa: F811
     add(site, "stage", "track", COUNTS)
     done("track", path, "--to", "/camera/others")
-    assert made(path, "/camera/others").parameters["tracker"] == "sort"
+    assert provenance_of(path, "/camera/others").parameters["tracker"] == "sort"

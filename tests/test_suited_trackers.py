@@ -14,9 +14,9 @@ import pytest
 import mcaptrack
 from mcaptrack.registry import KINDS
 from mcaptrack.schema import DETECTIONS, VIDEO
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES, OnnxDetector
 from mcaptrack.transforms.protocol import Suited, traits_of
+from tests.logs import provenance_of
 
 BOX = {"x_px": [10.0], "y_px": [10.0], "w_px": [8.0], "h_px": [20.0]}
 
@@ -51,10 +51,7 @@ def log(tmp_path) -> Path:
 
 
 def tracker_of(path: Path) -> str:
-    with mcaptrack.log.read(path) as opened:
-        made = Provenance.from_metadata(opened.channel("/camera/tracks").metadata)
-    assert made is not None
-    return str(made.parameters["tracker"])
+    return str(provenance_of(path, "/camera/tracks").parameters["tracker"])
 
 
 def run(path: Path, **options) -> tuple[str, list[str]]:

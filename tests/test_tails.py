@@ -26,7 +26,7 @@ from mcaptrack.predictors.tail_calibration import (
 )
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.predictions import tails_of
-from mcaptrack.transforms import PROFILES, forecasts
+from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.motion_limits import LIMITS
 from mcaptrack.transforms.predict import Predict
 from tests.worlds import ns, tracks_at
@@ -417,50 +417,6 @@ def test_a_car_that_has_just_stopped_may_go_on():
     """Its history still has the way that it went."""
     stopped, stands = (axis_m(last_forecast(3, speed, True, stops=3)) for speed in (8.0, 0.0))
     assert stopped > 3 * stands
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_what_stands_by_hand(seed: int):
-    """Objects with different pasts: their speed over up to seven steps; a single step says nothing."""
-    rng = np.random.default_rng(seed)
-    past, unit_m = np.cumsum(rng.normal(0, 0.05, (8, 10, 2)), axis=1), rng.choice([1.0, 4.0], 8)
-    known_from = [0, 1, 2, 3, 5, 7, 8, 9]
-    for one, first in zip(past, known_from, strict=True):
-        one[:first] = np.nan
-    found = forecasts._standing(past, unit_m, 0.4)
-    for one, unit, first, stays in zip(past, unit_m, known_from, found, strict=True):
-        begin = max(first, 2)  # seven steps back at most
-        steps = 9 - begin
-        if steps < 2:
-            assert stays == 0
-        else:
-            speed = np.linalg.norm(one[-1] - one[begin]) / (0.4 * steps * unit)
-            assert stays == pytest.approx(0.95 * np.exp(-((speed / 0.15) ** 2)))
-
-
-def test_a_forecast_with_rest_has_the_mean_and_covariance_of_both():
-    """Each step is a mixture of two distributions, whose moments are added up."""
-    rng = np.random.default_rng(1)
-    now, stay, noise_m, unit_m = (
-        rng.normal(size=(3, 2)),
-        np.array([0.0, 0.3, 0.95]),
-        rng.uniform(0.1, 0.4, 3),
-        np.array([4.0, 1.0, 2.0]),
-    )
-    half = rng.normal(size=(3, 5, 2, 2))
-    forecast = Forecast(rng.normal(size=(3, 5, 2)), half @ half.transpose(0, 1, 3, 2))
-    found = forecasts._with_rest(forecast, now, stay, noise_m, unit_m, 0.4)
-    for one in range(3):
-        for step in range(5):
-            creep = 0.03 * unit_m[one] * 0.4 * (step + 1)
-            parts = (
-                (stay[one], now[one], (noise_m[one] ** 2 + creep**2) * np.eye(2)),
-                (1 - stay[one], forecast.mean[one, step], forecast.cov[one, step]),
-            )
-            mean = sum(share * at for share, at, _ in parts)
-            cov = sum(share * (spread + np.outer(at - mean, at - mean)) for share, at, spread in parts)
-            np.testing.assert_allclose(found.mean[one, step], mean)
-            np.testing.assert_allclose(found.cov[one, step], cov)
 
 
 # Ellipses corrected by what they have held, and the noise of positions as far as tracks show it

@@ -265,11 +265,8 @@ def test_tracks_have_a_row_before_the_first_and_one_after_the_last(part_rows: in
     out = mended_ends(collect(TRACKS, frames))
     spans = spans_of(out)
     assert {one: (found[0], found[-1]) for one, found in spans.items()} == {
-        3: (9, 31),
-        5: (0, 59),
-        1: (2, 3),
-        9: (19, 24),
-    }
+        3: (9, 31), 5: (0, 59), 1: (2, 3), 9: (19, 24),
+    }  # fmt: skip
     assert all(len(found) == found[-1] - found[0] + 1 for found in spans.values())
     for n, (frame, before) in enumerate(zip(out, frames, strict=True)):
         assert (frame.t_ns, frame.index) == (before.t_ns, before.index)

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 import mcaptrack
 from mcaptrack import McaptrackError, log
 from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, TRACKS, EventKind, Frame, Schema
-from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.transforms import STAGES
 from mcaptrack.transforms.sort import Sort
+from tests.logs import provenance_of
 from tests.space_logs import (
     LATE_NS,
     NAMES,
@@ -280,20 +280,6 @@ def rows_of(path: Path) -> dict[str, np.ndarray]:
     return {topic: rows.rows for topic, rows in found.items()}
 
 
-def test_every_form_of_a_log_gives_the_same_tracks(street):
-    first, *others = (rows_of(path) for path in street.values())
-    assert len(np.unique(first["/lidar/retracks/full"]["track_id"])) >= 8
-    assert not first["/lidar/retracks/full"]["observed"].all()
-    for topic, rows in first.items():
-        assert len(rows), topic
-        for other in (found[topic] for found in others):
-            assert other["track_id"].tolist() == rows["track_id"].tolist(), topic
-            for name in set(rows.dtype.names) - {"source_id", "class_id"}:
-                kind = rows[name].dtype.kind
-                tolerance = 1e-6 if kind == "f" else 0
-                np.testing.assert_allclose(other[name], rows[name], atol=tolerance, rtol=0, err_msg=f"{topic} {name}")
-
-
 def test_limits_of_motion_reach_every_stage_and_are_recorded(street, tmp_path):
     """Channels that were made with other limits are made again; without the option, they stay as they are."""
     path = tmp_path / "a.mcap"
@@ -305,11 +291,8 @@ def test_limits_of_motion_reach_every_stage_and_are_recorded(street, tmp_path):
     taken = {name for name, stage in STAGES.items() if "class_limits" in {f.name for f in fields(stage.default)}}
     assert {"retrack", "predict"} <= taken
     assert {*taken, "track", "sample"} <= set(made.stages)
-    with log.read(path) as opened:
-        for topic in {*TRACKED, *PREDICTED} - {"/lidar/samples"}:
-            how = Provenance.from_metadata(opened.channel(topic).metadata)
-            assert how is not None
-            assert how.parameters["class_limits"] == LIMITS, topic
+    for topic in {*TRACKED, *PREDICTED} - {"/lidar/samples"}:
+        assert provenance_of(path, topic).parameters["class_limits"] == LIMITS, topic
     after = rows_of(path)
     for topic, rows in before.items():
         assert rows.tobytes() != after[topic].tobytes(), topic

@@ -510,10 +510,6 @@ def test_text_and_json_have_the_scores(folder, given):
     ]
     data = json.loads(done("train", "a.txt", "b.txt", "--force", "--json").out)
     assert {key: data[key] for key in ("weights", "epochs", "kept_epoch", "seconds", "scores")} == {
-        "weights": "trained/red.safetensors",
-        "epochs": 7,
-        "kept_epoch": 5,
-        "seconds": 125.4,
-        "scores": SCORES,
-    }
+        "weights": "trained/red.safetensors", "epochs": 7, "kept_epoch": 5, "seconds": 125.4, "scores": SCORES,
+    }  # fmt: skip
     assert (data["windows"], data["validation_windows"]) == (len(given[1][1]), len(given[1][2]))

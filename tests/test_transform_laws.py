@@ -157,12 +157,8 @@ PAPER = {
     "resolve_swaps": False, "track_confidence": 0.0, "across_classes": False, "smooth": False, "interpolated": True,
 }  # fmt: skip
 AUTHORS = PAPER | {
-    "distance": "max",
-    "priority_distance": 0.15,
-    "birth": "smoothed",
-    "trim_ends": True,
-    "backfill": "all",
-}
+    "distance": "max", "priority_distance": 0.15, "birth": "smoothed", "trim_ends": True, "backfill": "all",
+}  # fmt: skip
 
 
 def options_of(transform: Any) -> dict[str, Any]:

@@ -15,7 +15,6 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.schema.provenance import Provenance
 from tests.worlds import write_clip
 
 SECOND = 10**9
@@ -161,33 +160,6 @@ class TestDetections:
 
 
 class TestWriting:
-    def test_own_detections_are_tracked_as_any_others(self, tmp_path):
-        path = tmp_path / "own.mcap"
-        with mcaptrack.open(path, create=True) as opened:
-            assert opened.write("/camera/detections", walk()) == 30
-            assert opened.array("detections")["x_px"].shape == (60,)
-        result = mcaptrack.track(path)
-        assert (result.stages, result.tracks["/camera/tracks"]) == (("track",), 2)
-        assert mcaptrack.run(path, tables=False).summary.tracks == 2
-        made = {channel.topic: channel.transform for channel in mcaptrack.info(path).channels}
-        assert (made["/camera/detections"], made["/camera/tracks"]) == ("ingest", "track")
-        assert mcaptrack.check(path).findings == ()
-
-    def test_frames_arrays_and_tables_give_the_same_channel(self, tmp_path):
-        payloads = set()
-        for form in ("frames", "array", "table"):
-            path = tmp_path / f"{form}.mcap"
-            with mcaptrack.open(path, create=True) as opened:
-                opened.write("/camera/detections", walk())
-                rows = {"frames": walk(), "array": opened.array("detections"), "table": opened.table("detections")}[
-                    form
-                ]
-                assert opened.write("/camera/detections", rows, replace=True) == 30
-            with log.read(path) as opened:
-                assert [frame.index for frame in opened.frames("/camera/detections", DETECTIONS)] == list(range(30))
-                payloads.add(Provenance.from_metadata(opened.channel("/camera/detections").metadata).digest)
-        assert len(payloads) == 1
-
     def test_supervision_detections_round_trip(self, tmp_path, made):
         tracked = made(BOXES, confidence=SCORES, tracker_id=np.array([7, 9]))
         given = {0: tracked, SECOND: made.empty(), 2 * SECOND: tracked}
@@ -230,19 +202,6 @@ class TestWriting:
                 with pytest.raises(McaptrackError, match=words) as refused:
                     opened.write("tracks", rows)
                 assert "\n" not in str(refused.value)
-
-    def test_what_is_there_stays_unless_it_is_to_be_replaced(self, tmp_path):
-        path = tmp_path / "a.mcap"
-        with mcaptrack.open(path, create=True) as opened:
-            opened.write("/camera/detections", walk())
-            before = path.read_bytes()
-            with pytest.raises(McaptrackError, match="has /camera/detections already; `replace=True` replaces it"):
-                opened.write("/camera/detections", walk(3))
-            assert path.read_bytes() == before
-            opened.write("/camera/detections", walk(3), replace=True)
-            assert len(opened.array("detections")) == 6
-        with pytest.raises(McaptrackError, match="exists"):
-            mcaptrack.open(path, create=True)
 
     UNFIT = {
         "/camera/detections": [

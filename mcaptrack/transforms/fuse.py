@@ -555,7 +555,7 @@ class FootFuser:
     ...     cov_xx_m2=[0.09, 0.01, 0.09], cov_xy_m2=[0, 0, 0], cov_yy_m2=[0.01, 0.04, 0.01], class_id=[1, 1, 1])
     >>> [(fused, members)] = FootFuser(min_score=0.0)([Frame(0, 0, rows)])
     >>> fused.rows["x_m"].round(2).tolist(), fused.rows["seen_by"].tolist(), members.rows["detection"].tolist()
-    ([1.03, 9.0], [2, 1], [0, 0, 1])
+    ([1.03, 9.0], [2, 1], [0, 1, 0])
     """
 
     max_sigma: float = option(3.0, least=0.0, most=100.0)
