@@ -475,14 +475,6 @@ def test_every_format_and_every_check_is_here():
     assert set(BROKEN) == {*OF_SOURCE, *OF_ROLE, "classes"}
 
 
-def test_the_page_of_formats_has_the_table_of_the_registry():
-    page = (Path(__file__).parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
-    formats = {name: find("label_format", name).cls for name in BUILT_IN["label_format"]}
-    assert [f"| `{name}` | {form.title} | {form.row} |" in page for name, form in formats.items()] == [True] * len(
-        formats
-    )
-
-
 def has(name: str) -> set[str]:
     """The columns and facts of a format, as they are declared here."""
     writer = WRITERS[name]

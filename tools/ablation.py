@@ -2,7 +2,7 @@
 
     .venv/bin/python tools/ablation.py
     .venv/bin/python tools/ablation.py --corrupted sdd/train --scenes sdd-noisy --scenes sdd-detections \
-        --homographies sdd/homography -o docs/ablation.md
+        --homographies sdd/homography -o docs/method.md
 
 The first table has the default without one part each, the second the way from the paper to the default, one step a row.
 `--corrupted` are true tracks with all kinds of `corruptions.py`: their scores are means over seeds, with the standard
