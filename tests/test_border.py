@@ -22,7 +22,7 @@ from pyarrow import feather
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, find
+from mcaptrack.registry import BUILT_IN
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, OF_SOURCE
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 

@@ -172,16 +172,6 @@ def test_the_floors_on_the_map_are_those_that_are_held():
     assert all(re.search(rf"\b{name}\b", text) for name in layers)
 
 
-def test_the_scores_of_the_method_are_those_of_its_ablation():
-    """Both tables of the page have scores of profiles within 1 m: IDF1, MOTA and identity switches."""
-    method = (ROOT / "docs" / "method.md").read_text()
-    steps = method.split("<!-- From the paper to the default -->")[1]
-    for profile, step in {"paper": "paper", "default": "+ smoothing (the default)"}.items():
-        (cells,) = re.findall(rf"^\| {re.escape(step)} \|(.*)\|$", steps, re.M)
-        idf1, mota, switches = re.sub(r" \([\d.]+\)", "", cells.split(" | ")[2]).split(" / ")
-        assert f"| `--profile {profile}` | {idf1} | {mota} | {round(float(switches)):,} |" in method
-
-
 def test_every_dependency_is_pinned():
     wanted = [
         *PROJECT["dependencies"],

@@ -129,16 +129,6 @@ def stays(seven: Log) -> Rows:
     return out
 
 
-def inside_polygon(seven: Log) -> Rows:
-    corners = np.array([[0, 10], [5, 12], [3, 16], [-3, 15]], float)  # convex, counter-clockwise
-    sides, out = np.roll(corners, -1, axis=0) - corners, []
-    for who, (t_ns, xy_m, _) in seven.tracks("truth").items():
-        away = xy_m[:, None] - corners
-        inside = t_ns[(sides[:, 0] * away[..., 1] - sides[:, 1] * away[..., 0] > 0).all(axis=1)]
-        out += [[who, inside[0] / NS, inside[-1] / NS, len(inside)]] if len(inside) else []
-    return out
-
-
 def areas(seven: Log) -> Rows:
     who: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for t_ns, row in seven.rows("truth", TRACKS):
@@ -167,11 +157,6 @@ def speeds(seven: Log) -> Rows:
         path_m = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
         assert out[walker.id].mean() == pytest.approx(path_m / (end - begin), rel=0.15), walker.id
     return [[who, of.mean(), of.max()] for who, of in out.items() if len(of)]
-
-
-def distribution(seven: Log) -> Rows:
-    every = np.concatenate([speeds_of(track) for track in seven.tracks("truth").values()])
-    return sorted(map(list, Counter((np.floor(every * 4) / 4).tolist()).items()))
 
 
 def approaches(seven: Log) -> Rows:
@@ -289,10 +274,8 @@ ANSWERS: dict[str, tuple[Callable[[Log], Rows], float]] = {
     "as frames\nfrom (select": (numbers_of_people, 0),
     "as begin": (arrivals, 0),
     "as visits": (stays, 0.051),
-    "create macro inside": (inside_polygon, 1e-9),
     "with zones(": (areas, 0.051),
     "as fastest_m_s": (speeds, 0.051),
-    "as from_m_s": (distribution, 0),
     "as closest_m": (approaches, 0.0051),
     "kind = 4": (switches, 0.51),
     "as hidden_s": (occlusions, 0.051),

@@ -2,8 +2,8 @@
 
 MkDocs calls ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
 ``<!-- generated: NAME -->`` where a part belongs: one of ``GENERATED``, or of those that `mcaptrack docs` prints, too
-(``mcaptrack.cli.generated.PARTS``). Below each query of docs/sql.md stands what the tables of `mcaptrack demo` answer: those
-in the folder that the environment variable DEMO names, or those of a demonstration that is made for it (a minute).
+(``mcaptrack.cli.generated.PARTS``). Below each query of docs/sql.md stands what the tables of `mcaptrack demo` answer:
+those in the folder that the environment variable DEMO names, or those of one that is made for it (a minute).
 """
 
 from __future__ import annotations
