@@ -316,7 +316,7 @@ def assert_exists(line: str) -> None:
     if words[0] == "make":
         assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M), line
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for named in re.findall(r"\.\[([\w,]+)\]", line):
+    for named in re.findall(r"(?:\.|mcaptrack)\[([\w,]+)\]", line):
         assert set(named.split(",")) <= extras.keys(), line
     if words[0] != "mcaptrack" or len(words) == 1:
         return

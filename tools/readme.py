@@ -6,7 +6,7 @@
 
 FOLDER, which must not exist, gets a copy of the repository, an environment, and every file that the commands name:
 videos, labels and recordings of one drawn scene. All ``sh`` blocks run in their order, then all ``sql`` and ``python``
-blocks. The packages that the text asks for (`pip install ".[sql]"`) are installed without constraints, so in their
+blocks. The packages that the text asks for (`pip install "mcaptrack[sql]"`) are installed without constraints, so in their
 newest releases. Needs nothing but Python 3.11 or later and a package registry. Prints what it leaves out, and why;
 exits with 1 and the output of the first command that fails.
 
@@ -37,7 +37,7 @@ LEFT_OUT = {
     r"make test": "it is run by itself",
     r"pip install git\+https://.*": "the copy of the repository is installed",
     r"pip install -c constraints\.txt .*": "it would replace the newest releases",
-    r'pip install "\.\[train\]"|mcaptrack train .*': "torch is several gigabytes",
+    r'pip install "mcaptrack\[train\]"|mcaptrack train .*': "torch is several gigabytes",
 }
 #: Exit codes besides 0 that the README announces.
 ALSO_GOOD = {"recover": {3}}
