@@ -207,7 +207,7 @@ def cameras(folder: Path) -> Picture:
 
 def robots(folder: Path) -> Picture:
     """Tracks of drawn 3D boxes, from above."""
-    boxes = draw_traffic(3, seconds=8.0).boxes
+    boxes = draw_traffic(3, seconds=8.0, density=0.4).boxes
     names = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "heading_rad", "score")
     with (folder / "boxes.csv").open("w", newline="") as file:
         writer = csv.writer(file)
