@@ -178,6 +178,20 @@ def registry() -> str:
     return _references(registry, ["find", "names", "entry_of", "Entry"])
 
 
+def contracts() -> str:
+    """What label formats, readers of messages and exporters of a user's own have to be, and give."""
+    from mcaptrack import contracts
+
+    return _references(contracts, ["LabelFormat", "LabelBoxes", "MessageReader", "Box", "Box3d", "Exporter"])
+
+
+def fleet() -> str:
+    """Functions over many logs."""
+    from mcaptrack import fleet
+
+    return _references(fleet, ["run", "FleetResult", "LogOutcome"])
+
+
 def testing() -> str:
     """The checks of parts of a user's own."""
     from mcaptrack import testing
@@ -191,5 +205,6 @@ def _cell(text: str) -> str:
 
 
 GENERATED: dict[str, Callable[[], str]] = {
-    made.__name__: made for made in (commands, library, transforms, predictors, metrics, registry, testing)
+    made.__name__: made
+    for made in (commands, library, fleet, transforms, predictors, metrics, contracts, registry, testing)
 }
