@@ -7,8 +7,8 @@
 FOLDER, which must not exist, gets a copy of the repository, an environment, and every file that the commands name:
 videos, labels and recordings of one drawn scene. All ``sh`` blocks run in their order, then all ``sql`` and ``python``
 blocks. The packages that the text asks for (`pip install "mcaptrack[sql]"`) are installed without constraints, so in
-their newest releases. Needs nothing but Python 3.11 or later and a package registry. Prints what it leaves out, and why;
-exits with 1 and the output of the first command that fails.
+their newest releases. Needs nothing but Python 3.11 or later and a package registry. Prints what it leaves out, and
+why; exits with 1 and the output of the first command that fails.
 
 Pictures and numbers are of `mcaptrack demo` with its usual seed, and of ten seeds of each scene (demo_scores.json,
 which `tools/bench/demo.py` measures). Screenshots need Chromium; without it they are left out. Three minutes
