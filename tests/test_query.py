@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from mcaptrack import log, tables
-from mcaptrack.schema import EVENTS, PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema import EVENTS, FORECAST_ERRORS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from mcaptrack.sources.demo import demo_scene
@@ -151,6 +151,7 @@ def known_log(path, tracked=(7, 8)):
     whole = [Frame(ns(0.1 * n), n, rows) for n, rows in enumerate(seen)]
     ahead = [(7, 1, 0.4, 0.3), (7, 2, 0.8, 0.0), (8, 1, 0.0, 10.5), (8, 2, 0.4, 10.8)]
     predicted = Provenance("predict", {}, "/camera/samples")
+    of_whom = FORECAST_ERRORS.rows(track_id=[7, 8], truth_id=[1, 2], later_id=[-1, -1])
     told = [
         Frame(ns(2.4), 6, happened([(4, 1, 7, 9, 0.4), (2, 1, 7, -1, 0.8), (2, 2, 8, -1, 0.4), (2, 1, 9, -1, 1.2)]))
     ]
@@ -163,6 +164,11 @@ def known_log(path, tracked=(7, 8)):
             "/camera/retracks": (TRACKS, Provenance("retrack", {}, "/camera/samples"), samples),
             "/camera/retracks/full": (TRACKS, Provenance("carry", {}, "/camera/retracks"), whole),
             "/camera/predictions": (PREDICTIONS, predicted, [Frame(0, 0, forecasts(ahead))]),
+            "/camera/predictions/errors": (
+                FORECAST_ERRORS,
+                Provenance("events", {}, "/camera/predictions"),
+                [Frame(0, 0, of_whom)],
+            ),
             "/camera/tracks/events": (EVENTS, Provenance("events", {}, "/camera/tracks"), told),
         },
     )
