@@ -19,14 +19,16 @@ import mcaptrack
 from mcaptrack.sources.demo import demo_scene
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent.parent))
 from traffic import CLASSES, draw_traffic
+
+from tests.browser import PROGRAM, browser
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 #: How the picture of the README is drawn.
 COMPARED = "--compare --width 800 --start-s 26.5 --end-s 33 --max-fps 3"
 #: Width of a picture of one part, and of each of two beside each other (px).
 WIDE, HALF = 800, 400
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 ZONES = {
     "type": "FeatureCollection",
     "units": "metres",
@@ -55,7 +57,7 @@ def pictures(log: Path, folder: Path) -> Iterator[tuple[Path, Path]]:
     for name, picture in stills(log, folder):
         cv2.imwrite(str(drawn / f"{name}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
         yield drawn / f"{name}.jpg", DOCS / "images" / f"{name}.jpg"
-    if CHROMIUM is None:
+    if PROGRAM is None:
         print("left out: screenshots (there is no Chromium)")
         return
     for name, picture in screenshots(log, folder):
@@ -93,9 +95,9 @@ def screenshots(log: Path, folder: Path) -> Iterator[tuple[str, Picture]]:
     yield "report", shown((folder / "report.html").as_uri(), folder, 800, 1077)
     with mcaptrack.open(log) as opened:
         opened.show(start_s=27.0, end_s=31.0).save(folder / "player.html")
-    yield "player", shown((folder / "player.html").as_uri(), folder, 800, 600)
+    yield "player", shown((folder / "player.html").as_uri(), folder, 800, 600, "player.html")
     server = mcaptrack.view(log, port=0).start()
-    yield "view", shown(server.address, folder, 1200, 760)
+    yield "view", shown(server.address, folder, 1200, 760, "player-0.html")
     server.close()
     command("evaluate", log, "--smoothed", "--curves", folder / "curves.svg")
     yield "curves", shown((folder / "curves.svg").as_uri(), folder, 560, 300)
@@ -123,12 +125,16 @@ def grid(parts: Sequence[Picture], columns: int = 2) -> Picture:
     return np.vstack([np.hstack(framed[at : at + columns]) for at in range(0, len(framed), columns)])
 
 
-def shown(address: str, folder: Path, width: int, height: int) -> Picture:
-    """A screenshot of a page (px)."""
+def shown(address: str, folder: Path, width: int, height: int, player: str = "") -> Picture:
+    """A screenshot of a page (px), once the player in its frame of this name is ready."""
     path = folder / "shown.png"
-    words = ("--headless", "--no-sandbox", "--hide-scrollbars", "--disable-gpu", "--virtual-time-budget=30000")
-    line = [str(CHROMIUM), *words, f"--window-size={width},{height}", f"--screenshot={path}", address]
-    subprocess.run(line, check=True, capture_output=True)
+    with browser() as tab:
+        tab.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        tab.open(address)
+        tab.wait("document.readyState === 'complete'")
+        if player:
+            tab.wait("document.documentElement.classList.contains('ready')", player)
+        tab.picture(path, width, height)
     return cv2.imread(str(path))
 
 
