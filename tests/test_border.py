@@ -22,7 +22,7 @@ from pyarrow import feather
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, find
+from mcaptrack.registry import BUILT_IN
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, OF_SOURCE
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 from mcaptrack.sources.ingest.labels.table import BoxTable
@@ -463,14 +463,6 @@ BROKEN: dict[str, list[tuple[list[Row], str, str, str]]] = {
 def test_every_format_and_every_check_is_here():
     assert set(WRITERS) == set(BUILT_IN["label_format"])
     assert set(BROKEN) == {*OF_SOURCE, *OF_ROLE, "classes"}
-
-
-def test_the_page_of_formats_has_the_table_of_the_registry():
-    page = (Path(__file__).parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
-    formats = {name: find("label_format", name).cls for name in BUILT_IN["label_format"]}
-    assert [f"| `{name}` | {form.title} | {form.row} |" in page for name, form in formats.items()] == [True] * len(
-        formats
-    )
 
 
 def has(name: str) -> set[str]:

@@ -36,8 +36,7 @@ COMMANDS = GROUP.commands
 #: Pages that take long, and whose commands other tests run; those of README.md tools/readme.py runs in an environment of
 #: its own.
 LONG = {
-    "README.md", "ablation.md", "camera-motion.md", "extend.md", "fleet.md", "python.md", "robots.md", "sql.md", "stages.md",
-    "tuning.md", "tutorial.md",
+    "README.md", "camera-motion.md", "extend.md", "fleet.md", "python.md", "robots.md", "sql.md", "stages.md", "tutorial.md",
 }  # fmt: skip
 #: What a page finds where it names it: a copy of a prepared file or folder.
 PREPARED = {
@@ -173,21 +172,6 @@ def test_the_floors_on_the_map_are_those_that_are_held():
     assert layers == {name for name in modules if not name.startswith("__")}
     text = ARCHITECTURE.read_text()
     assert all(re.search(rf"\b{name}\b", text) for name in layers)
-
-
-def test_the_scores_of_the_method_are_those_of_the_ablation():
-    """Both pages have scores of profiles within 1 m: IDF1, MOTA and identity switches."""
-    ablation, method = ((ROOT / "docs" / f"{name}.md").read_text() for name in ("ablation", "method"))
-    table = ablation.split("<!-- From the paper to the default -->")[1]
-    steps = {"paper": "paper", "authors": "authors", "default": "+ smoothing (the default)"}
-    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| ")]
-    for profile, step in steps.items():
-        (row,) = (cells for cells in rows if cells[0] == f"| {step}")
-        noisy, detections = (re.sub(r" \([\d.]+\)", "", cell).strip(" |").split(" / ") for cell in row[3:5])
-        if profile != "authors":  # with an LSTM on the other page
-            idf1, mota, switches = noisy
-            assert f"| `--profile {profile}` | {idf1} | {mota} | {round(float(switches)):,} |" in method
-        assert re.search(rf"\b{detections[0]} for `{profile}`", method)
 
 
 def test_every_dependency_is_pinned():
@@ -334,7 +318,7 @@ def assert_exists(line: str) -> None:
     if words[0] == "make":
         assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.M), line
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    for named in re.findall(r"\.\[([\w,]+)\]", line):
+    for named in re.findall(r"(?:\.|mcaptrack)\[([\w,]+)\]", line):
         assert set(named.split(",")) <= extras.keys(), line
     if words[0] != "mcaptrack" or len(words) == 1:
         return

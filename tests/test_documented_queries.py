@@ -24,7 +24,6 @@ from mcaptrack import log
 from mcaptrack.schema import (
     DECISIONS,
     EVENTS,
-    FORECAST_ERRORS,
     PREDICTIONS,
     TRACKS,
     ZONE_COUNTS,
@@ -131,16 +130,6 @@ def stays(seven: Log) -> Rows:
     return out
 
 
-def inside_polygon(seven: Log) -> Rows:
-    corners = np.array([[0, 10], [5, 12], [3, 16], [-3, 15]], float)  # convex, counter-clockwise
-    sides, out = np.roll(corners, -1, axis=0) - corners, []
-    for who, (t_ns, xy_m, _) in seven.tracks("truth").items():
-        away = xy_m[:, None] - corners
-        inside = t_ns[(sides[:, 0] * away[..., 1] - sides[:, 1] * away[..., 0] > 0).all(axis=1)]
-        out += [[who, inside[0] / NS, inside[-1] / NS, len(inside)]] if len(inside) else []
-    return out
-
-
 def areas(seven: Log) -> Rows:
     who: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for t_ns, row in seven.rows("truth", TRACKS):
@@ -169,11 +158,6 @@ def speeds(seven: Log) -> Rows:
         path_m = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
         assert out[walker.id].mean() == pytest.approx(path_m / (end - begin), rel=0.15), walker.id
     return [[who, of.mean(), of.max()] for who, of in out.items() if len(of)]
-
-
-def distribution(seven: Log) -> Rows:
-    every = np.concatenate([speeds_of(track) for track in seven.tracks("truth").values()])
-    return sorted(map(list, Counter((np.floor(every * 4) / 4).tolist()).items()))
 
 
 def approaches(seven: Log) -> Rows:
@@ -222,48 +206,13 @@ def place_at(track: Track, t_ns: int) -> np.ndarray | None:
     return np.array([np.interp(0.0, seconds, track.xy_m[:, axis]) for axis in range(2)])
 
 
-#: Distances of a forecast, by the time and the track that it is of, and by the seconds ahead.
-Distances = dict[tuple[int, int], dict[float, float]]
-
-
-def distances_m(seven: Log, tracks: dict[int, Track], whose: Callable[[int, int], int]) -> Distances:
-    out: Distances = {}
-    for t_ns, row in seven.rows("predictions", PREDICTIONS):
-        key = (t_ns, int(row["track_id"]))
-        track = tracks.get(whose(*key))
-        place = None if track is None else place_at(track, t_ns + round(row["ahead_s"] * NS))
-        if place is not None:
-            out.setdefault(key, {})[round(row["ahead_s"], 1)] = np.hypot(*(place - [row["x_m"], row["y_m"]]))
-    return out
-
-
-def by_time_ahead(distances: Distances) -> Rows:
-    times = sorted({ahead_s for of in distances.values() for ahead_s in of})
-    return [
-        [ahead_s, len(of), np.mean(of)]
-        for ahead_s in times
-        for of in [[by[ahead_s] for by in distances.values() if ahead_s in by]]
-    ]
-
-
 def against_tracks(seven: Log) -> Rows:
-    return by_time_ahead(distances_m(seven, seven.tracks("samples"), lambda _, track_id: track_id))
-
-
-def against_truth(seven: Log) -> Rows:
-    of_whom = {
-        (t_ns, int(row["track_id"])): row
-        for t_ns, row in seven.rows("predictions/errors", FORECAST_ERRORS)
-        if row["truth_id"] >= 0
-    }
-    distances = distances_m(
-        seven, seven.tracks("truth"), lambda *key: int(of_whom[key]["truth_id"]) if key in of_whom else -1
-    )
-    assert len(distances) > 0.9 * len(of_whom)  # few of these times are those of frames
-    for key, row in of_whom.items():  # what the evaluation of forecasts says
-        if np.isfinite(row["ade_m"]):
-            assert np.mean([*distances[key].values()]) == pytest.approx(row["ade_m"], abs=0.02), key
-    return by_time_ahead(distances)
+    tracks, off_m = seven.tracks("samples"), {}
+    for t_ns, row in seven.rows("predictions", PREDICTIONS):
+        place = place_at(tracks[int(row["track_id"])], t_ns + round(row["ahead_s"] * NS))
+        if place is not None:
+            off_m.setdefault(round(row["ahead_s"], 1), []).append(np.hypot(*(place - [row["x_m"], row["y_m"]])))
+    return [[ahead_s, len(of), np.mean(of)] for ahead_s, of in sorted(off_m.items())]
 
 
 def settings(seven: Log) -> Rows:
@@ -291,16 +240,13 @@ ANSWERS: dict[str, tuple[Callable[[Log], Rows], float]] = {
     "as frames\nfrom (select": (numbers_of_people, 0),
     "as begin": (arrivals, 0),
     "as visits": (stays, 0.051),
-    "create macro inside": (inside_polygon, 1e-9),
     "with zones(": (areas, 0.051),
     "as fastest_m_s": (speeds, 0.051),
-    "as from_m_s": (distribution, 0),
     "as closest_m": (approaches, 0.0051),
     "kind = 4": (switches, 0.51),
     "as hidden_s": (occlusions, 0.051),
     "kind = 2": (misses, 0.051),
     "made.input": (against_tracks, 0.0051),
-    "truth_id >= 0": (against_truth, 0.0051),
     "json_each": (settings, 0),
     "recursive": (chain, 0),
     "order by recording, topic": (scores, 0.0051),

@@ -2,9 +2,10 @@
 
     .venv/bin/python tools/ablation.py
     .venv/bin/python tools/ablation.py --corrupted sdd/train --scenes sdd-noisy --scenes sdd-detections \
-        --homographies sdd/homography -o docs/ablation.md
+        --homographies sdd/homography -o docs/method.md
 
-The first table has the default without one part each, the second the way from the paper to the default, one step a row.
+The first table has the profiles and the default without one part each, the second the way from the paper to the
+default, one step a row.
 `--corrupted` are true tracks with all kinds of `corruptions.py`: their scores are means over seeds, with the standard
 deviation. Without a folder they are synthetic crowds. `--scenes` are folders as of `reproduce.py`, drawn once: their
 spread is that of 200 choices of as many scenes with replacement. IDF1 / MOTA / identity switches within 1 m, by
@@ -85,8 +86,9 @@ _NAMES = {
 
 
 def _parts() -> dict[str, tuple[str, Retracking]]:
-    """The default without one part each, and the options of `mcaptrack retrack` that leave it out."""
-    out: dict[str, tuple[str, Retracking]] = {"the default": ("", DEFAULT)}
+    """The profiles, and the default without one part each, with the options of `mcaptrack retrack` for it."""
+    out: dict[str, tuple[str, Retracking]] = {name: STEPS[name] for name in ("paper", "authors")}
+    out["the default"] = ("", DEFAULT)
     for field in fields(DEFAULT):
         flag = field.name.replace("_", "-")
         has_flag = field.metadata.get("flag", True)
@@ -193,8 +195,10 @@ def main() -> None:
     for heading, table in tables(columns).items():
         print(f"\n{heading}\n\n{table}")
         mark = f"<!-- {heading} -->"
-        before, _, rest = text.partition(mark)
-        after = rest.partition(mark)[2] or "\n"
+        before, here, rest = text.partition(mark)
+        if not here:
+            continue
+        after = rest.partition(mark)[2]
         text = before.rstrip("\n") + f"\n\n{mark}\n\n{table}\n\n{mark}" + after
     if given.output:
         given.output.write_text(text.lstrip("\n"))

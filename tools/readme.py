@@ -6,13 +6,13 @@
 
 FOLDER, which must not exist, gets a copy of the repository, an environment, and every file that the commands name:
 videos, labels and recordings of one drawn scene. All ``sh`` blocks run in their order, then all ``sql`` and ``python``
-blocks. The packages that the text asks for (`pip install ".[sql]"`) are installed without constraints, so in their
-newest releases. Needs nothing but Python 3.11 or later and a package registry. Prints what it leaves out, and why;
-exits with 1 and the output of the first command that fails.
+blocks. The packages that the text asks for (`pip install "mcaptrack[sql]"`) are installed without constraints, so in
+their newest releases. Needs nothing but Python 3.11 or later and a package registry. Prints what it leaves out, and
+why; exits with 1 and the output of the first command that fails.
 
 Pictures and numbers are of `mcaptrack demo` with its usual seed, and of ten seeds of each scene (demo_scores.json,
-which `tools/bench/demo.py` measures). Screenshots need Chromium; without it they are left out by name. A minute of one
-core.
+which `tools/bench/demo.py` measures). Screenshots need Chromium; without it they are left out. Three minutes
+of one core.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LEFT_OUT = {
     r"make test": "it is run by itself",
     r"pip install git\+https://.*": "the copy of the repository is installed",
     r"pip install -c constraints\.txt .*": "it would replace the newest releases",
-    r'pip install "\.\[train\]"|mcaptrack train .*': "torch is several gigabytes",
+    r'pip install "mcaptrack\[train\]"|mcaptrack train .*': "torch is several gigabytes",
 }
 #: Exit codes besides 0 that the README announces.
 ALSO_GOOD = {"recover": {3}}
@@ -136,11 +136,11 @@ def run(words: list[object], work: Path, folder: Path, also_good: set[int] = fro
 
 # Pictures and numbers. What follows runs where mcaptrack and its dependencies are.
 
-#: How the picture of the README is drawn, and the size of the report's screenshot (px).
-PICTURE = "--compare --width 800 --start-s 26.5 --end-s 33 --max-fps 3"
-SCREENSHOT = (800, 1077)
-#: Pictures are alike if they differ by less than so many grey levels in the mean: encoders and fonts differ.
+#: Pictures are alike if they differ by fewer grey levels in the mean: encoders and the fonts of Chromium differ.
 ALIKE = {".gif": 3.0, ".jpg": 10.0}
+#: Stills, which bring their fonts, are alike if no square of so many pixels differs by more grey levels in the mean.
+TILE_PX, ALIKE_TILE = 16, 25.0
+SCREENSHOTS = ("report", "player", "view", "curves")
 #: Sentences with numbers, and the page that each is on.
 SENTENCES = {
     "README.md": (
@@ -155,6 +155,8 @@ SENTENCES = {
 
 def renew(writes: bool) -> int:
     """Make all pictures and numbers, and write them, or say which differ; returns the exit code."""
+    from pictures import pictures
+
     differ = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -162,8 +164,9 @@ def renew(writes: bool) -> int:
         mcaptrack("demo", "-o", log.parent, "-q")
         for made, path in pictures(log, folder):
             if writes:
+                path.parent.mkdir(exist_ok=True)
                 shutil.copy2(made, path)
-            elif not path.exists() or difference(made, path) > ALIKE[path.suffix]:
+            elif not path.exists() or differs(made, path):
                 differ.append(str(path.relative_to(ROOT)))
         for path, text in texts(log):
             if writes:
@@ -180,33 +183,8 @@ def mcaptrack(*words: object) -> str:
     return subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout
 
 
-def pictures(log: Path, folder: Path) -> Iterator[tuple[Path, Path]]:
-    """Pictures as they are made now, and where they stand."""
-    mcaptrack("render", log, "-o", folder / "demo.gif", *PICTURE.split(), "-q")
-    yield folder / "demo.gif", ROOT / "docs" / "demo.gif"
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser is None:
-        print("left out: docs/report.jpg (there is no Chromium)")
-        return
-    import cv2
-
-    mcaptrack("report", log, "-o", folder / "report.html", "-q")
-    size = "--window-size={},{}".format(*SCREENSHOT)
-    words = [
-        "--headless",
-        "--no-sandbox",
-        "--hide-scrollbars",
-        "--disable-gpu",
-        size,
-        f"--screenshot={folder}/report.png",
-    ]
-    subprocess.run([browser, *words, (folder / "report.html").as_uri()], check=True, capture_output=True)
-    cv2.imwrite(str(folder / "report.jpg"), cv2.imread(str(folder / "report.png")), [cv2.IMWRITE_JPEG_QUALITY, 85])
-    yield folder / "report.jpg", ROOT / "docs" / "report.jpg"
-
-
-def difference(made: Path, path: Path) -> float:
-    """The mean difference of two pictures in grey levels; infinite if their sizes or numbers of pictures differ."""
+def differs(made: Path, path: Path) -> bool:
+    """Whether two pictures show something else, have another size, or another number of frames."""
     import av
     import numpy as np
 
@@ -215,8 +193,13 @@ def difference(made: Path, path: Path) -> float:
         with av.open(str(picture)) as container:
             both.append(np.stack([frame.to_ndarray(format="gray") for frame in container.decode(video=0)]))
     if both[0].shape != both[1].shape:
-        return float("inf")
-    return float(np.abs(both[0].astype(int) - both[1]).mean())
+        return True
+    difference = np.abs(both[0].astype(int) - both[1])
+    if path.stem in SCREENSHOTS or path.suffix == ".gif":
+        return bool(difference.mean() > ALIKE[path.suffix])
+    count, height, width = (size - size % TILE_PX if at else size for at, size in enumerate(difference.shape))
+    tiles = difference[:, :height, :width].reshape(count, height // TILE_PX, TILE_PX, width // TILE_PX, TILE_PX)
+    return bool(tiles.mean(axis=(2, 4)).max() > ALIKE_TILE)
 
 
 def texts(log: Path) -> Iterator[tuple[Path, str]]:

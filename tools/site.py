@@ -1,25 +1,29 @@
-"""The generated parts of the site: commands, messages, library, the changelog.
+"""The generated parts of the site: commands, library, parts of the pipeline, answers to queries.
 
 MkDocs calls ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
 ``<!-- generated: NAME -->`` where a part belongs: one of ``GENERATED``, or of those that `mcaptrack docs` prints, too
-(``mcaptrack.cli.generated.PARTS``).
+(``mcaptrack.cli.generated.PARTS``). Below each query of docs/sql.md stands what the tables of `mcaptrack demo` answer:
+those in the folder that the environment variable DEMO names, or those of one that is made for it (a minute).
 """
 
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import sys
 from collections.abc import Callable, Collection, Iterable
+from contextlib import chdir
 from dataclasses import fields, is_dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, get_args
 
 import griffe
 
 ROOT = Path(__file__).resolve().parent.parent
-REPOSITORY = "https://github.com/mcaptrack/mcaptrack"
 _KINDS = {bool: "", int: "whole number", float: "number", Path: "path"}
 
 
@@ -30,16 +34,46 @@ class Completed(griffe.Extension):
         """Replace the docstring of a function that is a command."""
         if any(str(decorator.value).startswith("declared(") for decorator in func.decorators):
             doc = inspect.getdoc(getattr(import_module(func.module.path), func.name)) or ""
-            func.docstring = griffe.Docstring(doc, parent=func)
+            func.docstring = griffe.Docstring(doc, parent=func, parser=griffe.Parser.numpy)
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """The page, without the marks of its blocks, with what is generated."""
     sys.path[:0] = [path for path in (str(ROOT),) if path not in sys.path]
     text = re.sub(r"^ *<!-- (?:not run|file|exit): .+? -->\n", "", markdown, flags=re.M)
     from mcaptrack.cli.generated import PARTS, with_parts
 
-    return with_parts(text, PARTS | GENERATED)
+    text = with_parts(text, PARTS | GENERATED)
+    return with_answers(text) if page.file.src_uri == "sql.md" else text
+
+
+@cache
+def with_answers(text: str) -> str:
+    """The page of queries, with the answer that DuckDB alone gives below each of those about one log."""
+    import duckdb
+
+    import mcaptrack
+
+    with TemporaryDirectory() as folder, duckdb.connect() as connection:
+        if "DEMO" not in os.environ:
+            mcaptrack.demo(output=folder, force=True)
+
+        def answered(block: re.Match[str]) -> str:
+            if block[1].startswith("create view"):
+                connection.execute(block[1])
+            elif "before join" not in block[1]:  # that one is about two logs
+                relation = connection.sql(block[1])
+                head = f"| {' | '.join(relation.columns)} |\n{'|---' * len(relation.columns)}|\n"
+                rows = [f"| {' | '.join(map(_value, row))} |\n" for row in relation.fetchall()]
+                return f"{block[0]}\n{head}{''.join(rows)}"
+            return block[0]
+
+        with chdir(os.environ.get("DEMO", folder)):
+            return re.sub(r"^```sql\n(.*?)```\n", answered, text, flags=re.S | re.M)
+
+
+def _value(value: object) -> str:
+    return "null" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def commands() -> str:
@@ -81,31 +115,11 @@ def _option(one: Any, settings: dict[str, Any]) -> str:
     return f"| {names} | {values} | {_cell(default)} | {_cell(one.help or '')} |"
 
 
-def messages() -> str:
-    """Every message of the rows, as schemas/ defines it."""
-    parts = []
-    for path in sorted((ROOT / "schemas").glob("*.proto")):
-        text = path.read_text(encoding="utf-8")
-        about = re.match(r"// (.*)\n", text)
-        lines = [
-            f"## mcaptrack.{path.stem}",
-            "",
-            about[1] if about else "",
-            "",
-            "| field | type | meaning |",
-            "|---|---|---|",
-        ]
-        for optional, kind, name, words in re.findall(r"^ +(optional )?(\w+) (\w+) = \d+; *// (.*)$", text, re.M):
-            lines.append(f"| `{name}` | {kind}{', may be missing' if optional else ''} | {_cell(words)} |")
-        parts.append("\n".join(lines))
-    return "\n\n".join(parts)
-
-
 def library() -> str:
     """What the package exports: functions, then classes."""
     import mcaptrack
 
-    return _references(mcaptrack, sorted(mcaptrack.__all__, key=lambda name: (name[0].isupper(), name)))
+    return _references(mcaptrack, sorted(mcaptrack.__all__, key=lambda name: (name[0].isupper(), name)), level=2)
 
 
 def transforms() -> str:
@@ -114,7 +128,7 @@ def transforms() -> str:
     from mcaptrack.transforms import protocol
 
     parts = [_references(protocol, ["Transform", "option", "context"])]
-    plain = "    options: { members: false, show_bases: false, show_signature: false }"
+    plain = "    options: { heading_level: 3, members: false, show_bases: false, show_signature: false }"
     for name in transforms.__all__:
         one = getattr(transforms, name)
         if not (isinstance(one, type) and is_dataclass(one) and hasattr(one, "writes")):
@@ -149,17 +163,40 @@ def metrics() -> str:
     return "\n\n".join(parts)
 
 
-def _references(module: Any, names: Iterable[str], known: Collection[str] = ()) -> str:
+def _references(module: Any, names: Iterable[str], known: Collection[str] = (), level: int = 3) -> str:
     """Directives of mkdocstrings for classes and functions of a module, where they are defined."""
     found = [getattr(module, name) for name in names if name not in known]
     places = [f"{one.__module__}.{one.__qualname__}" for one in found if isinstance(one, type) or callable(one)]
-    return "\n\n".join(f"::: {place}" for place in dict.fromkeys(places) if place.startswith("mcaptrack."))
+    options = f"\n    options: {{ heading_level: {level} }}"
+    return "\n\n".join(f"::: {place}{options}" for place in dict.fromkeys(places) if place.startswith("mcaptrack."))
 
 
-def changes() -> str:
-    """The changelog, its headings one level down."""
-    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split("\n", 1)[1]
-    return re.sub(r"\]\((?!https?:)([^)#]+)", rf"]({REPOSITORY}/blob/main/\1", text)
+def registry() -> str:
+    """How parts are found by their names."""
+    from mcaptrack import registry
+
+    return _references(registry, ["find", "names", "entry_of", "Entry"])
+
+
+def contracts() -> str:
+    """What label formats, readers of messages and exporters of a user's own have to be, and give."""
+    from mcaptrack import contracts
+
+    return _references(contracts, ["LabelFormat", "LabelBoxes", "MessageReader", "Box", "Box3d", "Exporter"])
+
+
+def fleet() -> str:
+    """Functions over many logs."""
+    from mcaptrack import fleet
+
+    return _references(fleet, ["run", "FleetResult", "LogOutcome"])
+
+
+def testing() -> str:
+    """The checks of parts of a user's own."""
+    from mcaptrack import testing
+
+    return _references(testing, testing.__all__)
 
 
 def _cell(text: str) -> str:
@@ -168,5 +205,6 @@ def _cell(text: str) -> str:
 
 
 GENERATED: dict[str, Callable[[], str]] = {
-    made.__name__: made for made in (commands, messages, library, transforms, predictors, metrics, changes)
+    made.__name__: made
+    for made in (commands, library, fleet, transforms, predictors, metrics, contracts, registry, testing)
 }

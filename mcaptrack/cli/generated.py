@@ -118,7 +118,16 @@ def class_limits() -> str:
     return "\n".join([head, "|---" * 8 + "|", *rows])
 
 
+def label_formats() -> str:
+    """The built-in formats of label files, as a table in Markdown."""
+    from mcaptrack.registry import BUILT_IN, find
+
+    forms = {name: find("label_format", name).cls for name in BUILT_IN["label_format"]}
+    rows = (f"| `{name}` | {form.title} | {form.row} |" for name, form in forms.items())
+    return "\n".join(["| `--format` | | a row, or a file |", "|---|---|---|", *rows])
+
+
 #: The parts by name.
 PARTS: dict[str, Callable[[], str]] = {
-    part.__name__: part for part in (environment, stage_options, other_numbers, tables, class_limits)
+    part.__name__: part for part in (environment, stage_options, other_numbers, tables, class_limits, label_formats)
 }
