@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.fixed_frame import recorded
-from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.fields import Message3d
+from tests.box_reading import boxes_of, recorded
 from tests.ros_messages import BAR, Ros, plain
 from tests.space_logs import (
     SEEN,
@@ -74,9 +74,9 @@ def autoware(package: str, kind: str, labels: tuple[str, ...] = LABELS) -> str:
 def read(writer: Ros, message, encoding: str) -> Message3d:
     """The boxes of a message; a writer of ROS 1 or ROS 2 made it."""
     if encoding != "json":
-        return boxes_decoder(writer.kind, in_space=True)(writer.pack(message))
+        return boxes_of(writer.kind, writer.pack(message))
     kind = MessageType(writer.kind.name, "jsonschema", b"{}", "json")
-    return boxes_decoder(kind, in_space=True)(json.dumps(plain(message)).encode())
+    return boxes_of(kind, json.dumps(plain(message)).encode())
 
 
 def twist(writer: Ros, velocity):
@@ -227,7 +227,7 @@ def test_detections_that_state_their_pose_in_a_result_alone():
     head = {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "lidar"}
     boxes = [one((0, 0, 0), (7, 8, 9)), one((1, 0, 0), (7, 8, 9)), one((0, 0, 0), (0, 0, 0))]
     kind = MessageType("vision_msgs/msg/Detection3DArray", "jsonschema", b"{}", "json")
-    found = boxes_decoder(kind, in_space=True)(json.dumps({"header": head, "detections": boxes}).encode())
+    found = boxes_of(kind, json.dumps({"header": head, "detections": boxes}).encode())
     assert [box.centre for box in found.boxes] == [(7, 8, 9), (1, 0, 0), (0, 0, 0)]
     assert [box.orientation for box in found.boxes] == [(0, 0, 0, 1), (0, 0, 0, 0), (0, 0, 0, 0)]
 
@@ -235,13 +235,13 @@ def test_detections_that_state_their_pose_in_a_result_alone():
 def test_a_field_that_is_missing_is_named():
     kind = MessageType("jsk_recognition_msgs/BoundingBoxArray", "jsonschema", b"{}", "json")
     with pytest.raises(McaptrackError, match=r"message \(it has no field 'stamp'\)$"):
-        boxes_decoder(kind, in_space=True)(b'{"header": {"frame_id": "a"}, "boxes": []}')
+        boxes_of(kind, b'{"header": {"frame_id": "a"}, "boxes": [{"pose": {"position": {"x": 1, "y": 2}}}]}')
 
 
 def test_scenes_of_foxglove_are_the_same_in_all_encodings():
     protobuf = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
-    wanted = boxes_decoder(protobuf, in_space=True)(scene_update(START_NS, [SEEN]).SerializeToString())
-    found = boxes_decoder(protobuf._replace(encoding="json"), in_space=True)(scene_update_json(START_NS, [SEEN]))
+    wanted = boxes_of(protobuf, scene_update(START_NS, [SEEN]).SerializeToString())
+    found = boxes_of(protobuf._replace(encoding="json"), scene_update_json(START_NS, [SEEN]))
     assert found.boxes == wanted.boxes
     assert wanted.boxes[0].source_id == "12"
     for ros1 in (False, True):
@@ -385,6 +385,6 @@ def test_definitions_in_idl_have_their_constants_in_a_module_beside():
     text = BAR + IDL.format(package=package, bar=BAR, labels=labels)
     kind = made.writer.kind._replace(schema_encoding="ros2idl", schema=text.encode())
     objects = [made.one(labels=((number, 1.0),)) for number in (1, 3, 6)]
-    found = boxes_decoder(kind, in_space=True)(made.writer.pack(made.message(*objects)))
+    found = boxes_of(kind, made.writer.pack(made.message(*objects)))
     assert [box.class_name for box in found.boxes] == ["car", "trailer", "pedestrian"]
     assert found.boxes[0].velocity == pytest.approx((0, 3, 0))

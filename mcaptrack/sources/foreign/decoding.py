@@ -132,7 +132,11 @@ _LIMIT_NS: Final = 2**63
 
 def stamp_of(message: Any) -> int:
     """The stamp of a message in nanoseconds: ``timestamp`` in Foxglove messages, ``header.stamp`` in ROS messages."""
-    stamp = message.timestamp if hasattr(message, "timestamp") else message.header.stamp
+    return time_of(message.timestamp if hasattr(message, "timestamp") else message.header.stamp)
+
+
+def time_of(stamp: Any) -> int:
+    """A time in nanoseconds. Raises ValueError for what is none."""
     if isinstance(stamp, str):
         match = _RFC3339.fullmatch(stamp)
         if not match:

@@ -110,6 +110,8 @@ class UnreadMessages:
             warn(f"{self._where}: {where}; {so}", "lost")
 
     def __str__(self) -> str:
+        if not self._unread:
+            return ""
         many = f"; {self._unread} of {self._seen} messages are like this" if self._unread > 1 else ""
         return f" at {self._first[0]} ns: {self._first[1]}{many}"
 

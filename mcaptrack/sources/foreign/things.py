@@ -1,0 +1,276 @@
+"""What messages hold, by the paths of its fields: of all messages of a batch at once, or of single ones.
+
+``Columns`` are messages that ``mcaptrack.columns`` reads. ``Objects`` are decoded messages, where there are no columns:
+those of JSON and of encodings that aren't read so, those that drawings and readers of packages take, and those of a
+batch in which some can't be read. Both give the same values, so that a reader need not know which they are.
+
+Letters: M messages, N things (messages, or members of lists in them), K members.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from math import nan
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+from mcap.well_known import MessageEncoding
+
+from mcaptrack import log
+from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, number, text, time_of
+from mcaptrack.sources.foreign.flatten import UnreadMessages, column_reader, message_type_of, payload_decoder
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+T = TypeVar("T")
+Path = tuple[str, ...]
+#: The token of a list in a path, all members of which count; others, such as "[0]", stand for one member.
+EACH: Final = "[]"
+
+
+class Things(ABC):
+    """N things, with the values of their fields by path. Fields that are missing may be any; those of protobuf are 0,
+    which it leaves out.
+    """
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def has(self, path: Path) -> bool:
+        """Whether there is such a field."""
+
+    @abstractmethod
+    def is_set(self, path: Path) -> Bools:
+        """Whether each thing has the field (N,): in protobuf and JSON it may be missing."""
+
+    @abstractmethod
+    def values(self, path: Path) -> list[Any]:
+        """The values of a field (N,); None where it is missing."""
+
+    @abstractmethod
+    def numbers(self, path: Path) -> Floats:
+        """The numbers of a field (N,); NaN where it is missing."""
+
+    @abstractmethod
+    def stamps(self, path: Path) -> Ints:
+        """The times of a field in ns (N,); 0 where it is missing. Raises ValueError if it holds no times."""
+
+    @abstractmethod
+    def members(self, path: Path) -> tuple[Ints, Things]:
+        """The thing of each member of a list (K,), and the members. Its path ends with "[]"; () are the things."""
+
+    @property
+    def single(self) -> Any:
+        """The one message that these are, decoded, for those who read messages as objects."""
+        raise TypeError("columns are no objects")
+
+    def texts(self, path: Path) -> Any:
+        """The texts of a field (N,); "" where it is missing."""
+        return np.array(["" if value is None else text(value) for value in self.values(path)], object)
+
+    def vectors(self, path: Path, names: str = "xyz") -> Floats:
+        """Points, quaternions, or arrays of numbers (N, 3) or (N, 4); NaN where one of them, such as z, is missing."""
+        parts = names if self.has((*path, "x")) else [f"[{place}]" for place in range(len(names))]
+        return np.stack([self.numbers((*path, part)) for part in parts], axis=-1)
+
+
+class Objects(Things):
+    """Decoded messages, with their fields as attributes."""
+
+    def __init__(self, objects: Sequence[Any]) -> None:
+        self.objects = objects
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    @property
+    def single(self) -> Any:
+        (message,) = self.objects
+        return message
+
+    def has(self, path: Path) -> bool:
+        return any(value is not None for value in self.values(path))
+
+    def is_set(self, path: Path) -> Bools:
+        return np.array([_is_set(thing, path) for thing in self.objects], bool)
+
+    def values(self, path: Path) -> list[Any]:
+        return [_value(thing, path) for thing in self.objects]
+
+    def numbers(self, path: Path) -> Floats:
+        return np.array([number(value) for value in self.values(path)], np.float64)
+
+    def stamps(self, path: Path) -> Ints:
+        out = []
+        for thing, value in zip(self.objects, self.values(path), strict=True):
+            if value is None and _value(thing, path[:-1]) is not None:
+                raise AttributeError(name=path[-1])  # a head without a time
+            out.append(0 if value is None else time_of(value))
+        return np.array(out, np.int64)
+
+    def members(self, path: Path) -> tuple[Ints, Things]:
+        if not path:
+            return np.arange(len(self)), self
+        lists = [() if value is None else value for value in self.values(path[:-1])]
+        owner = np.repeat(np.arange(len(lists)), [len(each) for each in lists])
+        return owner, Objects([member for each in lists for member in each])
+
+
+def _value(thing: Any, path: Path) -> Any:
+    """The value at a path; None where JSON leaves it out, and for a member that a list doesn't have."""
+    try:
+        for token in path:
+            thing = thing[int(token[1:-1] or 0)] if token.startswith("[") else getattr(thing, token)
+    except (AttributeError, IndexError, TypeError):
+        return None
+    return thing
+
+
+def _is_set(thing: Any, path: Path) -> bool:
+    owner = _value(thing, path[:-1])
+    return owner.HasField(path[-1]) if hasattr(owner, "HasField") else _value(owner, path[-1:]) is not None
+
+
+class Columns(Things):
+    """The columns of fields by path. ``unset`` is the number of fields that are missing, and not in a list."""
+
+    def __init__(self, columns: Mapping[Path, pa.Array], count: int, unset: float) -> None:
+        self._columns, self._count, self._unset = columns, count, unset
+
+    def __len__(self) -> int:
+        return self._count
+
+    def has(self, path: Path) -> bool:
+        return self._column(path) is not None or any(other[: len(path)] == path for other in self._columns)
+
+    def is_set(self, path: Path) -> Bools:
+        column = next((column for other, column in self._columns.items() if other[: len(path)] == path), None)
+        if column is None:
+            return np.zeros(self._count, bool)
+        return np.asarray(column.is_valid().to_numpy(zero_copy_only=False))
+
+    def values(self, path: Path) -> list[Any]:
+        column = self._column(path)
+        return [None] * self._count if column is None else column.to_pylist()
+
+    def numbers(self, path: Path) -> Floats:
+        import pyarrow as pa
+
+        column = self._column(path)
+        if column is None:
+            return np.full(self._count, nan)
+        if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+            return np.array([number(value) for value in column.to_pylist()], np.float64)
+        if column.null_count and not any(token.startswith("[") for token in path):
+            column = column.fill_null(self._unset)
+        return np.asarray(column.to_numpy(zero_copy_only=False), np.float64)
+
+    def stamps(self, path: Path) -> Ints:
+        import pyarrow as pa
+
+        column = self._column(path)
+        if column is None and not self.has(path):
+            return np.zeros(self._count, np.int64)
+        if column is None or not pa.types.is_timestamp(column.type):
+            raise ValueError(f"{'.'.join(path)} is no time")
+        return np.asarray(column.cast(pa.int64()).fill_null(0).to_numpy())
+
+    def members(self, path: Path) -> tuple[Ints, Things]:
+        import pyarrow.compute as pc
+
+        lists = self._column(path[:-1]) if path else None
+        if lists is None:
+            return np.arange(self._count if not path else 0), self if not path else Columns({}, 0, self._unset)
+        members = pc.list_flatten(lists)
+        return np.asarray(pc.list_parent_indices(lists)), Columns(dict(_leaves(members, ())), len(members), self._unset)
+
+    def _column(self, path: Path) -> pa.Array | None:
+        """The column of a field; None if there is none."""
+        import pyarrow as pa
+
+        begin = next((place for place, token in enumerate(path) if token.startswith("[")), len(path))
+        column = self._columns.get(path[:begin])
+        if begin == len(path) or column is None or not pa.types.is_list(column.type):
+            return column if begin == len(path) else None
+        at = column.offsets.to_numpy().astype(np.int64)
+        place = at[:-1] + int(path[begin][1:-1] or 0)
+        members = column.values.take(pa.array(place, mask=place >= at[1:]))
+        return Columns(dict(_leaves(members, ())), self._count, self._unset)._column(path[begin + 1 :])
+
+
+def _leaves(column: pa.Array, path: Path) -> Iterator[tuple[Path, pa.Array]]:
+    """The fields of structs, and of structs in them, by path; a column of anything else by itself."""
+    import pyarrow as pa
+
+    if not pa.types.is_struct(column.type):
+        yield path, column
+        return
+    for field, inner in zip(column.type, column.flatten(), strict=True):
+        yield from _leaves(inner, (*path, field.name))
+
+
+def read_channel(
+    opened: log.Log,
+    topic: str,
+    read: Callable[[Things], T],
+    unread: UnreadMessages,
+    paths: Collection[Path] = (),
+) -> Iterator[tuple[Ints, list[tuple[Ints, T]]]]:
+    """Read the messages of a channel, as columns if ``paths`` says which fields are needed, or each for itself.
+
+    Parameters
+    ----------
+    opened, topic
+        The channel.
+    read : callable
+        Takes messages to what is wanted of them.
+    unread : UnreadMessages
+        Gets those that can't be read.
+    paths : collection of tuple of str
+        The fields that ``read`` reads.
+
+    Yields
+    ------
+    t_ns : (M,) of int64
+        The log times of the messages of a batch.
+    parts : list of (array, object)
+        What ``read`` gave for some of these messages, and their numbers in the batch.
+
+    Raises
+    ------
+    McaptrackError
+        If messages of this type can't be read, with the topic; and if most of them can't.
+    """
+    reader = None
+    decode = payload_decoder(opened, topic, lambda kind: decoder_with_errors(kind, lambda one: read(Objects([one]))))
+    kind = message_type_of(opened, topic)
+    with suppress(ValueError, McaptrackError):  # then messages are decoded one by one
+        reader = column_reader(kind, _wanted(paths), True) if paths else None
+    unset = 0.0 if kind.encoding == MessageEncoding.Protobuf else nan
+    for batch in opened.payloads(topic):
+        count = len(batch.t_ns)
+        parts: list[tuple[Ints, T]] = []
+        unread.count(count)
+        if reader is not None:
+            with suppress(ValueError):  # one of them can't be read: which one is found out one by one
+                columns = reader.read(batch.data, batch.start, batch.end)
+                parts.append((np.arange(count), read(Columns(columns, count, unset))))
+        spans = zip(batch.t_ns.tolist(), batch.start.tolist(), batch.end.tolist(), strict=True)
+        for place, (t_ns, start, end) in enumerate(() if parts else spans):
+            try:
+                parts.append((np.array([place]), decode(batch.data[start:end].tobytes())))
+            except McaptrackError as error:
+                unread.add(t_ns, str(error))
+        yield batch.t_ns, parts
+
+
+def _wanted(paths: Collection[Path]) -> Callable[[Path], bool]:
+    """A function that says whether a field is at one of the paths, above or below it."""
+    plain = {tuple(token for token in path if not token.startswith("[")) for path in paths}
+    return lambda path: any(path[: len(other)] == other[: len(path)] for other in plain)
