@@ -56,7 +56,7 @@ from mcaptrack.sources.foreign.fields import (
 )
 from mcaptrack.sources.foreign.flatten import UnreadMessages, message_type_of
 from mcaptrack.sources.foreign.known_types import KNOWN, Known
-from mcaptrack.sources.foreign.things import Objects, Path, Things, read_channel
+from mcaptrack.sources.foreign.things import Path, Things, read_channel
 
 T = TypeVar("T")
 
@@ -239,7 +239,7 @@ def _of_drawings(special: Reading, messages: Sequence[Seen3d], words: Sequence[s
 
 def _single(read: Callable[[Things], Any]) -> Callable[[Any], Any]:
     """A function that reads one decoded message."""
-    return lambda message: read(Objects([message]))
+    return lambda message: read(Things([message]))
 
 
 def _shape_of(messages: Sequence[Any]) -> FieldShape:

@@ -593,7 +593,7 @@ NO_BOXES: Final = Boxes(np.empty(0, np.int64), np.empty((0, 4)), np.empty(0), np
 
 
 class Boxes3d(NamedTuple):
-    """Boxes in space: the number of the message of each (N,), and columns of what ``Box3d`` has."""
+    """Boxes in space: the number of the message of each (N,), and what ``Box3d`` has, as columns."""
 
     message: Ints
     stamp_ns: Ints
@@ -606,6 +606,13 @@ class Boxes3d(NamedTuple):
     source_id: Any
     velocity: Floats
     has_heading: Bools
+
+
+#: The types of these columns, and how many numbers each box has of them.
+_COLUMNS: Final = (
+    (np.int64, ()), (object, ()), (float, (3,)), (float, (4,)), (float, (3,)), (object, ()), (float, ()), (object, ()),
+    (float, (3,)), (bool, ()),
+)  # fmt: skip
 
 
 class Seen3d(NamedTuple):
@@ -631,22 +638,9 @@ class Message3d:
 
     def columns(self) -> Seen3d:
         """The same as columns."""
-        heads, frames, centres, turns, sizes, names, scores, ids, velocities, headings = (
-            zip(*self.boxes, strict=True) if self.boxes else ((),) * 10
-        )
-        boxes = Boxes3d(
-            np.zeros(len(self.boxes), np.int64),
-            np.array(heads, np.int64),
-            np.array(frames, object),
-            np.array(centres, np.float64).reshape(-1, 3),
-            np.array(turns, np.float64).reshape(-1, 4),
-            np.array(sizes, np.float64).reshape(-1, 3),
-            np.array(names, object),
-            np.array(scores, np.float64),
-            np.array(ids, object),
-            np.array(velocities, np.float64).reshape(-1, 3),
-            np.array(headings, bool),
-        )
+        values = list(zip(*self.boxes, strict=True)) or [()] * len(_COLUMNS)
+        columns = [np.array(of, kind).reshape(-1, *shape) for of, (kind, shape) in zip(values, _COLUMNS, strict=True)]
+        boxes = Boxes3d(np.zeros(len(self.boxes), np.int64), *columns)
         return Seen3d(np.array([self.stamp_ns], np.int64), np.array([self.is_measured]), boxes, self.ignored)
 
 

@@ -1,15 +1,14 @@
 """What messages hold, by the paths of its fields: of all messages of a batch at once, or of single ones.
 
-``Columns`` are messages that ``mcaptrack.columns`` reads. ``Objects`` are decoded messages, where there are no columns:
-those of JSON and of encodings that aren't read so, those that drawings and readers of packages take, and those of a
-batch in which some can't be read. Both give the same values, so that a reader need not know which they are.
+``Things`` are decoded messages: those of JSON and of encodings that aren't read as columns, those that drawings and
+readers of packages take, and those of a batch in which some can't be read. ``Columns`` are messages that
+``mcaptrack.columns`` reads. Both give the same values, so that a reader need not know which they are.
 
 Letters: M messages, N things (messages, or members of lists in them), K members.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import nan
@@ -33,42 +32,56 @@ Path = tuple[str, ...]
 EACH: Final = "[]"
 
 
-class Things(ABC):
-    """N things, with the values of their fields by path. Fields that are missing may be any; those of protobuf are 0,
-    which it leaves out.
+class Things:
+    """N decoded messages or members of lists, with their fields as attributes, and the values of these by path.
+
+    Fields that are missing have no value; in protobuf, which leaves out zeros, they are 0.
     """
 
-    @abstractmethod
-    def __len__(self) -> int: ...
+    def __init__(self, objects: Sequence[Any]) -> None:
+        self._objects = objects
 
-    @abstractmethod
-    def has(self, path: Path) -> bool:
-        """Whether there is such a field."""
-
-    @abstractmethod
-    def is_set(self, path: Path) -> Bools:
-        """Whether each thing has the field (N,): in protobuf and JSON it may be missing."""
-
-    @abstractmethod
-    def values(self, path: Path) -> list[Any]:
-        """The values of a field (N,); None where it is missing."""
-
-    @abstractmethod
-    def numbers(self, path: Path) -> Floats:
-        """The numbers of a field (N,); NaN where it is missing."""
-
-    @abstractmethod
-    def stamps(self, path: Path) -> Ints:
-        """The times of a field in ns (N,); 0 where it is missing. Raises ValueError if it holds no times."""
-
-    @abstractmethod
-    def members(self, path: Path) -> tuple[Ints, Things]:
-        """The thing of each member of a list (K,), and the members. Its path ends with "[]"; () are the things."""
+    def __len__(self) -> int:
+        return len(self._objects)
 
     @property
     def single(self) -> Any:
-        """The one message that these are, decoded, for those who read messages as objects."""
-        raise TypeError("columns are no objects")
+        """The one message that these are, for those who read messages as objects."""
+        (message,) = self._objects
+        return message
+
+    def has(self, path: Path) -> bool:
+        """Whether there is such a field."""
+        return any(value is not None for value in self.values(path))
+
+    def is_set(self, path: Path) -> Bools:
+        """Whether each thing has the field (N,): in protobuf and JSON it may be missing."""
+        return np.array([_is_set(thing, path) for thing in self._objects], bool)
+
+    def values(self, path: Path) -> list[Any]:
+        """The values of a field (N,); None where it is missing."""
+        return [_value(thing, path) for thing in self._objects]
+
+    def numbers(self, path: Path) -> Floats:
+        """The numbers of a field (N,); NaN where it is missing."""
+        return np.array([number(value) for value in self.values(path)], np.float64)
+
+    def stamps(self, path: Path) -> Ints:
+        """The times of a field in ns (N,); 0 where it is missing. Raises ValueError if it holds no times."""
+        out = []
+        for thing, value in zip(self._objects, self.values(path), strict=True):
+            if value is None and _value(thing, path[:-1]) is not None:
+                raise AttributeError(name=path[-1])  # a head without a time
+            out.append(0 if value is None else time_of(value))
+        return np.array(out, np.int64)
+
+    def members(self, path: Path) -> tuple[Ints, Things]:
+        """The thing of each member of a list (K,), and the members. Its path ends with "[]"; () are the things."""
+        if not path:
+            return np.arange(len(self)), self
+        lists = [() if value is None else value for value in self.values(path[:-1])]
+        owner = np.repeat(np.arange(len(lists)), [len(each) for each in lists])
+        return owner, Things([member for each in lists for member in each])
 
     def texts(self, path: Path) -> Any:
         """The texts of a field (N,); "" where it is missing."""
@@ -78,48 +91,6 @@ class Things(ABC):
         """Points, quaternions, or arrays of numbers (N, 3) or (N, 4); NaN where one of them, such as z, is missing."""
         parts = names if self.has((*path, "x")) else [f"[{place}]" for place in range(len(names))]
         return np.stack([self.numbers((*path, part)) for part in parts], axis=-1)
-
-
-class Objects(Things):
-    """Decoded messages, with their fields as attributes."""
-
-    def __init__(self, objects: Sequence[Any]) -> None:
-        self.objects = objects
-
-    def __len__(self) -> int:
-        return len(self.objects)
-
-    @property
-    def single(self) -> Any:
-        (message,) = self.objects
-        return message
-
-    def has(self, path: Path) -> bool:
-        return any(value is not None for value in self.values(path))
-
-    def is_set(self, path: Path) -> Bools:
-        return np.array([_is_set(thing, path) for thing in self.objects], bool)
-
-    def values(self, path: Path) -> list[Any]:
-        return [_value(thing, path) for thing in self.objects]
-
-    def numbers(self, path: Path) -> Floats:
-        return np.array([number(value) for value in self.values(path)], np.float64)
-
-    def stamps(self, path: Path) -> Ints:
-        out = []
-        for thing, value in zip(self.objects, self.values(path), strict=True):
-            if value is None and _value(thing, path[:-1]) is not None:
-                raise AttributeError(name=path[-1])  # a head without a time
-            out.append(0 if value is None else time_of(value))
-        return np.array(out, np.int64)
-
-    def members(self, path: Path) -> tuple[Ints, Things]:
-        if not path:
-            return np.arange(len(self)), self
-        lists = [() if value is None else value for value in self.values(path[:-1])]
-        owner = np.repeat(np.arange(len(lists)), [len(each) for each in lists])
-        return owner, Objects([member for each in lists for member in each])
 
 
 def _value(thing: Any, path: Path) -> Any:
@@ -138,7 +109,7 @@ def _is_set(thing: Any, path: Path) -> bool:
 
 
 class Columns(Things):
-    """The columns of fields by path. ``unset`` is the number of fields that are missing, and not in a list."""
+    """Things whose fields are columns. ``unset`` is the number of fields that are missing, and not in a list."""
 
     def __init__(self, columns: Mapping[Path, pa.Array], count: int, unset: float) -> None:
         self._columns, self._count, self._unset = columns, count, unset
@@ -184,9 +155,11 @@ class Columns(Things):
     def members(self, path: Path) -> tuple[Ints, Things]:
         import pyarrow.compute as pc
 
-        lists = self._column(path[:-1]) if path else None
+        if not path:
+            return np.arange(self._count), self
+        lists = self._column(path[:-1])
         if lists is None:
-            return np.arange(self._count if not path else 0), self if not path else Columns({}, 0, self._unset)
+            return np.arange(0), Things(())
         members = pc.list_flatten(lists)
         return np.asarray(pc.list_parent_indices(lists)), Columns(dict(_leaves(members, ())), len(members), self._unset)
 
@@ -248,7 +221,7 @@ def read_channel(
         If messages of this type can't be read, with the topic; and if most of them can't.
     """
     reader = None
-    decode = payload_decoder(opened, topic, lambda kind: decoder_with_errors(kind, lambda one: read(Objects([one]))))
+    decode = payload_decoder(opened, topic, lambda kind: decoder_with_errors(kind, lambda one: read(Things([one]))))
     kind = message_type_of(opened, topic)
     with suppress(ValueError, McaptrackError):  # then messages are decoded one by one
         reader = column_reader(kind, _wanted(paths), True) if paths else None
