@@ -16,8 +16,9 @@ from mcaptrack.contracts import Box, Box3d
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources import fixed_frame
 from mcaptrack.sources.foreign import MessageType, reading_of
-from mcaptrack.sources.foreign.boxes import _special, read_messages
+from mcaptrack.sources.foreign.boxes import _special
 from mcaptrack.sources.foreign.fields import Message3d
+from mcaptrack.sources.foreign.things import read_channel
 
 
 def _values(column: Any) -> list[Any]:
@@ -31,7 +32,7 @@ def boxes_in(opened: log.Log, topic: str) -> list[Any]:
     reading = reading_of(opened, topic) or _special(plain_name(opened.channel(topic).schema_name))
     if reading is None:
         return list(fixed_frame.named_detections(opened, topic).frames)  # raises an error that says so
-    log_ns, parts = read_messages(opened, topic, reading, reading.read)
+    log_ns, parts, _ = read_channel(opened, topic, reading.read, reading.paths)
     out: list[Any] = [None] * len(log_ns)
     for which, seen in parts:
         boxes = seen.boxes if reading.in_space else seen

@@ -47,11 +47,10 @@ from mcaptrack.sources.foreign.boxes import (
     facts_of,
     named_boxes,
     read_classes,
-    read_messages,
 )
 from mcaptrack.sources.foreign.decoding import unpacker
 from mcaptrack.sources.foreign.fields import Message3d, Seen3d
-from mcaptrack.sources.foreign.flatten import UnreadMessages, payload_decoder
+from mcaptrack.sources.foreign.flatten import payload_decoder
 from mcaptrack.sources.foreign.things import EACH, Path, Things, read_channel
 
 # All 3D boxes of a channel as arrays, in the frames that they were recorded in.
@@ -521,7 +520,7 @@ def poses_at(
     tree, _, unread = read_frames(opened)
     tree = tree or TransformTree([])
     for text in unread:
-        warn(f"{opened.path}: {text}", "lost")
+        warn(text, "lost")
     poses = tree.lookup(target, source, stamps_ns)
     if len(stamps_ns) and not poses.is_known.any():
         by_log_time = tree.on_log_time.lookup(target, source, log_ns)
@@ -540,26 +539,25 @@ def poses_at(
 
 def _read(opened: log.Log) -> FramesRead:
     edges: dict[tuple[str, str, bool], int] = {}
-    parts: list[tuple[list[int], PoseSamples]] = []
+    of_edge, samples = list[int](), list[PoseSamples]()
     topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
     told: list[str] = []
     for topic in topics:
-        unread = UnreadMessages(topic, opened.channel(topic).messages)
         try:
-            for t_ns, some in read_channel(opened, topic, _transforms, unread, _FIELDS):
-                for which, read in some:
-                    names = zip(read.parent, read.child, strict=True)
-                    edge = [edges.setdefault((*pair, topic.endswith(_LATCHED)), len(edges)) for pair in names]
-                    log_ns = t_ns[which[read.message]]
-                    parts.append((edge, PoseSamples(read.stamp_ns, log_ns, read.translation, read.quaternion)))
-            told += [f"{topic}{unread}"] if str(unread) else []
+            log_ns, parts, unread = read_channel(opened, topic, _transforms, _FIELDS)
         except McaptrackError as error:
-            told.append(str(error).removeprefix(f"{opened.path}: "))
+            told.append(str(error))
+            continue
+        told += [str(unread)] if str(unread) else []
+        for which, read in parts:
+            names = zip(read.parent, read.child, strict=True)
+            of_edge += [edges.setdefault((*pair, topic.endswith(_LATCHED)), len(edges)) for pair in names]
+            times = log_ns[which[read.message]]
+            samples.append(PoseSamples(read.stamp_ns, times, read.translation, read.quaternion))
     if not edges:
         return FramesRead(None, tuple(topics), tuple(told))
-    samples = joined([part for _, part in parts])
-    of_edge = _groups(np.concatenate([edge for edge, _ in parts]), np.arange(len(samples.log_ns)))
-    recorded = [Recorded(*edge, taken(samples, which)) for edge, (_, which) in zip(edges, of_edge, strict=True)]
+    poses, order = joined(samples), _groups(np.array(of_edge), np.arange(len(of_edge)))
+    recorded = [Recorded(*edge, taken(poses, which)) for edge, (_, which) in zip(edges, order, strict=True)]
     return FramesRead(TransformTree(recorded), tuple(topics), tuple(told))
 
 
@@ -630,7 +628,9 @@ def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> f
     def classes(texts: Sequence[str]) -> ClassesRead:
         return classes_of(opened, topic, reading, [text or own for text in texts])
 
-    boxes, unnamed = recorded(*read_messages(opened, topic, reading, reading.read), classes).in_usual_frame()
+    log_ns, parts, unread = read_channel(opened, topic, reading.read, reading.paths)
+    unread.warn("it counts as empty")
+    boxes, unnamed = recorded(log_ns, parts, classes).in_usual_frame()
     for remark, count in boxes.remarks.items():
         warn(f"{opened.path}: {topic}: {count:,} {remark}", "left-out")
     if unnamed:

@@ -16,7 +16,7 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 from math import isfinite
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -54,11 +54,9 @@ from mcaptrack.sources.foreign.fields import (
     shape_of_message,
     shape_of_type,
 )
-from mcaptrack.sources.foreign.flatten import UnreadMessages, message_type_of
+from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.foreign.known_types import KNOWN, Known
 from mcaptrack.sources.foreign.things import Path, Things, read_channel
-
-T = TypeVar("T")
 
 _KIND: Final = "message_reader"
 #: What is read, in messages.
@@ -464,9 +462,10 @@ def named_boxes(opened: log.Log, topic: str, reading: Reading) -> NamedFrames:
     picture are scaled to its size. What is assumed is said.
     """
     where, choice = f"{opened.path}: {topic}", choice_for(opened, topic)
-    log_ns, parts = read_messages(
-        opened, topic, reading, lambda messages: (picture_stamps(messages), reading.read(messages))
+    log_ns, parts, unread = read_channel(
+        opened, topic, lambda messages: (picture_stamps(messages), reading.read(messages)), reading.paths
     )
+    unread.warn("it counts as empty")
     stamp_ns = np.zeros(len(log_ns), np.int64)
     for which, (stamps_ns, _) in parts:
         stamp_ns[which] = stamps_ns
@@ -608,24 +607,3 @@ def _times_of_pictures(
     said = f"boxes are taken at their log times, {late_s:.3g} s after their stamps, which no picture has"
     warn(f"{opened.path}: {topic}: {said}", "clock")
     return log_ns, "", "log times"
-
-
-# Messages of a channel
-
-
-def read_messages(
-    opened: log.Log, topic: str, reading: Reading, read: Callable[[Things], T]
-) -> tuple[Ints, list[tuple[Ints, T]]]:
-    """The log times of the messages of a channel (M,), and what ``read`` gives for some of them, with their numbers.
-
-    Nothing is given for messages that can't be read: a warning says that they count as empty. Raises McaptrackError,
-    with topic and time, if most can't.
-    """
-    unread = UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
-    times, parts, count = [np.empty(0, np.int64)], list[tuple[Ints, T]](), 0
-    for t_ns, some in read_channel(opened, topic, read, unread, reading.paths):
-        parts += [(which + count, part) for which, part in some]
-        times.append(t_ns)
-        count += len(t_ns)
-    unread.warn("it counts as empty")
-    return np.concatenate(times), parts

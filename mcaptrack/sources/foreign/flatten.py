@@ -92,7 +92,7 @@ class UnreadMessages:
         self._first = min(self._first, (t_ns, why)) if self._unread else (t_ns, why)
         self._unread += 1
         if self._unread == self._total or (self._unread > _MOST_UNREAD and 2 * self._unread > self._seen):
-            raise McaptrackError(f"{self._where}{self}")
+            raise McaptrackError(str(self))
 
     def lose(self, messages: int, why: str) -> None:
         """Count messages in a damaged chunk. Raises McaptrackError if all are."""
@@ -104,7 +104,7 @@ class UnreadMessages:
     def warn(self, so: str) -> None:
         """Warn of them, if there are any, and ``so`` of what follows."""
         if self._unread:
-            warn(f"{self._where}{self}; {so}", "lost")
+            warn(f"{self}; {so}", "lost")
         if self._lost:
             where = f"{self._lost} of {self._total} messages are in damaged chunks ({self._damage})"
             warn(f"{self._where}: {where}; {so}", "lost")
@@ -113,7 +113,7 @@ class UnreadMessages:
         if not self._unread:
             return ""
         many = f"; {self._unread} of {self._seen} messages are like this" if self._unread > 1 else ""
-        return f" at {self._first[0]} ns: {self._first[1]}{many}"
+        return f"{self._where} at {self._first[0]} ns: {self._first[1]}{many}"
 
 
 def payload_decoder(

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import nan
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.well_known import MessageEncoding
@@ -188,59 +188,46 @@ def _leaves(column: pa.Array, path: Path) -> Iterator[tuple[Path, pa.Array]]:
         yield from _leaves(inner, (*path, field.name))
 
 
-def read_channel(
-    opened: log.Log,
-    topic: str,
-    read: Callable[[Things], T],
-    unread: UnreadMessages,
-    paths: Collection[Path] = (),
-) -> Iterator[tuple[Ints, list[tuple[Ints, T]]]]:
-    """Read the messages of a channel, as columns if ``paths`` says which fields are needed, or each for itself.
-
-    Parameters
-    ----------
-    opened, topic
-        The channel.
-    read : callable
-        Takes messages to what is wanted of them.
-    unread : UnreadMessages
-        Gets those that can't be read.
-    paths : collection of tuple of str
-        The fields that ``read`` reads.
-
-    Yields
-    ------
-    t_ns : (M,) of int64
-        The log times of the messages of a batch.
-    parts : list of (array, object)
-        What ``read`` gave for some of these messages, and their numbers in the batch.
-
-    Raises
-    ------
-    McaptrackError
-        If messages of this type can't be read, with the topic; and if most of them can't.
+class ChannelRead(NamedTuple, Generic[T]):
+    """The log times of the messages of a channel (M,), what was read of some of them, each with their numbers, and
+    those that can't be read.
     """
-    reader = None
+
+    log_ns: Ints
+    parts: list[tuple[Ints, T]]
+    unread: UnreadMessages
+
+
+def read_channel(
+    opened: log.Log, topic: str, read: Callable[[Things], T], paths: Collection[Path] = ()
+) -> ChannelRead[T]:
+    """Read the messages of a channel: batches of them as columns of the fields at ``paths``, or each for itself.
+
+    Raises McaptrackError, with topic and time, if messages of this type can't be read, or if most of them can't.
+    """
+    reader, unread = None, UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
     decode = payload_decoder(opened, topic, lambda kind: decoder_with_errors(kind, lambda one: read(Things([one]))))
     kind = message_type_of(opened, topic)
     with suppress(ValueError, McaptrackError):  # then messages are decoded one by one
         reader = column_reader(kind, _wanted(paths), True) if paths else None
     unset = 0.0 if kind.encoding == MessageEncoding.Protobuf else nan
+    times, parts, done = [np.empty(0, np.int64)], list[tuple[Ints, T]](), 0
     for batch in opened.payloads(topic):
-        count = len(batch.t_ns)
-        parts: list[tuple[Ints, T]] = []
+        count, seen = len(batch.t_ns), len(parts)
         unread.count(count)
         if reader is not None:
             with suppress(ValueError):  # one of them can't be read: which one is found out one by one
                 columns = reader.read(batch.data, batch.start, batch.end)
-                parts.append((np.arange(count), read(Columns(columns, count, unset))))
+                parts.append((np.arange(done, done + count), read(Columns(columns, count, unset))))
         spans = zip(batch.t_ns.tolist(), batch.start.tolist(), batch.end.tolist(), strict=True)
-        for place, (t_ns, start, end) in enumerate(() if parts else spans):
+        for at, (t_ns, start, end) in enumerate(() if len(parts) > seen else spans, done):
             try:
-                parts.append((np.array([place]), decode(batch.data[start:end].tobytes())))
+                parts.append((np.array([at]), decode(batch.data[start:end].tobytes())))
             except McaptrackError as error:
                 unread.add(t_ns, str(error))
-        yield batch.t_ns, parts
+        times.append(batch.t_ns)
+        done += count
+    return ChannelRead(np.concatenate(times), parts, unread)
 
 
 def _wanted(paths: Collection[Path]) -> Callable[[Path], bool]:
