@@ -49,6 +49,11 @@ def boxes_in(opened: log.Log, topic: str) -> list[Any]:
 
 def boxes_of(kind: MessageType, payload: bytes) -> Any:
     """What a message holds; raises McaptrackError if it can't be read."""
+    return boxes_of_each(kind, [payload])[0]
+
+
+def boxes_of_each(kind: MessageType, payloads: Iterable[bytes]) -> list[Any]:
+    """What each of the messages of a log holds; None for those that can't be read."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "a.mcap")
         with path.open("wb") as file:
@@ -56,10 +61,11 @@ def boxes_of(kind: MessageType, payload: bytes) -> Any:
             writer.start()
             schema = writer.register_schema(kind.name, kind.schema_encoding, kind.schema)
             channel = writer.register_channel("/t", kind.encoding, schema)
-            writer.add_message(channel, 1, payload, 1)
+            for number, payload in enumerate(payloads, 1):
+                writer.add_message(channel, number, payload, number)
             writer.finish()
         with log.read(path) as opened:
-            return boxes_in(opened, "/t")[0]
+            return boxes_in(opened, "/t")
 
 
 def recorded(messages: Iterable[tuple[int, Message3d]]) -> fixed_frame.Recorded3d:

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mcaptrack.columns import Unsupported
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.foreign import MessageType
+from mcaptrack.sources.foreign import things as things_of_messages
 from mcaptrack.sources.foreign.fields import Message3d
-from tests.box_reading import boxes_of, recorded
+from tests.box_reading import boxes_of, boxes_of_each, recorded
 from tests.ros_messages import BAR, Ros, plain
 from tests.space_logs import (
     SEEN,
@@ -263,6 +265,32 @@ SCENE = (
     + BAR + "MSG: foxglove_msgs/KeyValuePair\nstring key\nstring value\n"
     + BAR + "MSG: foxglove_msgs/CubePrimitive\ngeometry_msgs/Pose pose\ngeometry_msgs/Vector3 size\n"
 ).replace("time timestamp", "builtin_interfaces/Time timestamp")  # fmt: skip
+
+
+def unread_as_columns(*_) -> None:
+    raise Unsupported("columns")
+
+
+@pytest.mark.parametrize("is_damaged", [False, True])
+@pytest.mark.parametrize("family", [of for of in FAMILIES if of[0] != "markers" and of[1] != "json"], ids="-".join)
+def test_messages_of_a_batch_are_read_as_each_for_itself(monkeypatch, family, is_damaged):
+    """All at once, as columns, or decoded one by one by rosbags. A damaged message costs itself."""
+    writer, message = FAMILIES[family]()
+    ((name, things),) = ((name, value) for name, value in vars(message).items() if isinstance(value, list))
+    payloads = []
+    for number in range(20):
+        setattr(message, name, things * (number % 3))
+        payloads.append(writer.pack(message))
+    if is_damaged:
+        payloads[13] = payloads[13][: len(payloads[13]) // 2]
+    with monkeypatch.context() as patched:
+        if not is_damaged:
+            patched.setattr(things_of_messages, "decoder_with_errors", lambda *_: None)  # nothing is decoded
+        at_once = boxes_of_each(writer.kind, payloads)
+    monkeypatch.setattr(things_of_messages, "column_reader", unread_as_columns)
+    assert boxes_of_each(writer.kind, payloads) == at_once
+    assert [number for number, seen in enumerate(at_once) if seen is None] == [13] * is_damaged
+    assert [len(seen.boxes) for seen in at_once if seen] == [number % 3 for number in range(20) if at_once[number]]
 
 
 # What each family says beside

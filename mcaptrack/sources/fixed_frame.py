@@ -660,10 +660,10 @@ def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> f
         remark = "times have boxes of several messages, where others have those of one, as if a clock was set back"
         warn(f"{opened.path}: {topic}: {several:,} of {len(start_ns):,} {remark}: they count as one frame", "clock")
     order = np.argsort(frame, kind="stable")
-    parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
+    by_frame = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
     kept = np.flatnonzero(~is_left_out).tolist()
     times = start_ns.tolist()
-    frames = [Frame(times[at], index, parts[at]) for index, at in enumerate(kept)]
+    frames = [Frame(times[at], index, by_frame[at]) for index, at in enumerate(kept)]
     clock = "stamps" if not boxes.times()[1] else "stamps, and log times where they are missing or off"
     facts = facts_of(choice_for(opened, topic), reading, clock=clock, classes=boxes.classes.source, scale="metres")
     return foreign.NamedFrames(frames, boxes.classes.names, fixed, facts)
