@@ -15,14 +15,13 @@ from contextvars import ContextVar
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
-from math import isfinite
 from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.contracts import Box3d, is_in_space
+from mcaptrack.contracts import is_in_space
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints, joined
 from mcaptrack.geometry.boxes import outside
@@ -48,6 +47,7 @@ from mcaptrack.sources.foreign.fields import (
     ThingFields,
     check_boxes,
     head_of,
+    identity,
     mapped,
     parse_map,
     recognised,
@@ -319,28 +319,22 @@ def checked_boxes(entry: Entry, boxes: list[Any]) -> Boxes:
 
 def checked_boxes_3d(entry: Entry, message: Any, boxes: list[Any]) -> Seen3d:
     """The boxes in space that a reader gave, with the header of their message, if it has one."""
-    try:
-        head = head_of(message)
-    except (AttributeError, ValueError):
-        head = (0, "")
+    stamp_ns, frame_id = 0, ""
+    with suppress(AttributeError, ValueError):
+        stamp_ns, frame_id = head_of(message)
     with blamed(entry, "gave what is no Box3d"):
-        return Message3d(head[0], [_checked_box_3d(box, head) for box in boxes]).columns()
-
-
-def _checked_box_3d(box: Any, head: tuple[int, str]) -> Box3d:
-    vectors = [tuple(map(float, values)) for values in (box.centre, box.size, box.velocity, box.orientation)]
-    if [len(values) for values in vectors] != [3, 3, 3, 4]:
-        raise ValueError("a centre, size and velocity are three numbers, and an orientation is four")
-    centre, size, velocity, orientation = vectors
-    if not all(map(isfinite, (*centre, *orientation))) or any(side < 0 for side in size):
-        raise ValueError(f"a box can't be at {centre}, turned by {orientation}, with the size {size}")
-    if box.source_id is not None and not isinstance(box.source_id, str):
-        integer(box.source_id)
-    stamp, frame = (integer(box.stamp_ns), text(box.frame_id))
-    return box._replace(  # type: ignore[no-any-return]
-        stamp_ns=stamp or head[0], frame_id=frame or head[1], centre=centre, size=size, velocity=velocity,
-        orientation=orientation, class_name=text(box.class_name), score=float(box.score),
-    )  # fmt: skip
+        stated = [
+            box._replace(
+                stamp_ns=integer(box.stamp_ns) or stamp_ns, frame_id=text(box.frame_id) or frame_id,
+                class_name=text(box.class_name), source_id=identity(box.source_id),
+            )
+            for box in boxes
+        ]  # fmt: skip
+        seen = Message3d(stamp_ns, stated).columns()
+        centre, turn, size = seen.boxes.centre, seen.boxes.orientation, seen.boxes.size
+        if not (np.isfinite(centre).all() and np.isfinite(turn).all()) or (size < 0).any():
+            raise ValueError("a box can't have such numbers: places and turns are finite, and no size is negative")
+    return seen
 
 
 # Which channels have boxes

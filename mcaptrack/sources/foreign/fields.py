@@ -28,7 +28,7 @@ from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.sources.foreign.decoding import integer, number, protobuf_unpacker, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.definitions import MessageType, ros_types
-from mcaptrack.sources.foreign.things import EACH, Path, Things
+from mcaptrack.sources.foreign.things import EACH, HEADS, Path, Things, heads
 
 #: A quaternion of zeros: the orientation isn't stated.
 UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
@@ -639,7 +639,8 @@ class Message3d:
     def columns(self) -> Seen3d:
         """The same as columns."""
         values = list(zip(*self.boxes, strict=True)) or [()] * len(_COLUMNS)
-        columns = [np.array(of, kind).reshape(-1, *shape) for of, (kind, shape) in zip(values, _COLUMNS, strict=True)]
+        kinds = zip(values, _COLUMNS, strict=True)
+        columns = [np.array(of, kind).reshape(len(self.boxes), *shape) for of, (kind, shape) in kinds]
         boxes = Boxes3d(np.zeros(len(self.boxes), np.int64), *columns)
         return Seen3d(np.array([self.stamp_ns], np.int64), np.array([self.is_measured]), boxes, self.ignored)
 
@@ -657,7 +658,7 @@ class FieldReader:
     def __init__(self, fields: ThingFields, adjust: Adjust | None = None, also: str = "") -> None:
         self.fields, self.in_space, self._adjust = fields, fields.in_space, adjust
         each = [("header",), *map(_tokens, also.split()), *(path for paths in fields.paths.values() for path in paths)]
-        self.paths: list[Path] = [("header",), ("timestamp",), ("frame_id",), ("image_header",)]
+        self.paths: list[Path] = [*HEADS, ("image_header",)]
         self.paths += [(*fields.things, *path) for path in each]
 
     def read(self, messages: Things) -> Boxes | Seen3d:
@@ -721,7 +722,7 @@ class FieldReader:
             size,
             names,
             score,
-            np.array(list(map(_identity, ids)), object),
+            np.array(list(map(identity, ids)), object),
             velocity,
             is_turned | ("orientation" in self.fields.paths),
         )
@@ -798,7 +799,7 @@ def plain_class(name: str) -> str:
     return "" if name.lower() == "unknown" else name.lower()
 
 
-def _identity(value: Any) -> int | str | None:
+def identity(value: Any) -> int | str | None:
     """An id: a number, a text, or the hexadecimal digits of a UUID; None if there is none."""
     if value is None or isinstance(value, str):
         return value or None
@@ -809,10 +810,8 @@ def _identity(value: Any) -> int | str | None:
 
 def message_heads(messages: Things, owner: Ints, things: Things) -> tuple[Ints, Any]:
     """Stamps in ns and frames of messages (M,): of their headers, their own, or those of their first things."""
-    if messages.has(("header",)):
-        return messages.stamps(("header", "stamp")), messages.texts(("header", "frame_id"))
-    if messages.has(("timestamp",)):
-        return messages.stamps(("timestamp",)), messages.texts(("frame_id",))
+    if messages.has(("header",)) or messages.has(("timestamp",)):
+        return heads(messages)
     stamp_ns, frame_id = np.zeros(len(messages), np.int64), np.full(len(messages), "", object)
     if things.has(("header",)):
         with_things, first = np.unique(owner, return_index=True)

@@ -20,7 +20,9 @@ from mcap.well_known import MessageEncoding
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, number, text, time_of
+from mcaptrack.log.messages import Payloads
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, number, text, time_of, unpacker
+from mcaptrack.sources.foreign.definitions import MessageType
 from mcaptrack.sources.foreign.flatten import UnreadMessages, column_reader, message_type_of, payload_decoder
 
 if TYPE_CHECKING:
@@ -201,33 +203,59 @@ class ChannelRead(NamedTuple, Generic[T]):
 def read_channel(
     opened: log.Log, topic: str, read: Callable[[Things], T], paths: Collection[Path] = ()
 ) -> ChannelRead[T]:
-    """Read the messages of a channel: batches of them as columns of the fields at ``paths``, or each for itself.
+    """Read the messages of a channel: those of a batch together, if ``paths`` says which fields are read, as columns
+    where they can be. Others, and those of a batch in which some can't be read, are read each for itself.
 
     Raises McaptrackError, with topic and time, if messages of this type can't be read, or if most of them can't.
     """
-    reader, unread = None, UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
+    unread = UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
     decode = payload_decoder(opened, topic, lambda kind: decoder_with_errors(kind, lambda one: read(Things([one]))))
-    kind = message_type_of(opened, topic)
-    with suppress(ValueError, McaptrackError):  # then messages are decoded one by one
-        reader = column_reader(kind, _wanted(paths), True) if paths else None
-    unset = 0.0 if kind.encoding == MessageEncoding.Protobuf else nan
+    together = _reader_of_batches(message_type_of(opened, topic), paths)
     times, parts, done = [np.empty(0, np.int64)], list[tuple[Ints, T]](), 0
     for batch in opened.payloads(topic):
         count, seen = len(batch.t_ns), len(parts)
         unread.count(count)
-        if reader is not None:
-            with suppress(ValueError):  # one of them can't be read: which one is found out one by one
-                columns = reader.read(batch.data, batch.start, batch.end)
-                parts.append((np.arange(done, done + count), read(Columns(columns, count, unset))))
-        spans = zip(batch.t_ns.tolist(), batch.start.tolist(), batch.end.tolist(), strict=True)
-        for at, (t_ns, start, end) in enumerate(() if len(parts) > seen else spans, done):
+        if paths:
+            with suppress(Exception):  # of bytes that are no such message: which one is found out one by one
+                parts.append((np.arange(done, done + count), read(together(batch))))
+        for at, (t_ns, payload) in enumerate(() if len(parts) > seen else _single_payloads(batch), done):
             try:
-                parts.append((np.array([at]), decode(batch.data[start:end].tobytes())))
+                parts.append((np.array([at]), decode(payload)))
             except McaptrackError as error:
                 unread.add(t_ns, str(error))
         times.append(batch.t_ns)
         done += count
     return ChannelRead(np.concatenate(times), parts, unread)
+
+
+def _reader_of_batches(kind: MessageType, paths: Collection[Path]) -> Callable[[Payloads], Things]:
+    """A function that reads the messages of a batch together."""
+    try:
+        reader = column_reader(kind, _wanted(paths), True)
+    except (ValueError, McaptrackError):  # messages without types, and those that aren't read as columns
+        unpack = unpacker(kind)
+        return lambda batch: Things([unpack(payload) for _, payload in _single_payloads(batch)])
+    unset = 0.0 if kind.encoding == MessageEncoding.Protobuf else nan
+    return lambda batch: Columns(reader.read(batch.data, batch.start, batch.end), len(batch.t_ns), unset)
+
+
+def _single_payloads(batch: Payloads) -> Iterator[tuple[int, bytes]]:
+    """Time and bytes of each message of a batch."""
+    for t_ns, start, end in zip(batch.t_ns.tolist(), batch.start.tolist(), batch.end.tolist(), strict=True):
+        yield t_ns, batch.data[start:end].tobytes()
+
+
+#: The fields that say when and where a message was measured.
+HEADS: Final = (("header",), ("timestamp",), ("frame_id",))
+
+
+def heads(messages: Things) -> tuple[Ints, Any]:
+    """Stamps in ns and frames of messages (M,): of their headers, or their own. Raises ValueError if they have none."""
+    if messages.has(("header",)):
+        return messages.stamps(("header", "stamp")), messages.texts(("header", "frame_id"))
+    if messages.has(("timestamp",)):
+        return messages.stamps(("timestamp",)), messages.texts(("frame_id",))
+    raise ValueError("it has no stamp")
 
 
 def _wanted(paths: Collection[Path]) -> Callable[[Path], bool]:
