@@ -9,9 +9,10 @@ Letters: M messages, N things (messages, or members of lists in them), K members
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import nan
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -32,6 +33,9 @@ T = TypeVar("T")
 Path = tuple[str, ...]
 #: The token of a list in a path, all members of which count; others, such as "[0]", stand for one member.
 EACH: Final = "[]"
+#: So many messages are read together, as columns and as objects: one that can't be read costs little, and few objects
+#: are kept, which Python would look through again and again.
+_COLUMNS, _OBJECTS = 1024, 32
 
 
 class Things:
@@ -62,6 +66,9 @@ class Things:
 
     def values(self, path: Path) -> list[Any]:
         """The values of a field (N,); None where it is missing."""
+        if path and not any(token.startswith("[") for token in path):
+            with suppress(AttributeError):  # all have it
+                return list(map(attrgetter(".".join(path)), self._objects))
         return [_value(thing, path) for thing in self._objects]
 
     def numbers(self, path: Path) -> Floats:
@@ -210,9 +217,9 @@ def read_channel(
     """
     unread = UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
     decode = payload_decoder(opened, topic, lambda kind: decoder_with_errors(kind, lambda one: read(Things([one]))))
-    together = _reader_of_batches(message_type_of(opened, topic), paths)
+    together, size = _reader_of_batches(message_type_of(opened, topic), paths)
     times, parts, done = [np.empty(0, np.int64)], list[tuple[Ints, T]](), 0
-    for batch in opened.payloads(topic):
+    for batch in _pieces(opened.payloads(topic), size):
         count, seen = len(batch.t_ns), len(parts)
         unread.count(count)
         if paths:
@@ -228,15 +235,24 @@ def read_channel(
     return ChannelRead(np.concatenate(times), parts, unread)
 
 
-def _reader_of_batches(kind: MessageType, paths: Collection[Path]) -> Callable[[Payloads], Things]:
-    """A function that reads the messages of a batch together."""
+def _reader_of_batches(kind: MessageType, paths: Collection[Path]) -> tuple[Callable[[Payloads], Things], int]:
+    """A function that reads messages together, and how many."""
     try:
         reader = column_reader(kind, _wanted(paths), True)
     except (ValueError, McaptrackError):  # messages without types, and those that aren't read as columns
         unpack = unpacker(kind)
-        return lambda batch: Things([unpack(payload) for _, payload in _single_payloads(batch)])
+        return lambda batch: Things([unpack(payload) for _, payload in _single_payloads(batch)]), _OBJECTS
     unset = 0.0 if kind.encoding == MessageEncoding.Protobuf else nan
-    return lambda batch: Columns(reader.read(batch.data, batch.start, batch.end), len(batch.t_ns), unset)
+    return lambda batch: Columns(reader.read(batch.data, batch.start, batch.end), len(batch.t_ns), unset), _COLUMNS
+
+
+def _pieces(batches: Iterable[Payloads], size: int) -> Iterator[Payloads]:
+    """Batches of at most so many messages."""
+    for batch in batches:
+        for low in range(0, len(batch.t_ns), size):
+            part = slice(low, low + size)
+            t_ns, data, *places = batch
+            yield Payloads(t_ns[part], data, *(column[part] for column in places))
 
 
 def _single_payloads(batch: Payloads) -> Iterator[tuple[int, bytes]]:
