@@ -237,9 +237,11 @@ def read_channel(
 
 def _reader_of_batches(kind: MessageType, paths: Collection[Path]) -> tuple[Callable[[Payloads], Things], int]:
     """A function that reads messages together, and how many."""
-    try:
-        reader = column_reader(kind, _wanted(paths), True)
-    except (ValueError, McaptrackError):  # messages without types, and those that aren't read as columns
+    reader = None
+    if paths and kind.encoding != MessageEncoding.JSON:  # which has no types, and needs no Arrow
+        with suppress(ValueError, McaptrackError):
+            reader = column_reader(kind, _wanted(paths), True)
+    if reader is None:
         unpack = unpacker(kind)
         return lambda batch: Things([unpack(payload) for _, payload in _single_payloads(batch)]), _OBJECTS
     unset = 0.0 if kind.encoding == MessageEncoding.Protobuf else nan
