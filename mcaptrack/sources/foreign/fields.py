@@ -26,7 +26,7 @@ from mcap.well_known import MessageEncoding
 from mcaptrack.contracts import Box3d, Quaternion, Vector
 from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.sources.foreign.decoding import integer, number, protobuf_unpacker, stamp_of, text, to_bytes
+from mcaptrack.sources.foreign.decoding import integer, number, protobuf_class, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.definitions import MessageType, ros_types
 from mcaptrack.sources.foreign.things import EACH, HEADS, Path, Things, heads
 
@@ -72,8 +72,7 @@ def shape_of_type(kind: MessageType) -> FieldShape | None:
     """The fields of a type by its definition in the log; None for JSON. Raises McaptrackError as ``unpacker`` does."""
     fields = count(1)  # a definition that is made to be endless is cut
     if kind.encoding == MessageEncoding.Protobuf:
-        from_string: Any = protobuf_unpacker(kind)
-        return _of_descriptor(from_string.__self__.DESCRIPTOR, 0, fields)
+        return _of_descriptor(protobuf_class(kind).DESCRIPTOR, 0, fields)
     if kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR):
         store, name = ros_types(kind)
         return _of_ros(store, name, 0, fields)

@@ -22,7 +22,6 @@ from mcaptrack.sources.foreign.decoding import (
     decoder_with_errors,
     frame_named,
     protobuf_class,
-    protobuf_unpacker,
     unpacker,
 )
 from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defined, ros_types
@@ -184,7 +183,7 @@ def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
     if kind.encoding == MessageEncoding.JSON:
         return json.loads
     if kind.encoding == MessageEncoding.Protobuf:
-        return protobuf_unpacker(kind)
+        return protobuf_class(kind).FromString  # type: ignore[no-any-return]
     return unpacker(kind)
 
 
