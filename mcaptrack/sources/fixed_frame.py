@@ -541,24 +541,24 @@ def _read(opened: log.Log) -> FramesRead:
     edges: dict[tuple[str, str, bool], int] = {}
     of_edge, samples = list[int](), list[PoseSamples]()
     topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
-    told: list[str] = []
+    problems: list[str] = []
     for topic in topics:
         try:
             log_ns, parts, unread = read_channel(opened, topic, _transforms, _FIELDS)
         except McaptrackError as error:
-            told.append(str(error))
+            problems.append(str(error))
             continue
-        told += [str(unread)] if str(unread) else []
+        problems += [str(unread)] if str(unread) else []
         for which, read in parts:
             names = zip(read.parent, read.child, strict=True)
             of_edge += [edges.setdefault((*pair, topic.endswith(_LATCHED)), len(edges)) for pair in names]
             times = log_ns[which[read.message]]
             samples.append(PoseSamples(read.stamp_ns, times, read.translation, read.quaternion))
     if not edges:
-        return FramesRead(None, tuple(topics), tuple(told))
+        return FramesRead(None, tuple(topics), tuple(problems))
     poses, order = joined(samples), _groups(np.array(of_edge), np.arange(len(of_edge)))
     recorded = [Recorded(*edge, taken(poses, which)) for edge, (_, which) in zip(edges, order, strict=True)]
-    return FramesRead(TransformTree(recorded), tuple(topics), tuple(told))
+    return FramesRead(TransformTree(recorded), tuple(topics), tuple(problems))
 
 
 #: The fields of transforms of all schemas.

@@ -39,7 +39,7 @@ from mcaptrack.sources.foreign.fields import (
     NO_THINGS,
     PEOPLE,
     THINGS,
-    Boxes,
+    Boxes2d,
     FieldReader,
     FieldShape,
     Message3d,
@@ -151,7 +151,7 @@ class Reading(NamedTuple):
     in_space : bool
         Whether boxes are in metres.
     read : callable
-        From messages to ``Boxes``, or of boxes in space to ``Seen3d``.
+        From messages to ``Boxes2d``, or of boxes in space to ``Seen3d``.
     fields : ThingFields or None
         What its fields are; None for drawings, and readers of packages.
     paths : sequence of tuple of str
@@ -299,7 +299,7 @@ def _of_package(entry: Entry) -> Reading:
     reader, guard = entry.made("read"), Guard(str(entry))
     in_space = is_in_space(entry, reader)
 
-    def read(messages: Things) -> Boxes | Seen3d:
+    def read(messages: Things) -> Boxes2d | Seen3d:
         with blamed(entry, "failed", guard):
             boxes = list(reader.read(messages.single))
         return checked_boxes_3d(entry, messages.single, boxes) if in_space else checked_boxes(entry, boxes)
@@ -307,14 +307,14 @@ def _of_package(entry: Entry) -> Reading:
     return Reading(in_space, read)
 
 
-def checked_boxes(entry: Entry, boxes: list[Any]) -> Boxes:
+def checked_boxes(entry: Entry, boxes: list[Any]) -> Boxes2d:
     """The boxes in a picture that a reader gave for a message. Raises McaptrackError for what is none."""
     with blamed(entry, "gave what is no Box"):
         rows = [(float(x), float(y), float(w), float(h), number(score)) for x, y, w, h, score, _ in boxes]
         columns = np.array(rows, np.float64).reshape(-1, 5)
         check_boxes(columns[:, :4])
         names = np.array([text(name) for *_, name in boxes], object)
-    return Boxes(np.zeros(len(boxes), np.int64), columns[:, :4], columns[:, 4], names)
+    return Boxes2d(np.zeros(len(boxes), np.int64), columns[:, :4], columns[:, 4], names)
 
 
 def checked_boxes_3d(entry: Entry, message: Any, boxes: list[Any]) -> Seen3d:

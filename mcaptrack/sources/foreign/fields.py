@@ -577,7 +577,7 @@ def _begin(shape: FieldShape, path: Path, lists: Sequence[Path]) -> tuple[Path, 
 # Messages to boxes
 
 
-class Boxes(NamedTuple):
+class Boxes2d(NamedTuple):
     """Boxes in pictures: the number of the message of each (N,), ``sides`` (N, 4) as left, top, width and height in px,
     ``score`` (N,), NaN where there is none, and ``class_name`` (N,).
     """
@@ -588,7 +588,7 @@ class Boxes(NamedTuple):
     class_name: Any
 
 
-NO_BOXES: Final = Boxes(np.empty(0, np.int64), np.empty((0, 4)), np.empty(0), np.empty(0, object))
+NO_BOXES: Final = Boxes2d(np.empty(0, np.int64), np.empty((0, 4)), np.empty(0), np.empty(0, object))
 
 
 class Boxes3d(NamedTuple):
@@ -615,7 +615,7 @@ _COLUMNS: Final = (
 
 
 class Seen3d(NamedTuple):
-    """What M messages hold: their stamps, 0 where there is none, boxes, and how many other parts, by what they are.
+    """The contents of M messages: their stamps, 0 where there is none, boxes, and counts of other parts by kind.
 
     ``is_measured`` (M,) is false for messages that only take boxes away from a viewer: nothing was measured then.
     """
@@ -660,11 +660,11 @@ class FieldReader:
         self.paths: list[Path] = [*HEADS, ("image_header",)]
         self.paths += [(*fields.things, *path) for path in each]
 
-    def read(self, messages: Things) -> Boxes | Seen3d:
+    def read(self, messages: Things) -> Boxes2d | Seen3d:
         """The boxes of messages."""
         return self.in_frame(messages) if self.in_space else self.in_picture(messages)
 
-    def in_picture(self, messages: Things) -> Boxes:
+    def in_picture(self, messages: Things) -> Boxes2d:
         """The boxes of messages in pictures, upright around what they state. Raises ValueError for impossible ones."""
         owner, things = messages.members(self.fields.things)
         names, score = self._classes(things)
@@ -689,7 +689,7 @@ class FieldReader:
                 w, h = right - left, bottom - top
             sides = np.stack([left, top, w, h], axis=1)
         check_boxes(sides)
-        return Boxes(owner, sides, score, names)
+        return Boxes2d(owner, sides, score, names)
 
     def in_frame(self, messages: Things) -> Seen3d:
         """The boxes of messages in space."""

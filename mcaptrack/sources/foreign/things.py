@@ -1,4 +1,4 @@
-"""What messages hold, by the paths of its fields: of all messages of a batch at once, or of single ones.
+"""The fields of messages by their paths, of a batch of messages at once, or of each message for itself.
 
 ``Things`` are decoded messages: those of JSON and of encodings that aren't read as columns, those that drawings and
 readers of packages take, and those of a batch in which some can't be read. ``Columns`` are messages that
