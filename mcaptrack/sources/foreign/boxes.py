@@ -333,7 +333,7 @@ def checked_boxes_3d(entry: Entry, message: Any, boxes: list[Any]) -> Seen3d:
         seen = Message3d(stamp_ns, stated).columns()
         centre, turn, size = seen.boxes.centre, seen.boxes.orientation, seen.boxes.size
         if not (np.isfinite(centre).all() and np.isfinite(turn).all()) or (size < 0).any():
-            raise ValueError("a box can't have such numbers: places and turns are finite, and no size is negative")
+            raise ValueError("a box can't be so: places and turns are finite, and no size is negative")
     return seen
 
 
