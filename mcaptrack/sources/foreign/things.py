@@ -118,7 +118,7 @@ def _is_set(thing: Any, path: Path) -> bool:
 
 
 class Columns(Things):
-    """Things whose fields are columns. ``unset`` is the number of fields that are missing, and not in a list."""
+    """Things with columns as fields. ``unset`` is the number of fields that are missing, and not in a list."""
 
     def __init__(self, columns: Mapping[Path, pa.Array], count: int, unset: float) -> None:
         self._columns, self._count, self._unset = columns, count, unset
