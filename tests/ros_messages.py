@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.foreign import MessageType
 
 STAMP_NS = 1_700_000_000_123_456_789
 
@@ -124,10 +124,6 @@ def vision(layout: str, boxes) -> tuple[MessageType, bytes]:
         last = ros.new("sensor_msgs/Image", ros.header(), 0, 0, "", 0, 0, pixels(b"")) if ros.ros1 else "name"
         found.append(ros.new("vision_msgs/Detection2D", ros.header(), results, bbox, last))
     return ros.kind, ros.pack(ros.new("vision_msgs/Detection2DArray", ros.header(), found))
-
-
-def boxes(kind: MessageType):
-    return boxes_decoder(kind)
 
 
 def plain(message) -> object:

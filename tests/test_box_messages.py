@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mcaptrack.columns import Unsupported
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.fixed_frame import recorded
-from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.foreign import MessageType
+from mcaptrack.sources.foreign import things as things_of_messages
 from mcaptrack.sources.foreign.fields import Message3d
+from tests.box_reading import boxes_of, boxes_of_each, recorded
 from tests.ros_messages import BAR, Ros, plain
 from tests.space_logs import (
     SEEN,
@@ -74,9 +76,9 @@ def autoware(package: str, kind: str, labels: tuple[str, ...] = LABELS) -> str:
 def read(writer: Ros, message, encoding: str) -> Message3d:
     """The boxes of a message; a writer of ROS 1 or ROS 2 made it."""
     if encoding != "json":
-        return boxes_decoder(writer.kind, in_space=True)(writer.pack(message))
+        return boxes_of(writer.kind, writer.pack(message))
     kind = MessageType(writer.kind.name, "jsonschema", b"{}", "json")
-    return boxes_decoder(kind, in_space=True)(json.dumps(plain(message)).encode())
+    return boxes_of(kind, json.dumps(plain(message)).encode())
 
 
 def twist(writer: Ros, velocity):
@@ -227,7 +229,7 @@ def test_detections_that_state_their_pose_in_a_result_alone():
     head = {"stamp": {"sec": 1, "nanosec": 0}, "frame_id": "lidar"}
     boxes = [one((0, 0, 0), (7, 8, 9)), one((1, 0, 0), (7, 8, 9)), one((0, 0, 0), (0, 0, 0))]
     kind = MessageType("vision_msgs/msg/Detection3DArray", "jsonschema", b"{}", "json")
-    found = boxes_decoder(kind, in_space=True)(json.dumps({"header": head, "detections": boxes}).encode())
+    found = boxes_of(kind, json.dumps({"header": head, "detections": boxes}).encode())
     assert [box.centre for box in found.boxes] == [(7, 8, 9), (1, 0, 0), (0, 0, 0)]
     assert [box.orientation for box in found.boxes] == [(0, 0, 0, 1), (0, 0, 0, 0), (0, 0, 0, 0)]
 
@@ -235,13 +237,13 @@ def test_detections_that_state_their_pose_in_a_result_alone():
 def test_a_field_that_is_missing_is_named():
     kind = MessageType("jsk_recognition_msgs/BoundingBoxArray", "jsonschema", b"{}", "json")
     with pytest.raises(McaptrackError, match=r"message \(it has no field 'stamp'\)$"):
-        boxes_decoder(kind, in_space=True)(b'{"header": {"frame_id": "a"}, "boxes": []}')
+        boxes_of(kind, b'{"header": {"frame_id": "a"}, "boxes": [{"pose": {"position": {"x": 1, "y": 2}}}]}')
 
 
 def test_scenes_of_foxglove_are_the_same_in_all_encodings():
     protobuf = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
-    wanted = boxes_decoder(protobuf, in_space=True)(scene_update(START_NS, [SEEN]).SerializeToString())
-    found = boxes_decoder(protobuf._replace(encoding="json"), in_space=True)(scene_update_json(START_NS, [SEEN]))
+    wanted = boxes_of(protobuf, scene_update(START_NS, [SEEN]).SerializeToString())
+    found = boxes_of(protobuf._replace(encoding="json"), scene_update_json(START_NS, [SEEN]))
     assert found.boxes == wanted.boxes
     assert wanted.boxes[0].source_id == "12"
     for ros1 in (False, True):
@@ -263,6 +265,32 @@ SCENE = (
     + BAR + "MSG: foxglove_msgs/KeyValuePair\nstring key\nstring value\n"
     + BAR + "MSG: foxglove_msgs/CubePrimitive\ngeometry_msgs/Pose pose\ngeometry_msgs/Vector3 size\n"
 ).replace("time timestamp", "builtin_interfaces/Time timestamp")  # fmt: skip
+
+
+def unread_as_columns(*_) -> None:
+    raise Unsupported("columns")
+
+
+@pytest.mark.parametrize("is_damaged", [False, True])
+@pytest.mark.parametrize("family", [of for of in FAMILIES if of[0] != "markers" and of[1] != "json"], ids="-".join)
+def test_messages_of_a_batch_are_read_as_each_for_itself(monkeypatch, family, is_damaged):
+    """All at once, as columns, or decoded one by one by rosbags. A damaged message costs itself."""
+    writer, message = FAMILIES[family]()
+    ((name, things),) = ((name, value) for name, value in vars(message).items() if isinstance(value, list))
+    payloads = []
+    for number in range(20):
+        setattr(message, name, things * (number % 3))
+        payloads.append(writer.pack(message))
+    if is_damaged:
+        payloads[13] = payloads[13][: len(payloads[13]) // 2]
+    with monkeypatch.context() as patched:
+        if not is_damaged:
+            patched.setattr(things_of_messages, "decoder_with_errors", lambda *_: None)  # nothing is decoded
+        at_once = boxes_of_each(writer.kind, payloads)
+    monkeypatch.setattr(things_of_messages, "column_reader", unread_as_columns)
+    assert boxes_of_each(writer.kind, payloads) == at_once
+    assert [number for number, seen in enumerate(at_once) if seen is None] == [13] * is_damaged
+    assert [len(seen.boxes) for seen in at_once if seen] == [number % 3 for number in range(20) if at_once[number]]
 
 
 # What each family says beside
@@ -385,6 +413,6 @@ def test_definitions_in_idl_have_their_constants_in_a_module_beside():
     text = BAR + IDL.format(package=package, bar=BAR, labels=labels)
     kind = made.writer.kind._replace(schema_encoding="ros2idl", schema=text.encode())
     objects = [made.one(labels=((number, 1.0),)) for number in (1, 3, 6)]
-    found = boxes_decoder(kind, in_space=True)(made.writer.pack(made.message(*objects)))
+    found = boxes_of(kind, made.writer.pack(made.message(*objects)))
     assert [box.class_name for box in found.boxes] == ["car", "trailer", "pedestrian"]
     assert found.boxes[0].velocity == pytest.approx((0, 3, 0))

@@ -20,9 +20,10 @@ from mcaptrack.geometry.transform_tree import Poses, PoseSamples, Recorded, Tran
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources import camera_motion, foreign
-from mcaptrack.sources.fixed_frame import named_detections, recorded, rows_of_boxes
-from mcaptrack.sources.foreign import MessageType, boxes_decoder
+from mcaptrack.sources.fixed_frame import named_detections, rows_of_boxes
+from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.fields import Message3d
+from tests.box_reading import boxes_of, recorded
 from tests.ros_messages import Ros
 from tests.space_logs import (
     NAMES,
@@ -91,9 +92,7 @@ def test_any_pose_of_sensor_and_box_gives_the_numbers_of_scipy(angles, shifts, l
     upright = Rotation.from_euler("zyx", [angles[6], angles[7] / 60, angles[8] / 60]) * on_side
     back, at = (robot * sensor).inv(), np.array([START_NS])
     box = Seen(back.apply(centre - base - robot.apply(mount)), (back * upright).as_quat(), np.array([4.0, 2.0, 1.5]))
-    found = recorded(
-        [(START_NS, boxes_decoder(_KIND, in_space=True)(scene_update(START_NS, [box]).SerializeToString()))]
-    )
+    found = recorded([(START_NS, boxes_of(_KIND, scene_update(START_NS, [box]).SerializeToString()))])
     ways = (("map", "base", robot, base), ("base", "lidar", sensor, mount))
     links = [
         Recorded(parent, child, True, PoseSamples(at, at, shift[None], turn.as_quat()[None]))
@@ -134,7 +133,7 @@ def test_tracks_in_another_frame_are_as_boxes_brought_there(monkeypatch):
         Box3d(START_NS, "city", (row["x_m"], row["y_m"], row["z_m"]), turn, (1.0, 1.0, 1.0), velocity=velocity)
         for row, turn, velocity in zip(rows[:2], turns, [(1.0, 0.0, 0.0), (0.0, -2.0, 0.0)], strict=True)
     ]
-    found = recorded([(START_NS, Message3d(START_NS, "city", boxes))])
+    found = recorded([(START_NS, Message3d(START_NS, boxes))])
     wanted = rows_of_boxes(found, np.tile(half, (2, 1, 1)), np.tile(shift, (2, 1)))
     for name in ("x_m", "y_m", "z_m", "heading_rad", "vx_m_per_s", "vy_m_per_s"):
         np.testing.assert_allclose(moved.rows[name][:2], wanted[name], atol=1e-12, err_msg=name)
@@ -149,8 +148,8 @@ _KIND = MessageType("foxglove.SceneUpdate", "protobuf", b"", "protobuf")
 # Other messages
 
 
-def boxes_of(writer: Ros, message) -> Message3d:
-    return boxes_decoder(writer.kind, in_space=True)(writer.pack(message))
+def boxes_by(writer: Ros, message) -> Message3d:
+    return boxes_of(writer.kind, writer.pack(message))
 
 
 def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
@@ -165,7 +164,7 @@ def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
         marker(writer, START_NS, SEEN, space="5"),
         marker(writer, START_NS, SEEN, space="type_2"),
     ]
-    found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", markers))
+    found = boxes_by(writer, writer.new("visualization_msgs/MarkerArray", markers))
     np.testing.assert_allclose(
         [box.centre for box in found.boxes], [[1, 3, 3], [-1, 2, 3], *[[1, 2, 3]] * 5], atol=1e-12
     )
@@ -175,7 +174,7 @@ def test_markers_that_are_no_cubes_are_counted_and_lists_of_cubes_are_boxes():
     assert found.boxes[2].stamp_ns == START_NS + 4
     assert found.ignored == {"markers that are no solids": 1}
     one = ros("visualization_msgs/Marker")
-    assert boxes_of(one, marker(one, START_NS, SEEN)).boxes[0].source_id == 12
+    assert boxes_by(one, marker(one, START_NS, SEEN)).boxes[0].source_id == 12
 
 
 def test_texts_beside_cubes_say_what_these_do_not():
@@ -191,7 +190,7 @@ def test_texts_beside_cubes_say_what_these_do_not():
         named(3, 1, "boxes", " "), named(3, 9, "labels", "car"), named(3, 9, "speeds", "bus"),  # which of them?
         named(4, 9, "labels", "car"),
     ]  # fmt: skip
-    found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", markers))
+    found = boxes_by(writer, writer.new("visualization_msgs/MarkerArray", markers))
     assert [box.class_name for box in found.boxes] == ["van", "truck", ""]
     np.testing.assert_array_equal([box.score for box in found.boxes], [0.75, 0.25, np.nan])
     assert found.ignored == {"markers that are no solids": 3}
@@ -207,7 +206,7 @@ def test_cubes_of_one_entity_have_no_id_and_metadata_has_several_names():
         other.cubes.add()
         other.metadata.add(key=key, value=value)
     message.entities.add(id="text alone").texts.add(text="car")
-    found = boxes_decoder(_KIND, in_space=True)(message.SerializeToString())
+    found = boxes_of(_KIND, message.SerializeToString())
     assert [box.source_id for box in found.boxes] == [None, None, "12", "77", "no number", "no number"]
     assert [box.class_name for box in found.boxes] == ["car", "car", "van", "", "", "bus"]
     np.testing.assert_array_equal([box.score for box in found.boxes], [0.5, 0.5, 0.25, np.nan, 0.5, np.nan])
@@ -226,12 +225,12 @@ def test_ids_and_values_of_metadata_may_be_numbers_in_json():
     update = json.loads(scene_update_json(START_NS, [SEEN]))
     (entity,) = update["entities"]
     entity["id"], entity["metadata"] = 42, [{"key": "score", "value": 0.25}, {"key": "class", "value": 3}]
-    decode = boxes_decoder(MessageType("foxglove.SceneUpdate", "jsonschema", b"{}", "json"), in_space=True)
-    (box,) = decode(json.dumps(update).encode()).boxes
+    kind = MessageType("foxglove.SceneUpdate", "jsonschema", b"{}", "json")
+    (box,) = boxes_of(kind, json.dumps(update).encode()).boxes
     assert (box.source_id, box.score, box.class_name) == ("42", 0.25, "3")
     entity["id"] = [42]
     with pytest.raises(McaptrackError, match="a list where text belongs"):
-        decode(json.dumps(update).encode())
+        boxes_of(kind, json.dumps(update).encode())
 
 
 def test_numbers_that_can_not_be_are_counted_once():
@@ -247,7 +246,7 @@ def test_numbers_that_can_not_be_are_counted_once():
         Box3d(START_NS, "a", (3.0, 0.0, 0.0), (nan, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0), source_id="0012"),
         Box3d(START_NS, "a", (4.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), size, source_id=2**40),
     ]
-    found = recorded([(START_NS, Message3d(START_NS, "a", boxes))])
+    found = recorded([(START_NS, Message3d(START_NS, boxes))])
     assert found.remarks == {
         "boxes have no position (no finite number) and are left out": 3,
         "boxes have a size that is no finite number: it is unknown": 1,
@@ -267,7 +266,7 @@ def test_numbers_that_can_not_be_are_counted_once():
 def test_a_box_without_z_stands_where_x_and_y_say():
     nan = float("nan")
     boxes = [Box3d(START_NS, "radar", (3.0, 1.0, z), (0.0, 0.0, 0.0, 1.0), (4.0, 2.0, 1.0)) for z in (0.0, nan)]
-    found = recorded([(START_NS, Message3d(START_NS, "radar", boxes))])
+    found = recorded([(START_NS, Message3d(START_NS, boxes))])
     assert found.remarks == {"boxes have no z: it is unknown, and 0 in their frame for x and y": 1}
     tilted = Rotation.from_euler("zyx", [0.5, 0.1, -0.2])
     rows = rows_of_boxes(found, np.tile(tilted.as_matrix(), (2, 1, 1)), np.tile([5.0, 6.0, 7.0], (2, 1)))
@@ -287,7 +286,7 @@ def message(*stamps_ms: int | None, is_measured: bool = True) -> Message3d:
     """Boxes with these stamps; None for none. A message without boxes has no stamp."""
     stamps = [0 if one is None else START_NS + one * MS for one in stamps_ms]
     boxes = [Box3d(one, "a", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0)) for one in stamps]
-    return Message3d(stamps[0] if stamps else 0, "a", boxes, is_measured=is_measured)
+    return Message3d(stamps[0] if stamps else 0, boxes, is_measured=is_measured)
 
 
 @pytest.mark.parametrize(
@@ -332,10 +331,10 @@ def box(x: float = 0.0, frame_id: str = "lidar", stamp_ns: int = START_NS, **mor
 @pytest.mark.parametrize(("name", "zero", "other"), [("velocity", (0.0,) * 3, (0.0, 1.0, 0.0)), ("score", 0.0, 0.1)])
 def test_velocities_and_scores_of_zero_are_unknown_if_there_are_no_others(name, zero, other):
     boxes = [box(**{name: zero}), box(**{name: zero}), box()]
-    found = recorded([(START_NS, Message3d(START_NS, "lidar", boxes))])
+    found = recorded([(START_NS, Message3d(START_NS, boxes))])
     assert np.isnan(getattr(found, name)).all()
     assert found.remarks == {f"boxes have a {name} of 0, and no box has another: it is unknown": 2}
-    found = recorded([(START_NS, Message3d(START_NS, "lidar", [*boxes, box(**{name: other})]))])
+    found = recorded([(START_NS, Message3d(START_NS, [*boxes, box(**{name: other})]))])
     np.testing.assert_array_equal(getattr(found, name), np.array([zero, zero, np.full_like(zero, np.nan), other]))
     assert not found.remarks
 
@@ -345,7 +344,7 @@ def test_boxes_that_are_recorded_twice_count_once():
     first = [box(1.0, score=nan), box(2.0, class_name="car"), box(1.0, score=0.5), box(2.0)]
     second = [box(1.0, score=nan, source_id=7), box(3.0), box(2.0)]
     times = (START_NS, START_NS, first), (START_NS + 5, START_NS, second), (late, late, [box(1.0, stamp_ns=late)])
-    found = recorded([(log_ns, Message3d(stamp_ns, "lidar", boxes)) for log_ns, stamp_ns, boxes in times])
+    found = recorded([(log_ns, Message3d(stamp_ns, boxes)) for log_ns, stamp_ns, boxes in times])
     _, frame, _ = found.frames()
     assert np.flatnonzero(found.is_repeated(frame)).tolist() == [4, 6]
 
@@ -449,14 +448,14 @@ def test_boxes_of_lines_are_boxes(centre, size, yaw, seed):
     shuffled = [points[2 * edge + end] for edge in order for end in (0, 1)]
     writer = ros("visualization_msgs/MarkerArray")
     lines = marker(writer, START_NS, Seen(np.zeros(3), np.array([0, 0, 0, 1.0]), np.ones(3)), 5, points=shuffled)
-    (box,) = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", [lines])).boxes
+    (box,) = boxes_by(writer, writer.new("visualization_msgs/MarkerArray", [lines])).boxes
     np.testing.assert_allclose(box.centre, centre, atol=1e-6)
     np.testing.assert_allclose(box.size, [*sorted(size[:2], reverse=True), size[2]], atol=1e-6)
     ahead = Rotation.from_quat(box.orientation).apply([1, 0, 0])
     along = Rotation.from_euler("z", yaw).apply([1, 0, 0] if size[0] >= size[1] else [0, 1, 0])
     assert abs(size[0] - size[1]) < 1e-6 or abs(ahead @ along) > 1 - 1e-6
     cut = marker(writer, START_NS, SEEN, 5, points=shuffled[:-2])
-    assert not boxes_of(writer, writer.new("visualization_msgs/MarkerArray", [cut])).boxes
+    assert not boxes_by(writer, writer.new("visualization_msgs/MarkerArray", [cut])).boxes
 
 
 @pytest.mark.parametrize("kind", [2, 3, 7])
@@ -465,7 +464,7 @@ def test_markers_that_are_round_have_a_size_and_no_heading(kind):
     points = [(0, 0, 0)] if kind == 7 else ()
     lines = marker(writer, START_NS, SEEN, 5, points=wires(SEEN.centre, Rotation.identity(), SEEN.size))
     drawn = [marker(writer, START_NS, SEEN, kind, points=points, space="people"), lines]
-    found = boxes_of(writer, writer.new("visualization_msgs/MarkerArray", drawn))
+    found = boxes_by(writer, writer.new("visualization_msgs/MarkerArray", drawn))
     (box,) = found.boxes  # lines count only where there is nothing else
     assert (box.centre, box.size, box.class_name) == ((1, 2, 3), (4, 2, 1.5), "people")
     assert not box.has_heading
@@ -485,7 +484,7 @@ def test_entities_may_be_drawn_by_other_solids(kind):
         solid = getattr(entity, kind).add()
         solid.pose.CopyFrom(cube.pose)
         solid.size.CopyFrom(cube.size)
-    (box,) = boxes_decoder(_KIND, in_space=True)(message.SerializeToString()).boxes
+    (box,) = boxes_of(_KIND, message.SerializeToString()).boxes
     np.testing.assert_allclose([*box.centre, *box.size], [1, 2, 3, 4, 2, 1.5], atol=1e-9)
     assert (box.class_name, box.source_id, box.has_heading) == ("car", "12", kind == "lines")
 

@@ -26,10 +26,10 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, read_calibrations
 from mcaptrack.sources.fixed_frame import holds_transforms, named_detections, read_frames
 from mcaptrack.sources.foreign import definitions
-from mcaptrack.sources.foreign.boxes import boxes_decoder, decoded_messages
 from mcaptrack.sources.foreign.definitions import MessageType, defined, definitions_of
 from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from tests.bags import database
+from tests.box_reading import boxes_in
 from tests.commands import call
 from tests.undefined import T0, message, names_no_definitions, package, store_of
 
@@ -43,8 +43,7 @@ SPELLINGS = {
 #: What asks for a type, with a type that it reads, and what it gives for a channel of it.
 def in_space(opened: log.Log) -> list:
     """The boxes in space of the messages of /t."""
-    read = decoded_messages(opened, "/t", lambda kind: boxes_decoder(kind, in_space=True), None)
-    return [message.boxes for _, message in read]
+    return [message.boxes for message in boxes_in(opened, "/t")]
 
 
 ASKS = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,9 +18,10 @@ from hypothesis import strategies as st
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.foreign import MessageType, boxes_decoder, picture_decoder
+from mcaptrack.sources.foreign import MessageType, picture_decoder
 from mcaptrack.sources.video import PIXEL_FORMATS, EncodedPicture, PixelLayout, decode_gray
-from tests.ros_messages import BAR, STAMP_NS, VISION, boxes, pixels, ros_writer, vision
+from tests.box_reading import boxes_of
+from tests.ros_messages import BAR, STAMP_NS, VISION, pixels, ros_writer, vision
 
 SEC, NSEC = divmod(STAMP_NS, 10**9)
 
@@ -288,26 +290,30 @@ class TestBoxes:
             (10.0, 10.0, 4.0, 8.0, np.pi / 2, [(2, 0.5)]),
         ]
         kind, payload = vision(layout, boxes)
-        found = boxes_decoder(kind)(payload)
+        found = boxes_of(kind, payload)
         np.testing.assert_allclose([box[:4] for box in found], [[90, 30, 20, 40], [8, 6, 4, 8], [6, 8, 8, 4]])
         np.testing.assert_array_equal([box.score for box in found], [0.75, np.nan, 0.5])
         assert [box.class_name for box in found] == ["7", "", "2"]
 
     def test_a_message_without_boxes_is_a_frame_without_rows(self):
         kind, payload = vision("v4", [])
-        assert len(boxes_decoder(kind)(payload)) == 0
+        assert len(boxes_of(kind, payload)) == 0
 
     @pytest.mark.parametrize("box", [(np.nan, 0.0, 1.0, 1.0), (0.0, np.inf, 1.0, 1.0), (0.0, 0.0, -1.0, 1.0)])
     def test_boxes_that_can_not_be_are_said(self, box):
         kind, payload = vision("v4", [(*box, 0.0, [])])
         with pytest.raises(McaptrackError, match="a box can't be"):
-            boxes_decoder(kind)(payload)
+            boxes_of(kind, payload)
 
     def test_other_channels_are_refused(self):
         with pytest.raises(
-            McaptrackError, match=r"it holds x, not detections; vision_msgs/Detection2DArray, .* are read"
+            McaptrackError, match=r"/t holds x, not detections; vision_msgs/Detection2DArray, .* are read"
         ):
-            boxes_decoder(MessageType("x", "", b"", "json"))
+            boxes_of(MessageType("x", "jsonschema", b"{}", "json"), b"{}")
+
+
+def reader_of_boxes(kind: MessageType):
+    return partial(boxes_of, kind)
 
 
 def kinds() -> dict[str, tuple]:
@@ -321,8 +327,8 @@ def kinds() -> dict[str, tuple]:
     made["raw ros1"] = (picture_decoder, *ros_raw(gradient(2, 2), "bgr8", True))
     made["raw ros2"] = (picture_decoder, *ros_raw(gradient(2, 2), "bgr8", False))
     for layout in VISION:
-        made[f"boxes {layout}"] = (boxes, *vision(layout, [(1.0, 1.0, 1.0, 1.0, 0.0, [(1, 0.5)])]))
-    made["boxes json"] = (boxes, *as_json("vision_msgs/msg/Detection2DArray", detections=[]))
+        made[f"boxes {layout}"] = (reader_of_boxes, *vision(layout, [(1.0, 1.0, 1.0, 1.0, 0.0, [(1, 0.5)])]))
+    made["boxes json"] = (reader_of_boxes, *as_json("vision_msgs/msg/Detection2DArray", detections=[]))
     return {name: (make(kind), payload) for name, (make, kind, payload) in made.items()}
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mcaptrack.sources.fixed_frame import Recorded3d, recorded
-from mcaptrack.sources.foreign.boxes import Box3d, Message3d
+from mcaptrack.contracts import Box3d
+from mcaptrack.sources.fixed_frame import Recorded3d
+from mcaptrack.sources.foreign.fields import Message3d
+from tests.box_reading import recorded
 
 START_NS, MS = 1_700_000_000_000_000_000, 1_000_000
 OBJECTS, SWEEPS, PERIOD_MS = 12, 20, 100
@@ -27,7 +29,7 @@ def scattered(stamp_ms, late_ms=lambda sweep, number: 40.0, objects: int = OBJEC
             x, y = PLACES[number] + SPEEDS[number] * (PERIOD_MS * sweep + after_ms) / 1000
             box = Box3d(stamp_ns, "lidar", (x, y, 0.0), (0.0, 0.0, 0.0, 1.0), (4.0, 2.0, 1.5), "car", 0.5, number)
             log_ns = START_NS + round((PERIOD_MS * sweep + late_ms(sweep, number)) * MS)
-            messages.append((log_ns, Message3d(stamp_ns, "lidar", [box])))
+            messages.append((log_ns, Message3d(stamp_ns, [box])))
     return recorded(sorted(messages, key=lambda one: one[0]))
 
 
@@ -78,7 +80,7 @@ def test_an_object_that_is_seen_twice_at_a_time_is_no_sweep():
         for place, speed in zip(PLACES, SPEEDS, strict=True):
             x, y = place + speed * (stamp_ns - START_NS) / 1e9
             boxes.append(Box3d(stamp_ns, "lidar", (x, y, 0.0), (0.0, 0.0, 0.0, 1.0), (4.0, 2.0, 1.5), "car", 0.5))
-        messages.append((stamp_ns, Message3d(stamp_ns, "lidar", boxes)))
+        messages.append((stamp_ns, Message3d(stamp_ns, boxes)))
     starts, _, words = recorded(messages).frames()
     assert (len(starts), words) == (40, "")
 

@@ -290,7 +290,7 @@ def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:
     """Return the frames of a log, each after its parent, and warn of transforms that contradict or are missing."""
     read = read_frames(opened)
     for why in read.unread:
-        warn(f"{opened.path}: {why}", "lost")
+        warn(why, "lost")
     if read.tree is None:
         return ()
     for remark in read.tree.remarks:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -21,8 +22,9 @@ from mcaptrack.schema.names import plain_name, shared_parts
 from mcaptrack.schema.provenance import INGEST
 from mcaptrack.sources.cameras import Camera, provenance_of
 from mcaptrack.sources.fixed_frame import poses_at, transforms_of
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, frame_named, stamp_of
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, frame_named
 from mcaptrack.sources.foreign.flatten import frame_of, message_type_of
+from mcaptrack.sources.foreign.things import HEADS, heads, read_channel
 from mcaptrack.sources.pictures import picture_size
 
 if TYPE_CHECKING:
@@ -255,21 +257,18 @@ def _ground_frame(tree: TransformTree, frame: str, eye: str, stamps_ns: Ints) ->
 
 def _headers(opened: log.Log, topics: Sequence[str]) -> tuple[Ints, Ints, str]:
     """Return log times and stamps in ns of all messages, (N,) each, by log time; and the frame of the first message."""
-    times: list[tuple[int, int]] = []
-    frame_id = ""
+    times, frame_id = [np.empty((2, 0), np.int64)], ""
     for topic in topics:
-        try:
-            decode = decoder_with_errors(
-                message_type_of(opened, topic), lambda message: (stamp_of(message), frame_named(message))
-            )
-            for message in opened.timed(topic):
-                stamp_ns, named = decode(message.payload)
-                frame_id = frame_id or named
-                times.append((message.t_ns, stamp_ns))
-        except McaptrackError:  # rows of mcaptrack have no stamps
-            times += [(t_ns, t_ns) for t_ns in opened.times(topic).tolist()]
-    log_ns, stamp_ns = np.array(sorted(times), np.int64).reshape(-1, 2).T
-    return log_ns, stamp_ns, frame_id
+        log_ns = opened.times(topic)
+        stamp_ns = log_ns.copy()
+        with suppress(McaptrackError):  # rows of mcaptrack have no stamps
+            for which, (stamps_ns, frames) in read_channel(opened, topic, heads, HEADS).parts:
+                stamp_ns[which] = stamps_ns
+                frame_id = frame_id or next(filter(None, frames), "").removeprefix("/")
+        times.append(np.stack([log_ns, stamp_ns]))
+    log_ns, stamp_ns = np.concatenate(times, axis=1)
+    order = np.lexsort((stamp_ns, log_ns))
+    return log_ns[order], stamp_ns[order], frame_id
 
 
 def _is_usable(opened: log.Log, topic: str) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
@@ -18,10 +18,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.contracts import Box3d
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.angles import headings
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.oriented_boxes import COLUMNS
 from mcaptrack.geometry.transform_tree import (
@@ -45,14 +44,14 @@ from mcaptrack.sources.foreign.boxes import (
     Reading,
     choice_for,
     classes_of,
-    decoded_messages,
     facts_of,
     named_boxes,
     read_classes,
 )
-from mcaptrack.sources.foreign.decoding import decoder_with_errors, stamp_of, unpacker
-from mcaptrack.sources.foreign.fields import Message3d
-from mcaptrack.sources.foreign.flatten import message_type_of
+from mcaptrack.sources.foreign.decoding import unpacker
+from mcaptrack.sources.foreign.fields import Message3d, Seen3d
+from mcaptrack.sources.foreign.flatten import payload_decoder
+from mcaptrack.sources.foreign.things import EACH, Path, Things, read_channel
 
 # All 3D boxes of a channel as arrays, in the frames that they were recorded in.
 #
@@ -346,51 +345,48 @@ def _starts(t_ns: Ints) -> Ints:
 
 
 def recorded(
-    messages: Iterable[tuple[int, Message3d]], classes: Callable[[Sequence[str]], ClassesRead] = read_classes
+    log_ns: Ints,
+    parts: Iterable[tuple[Ints, Seen3d]],
+    classes: Callable[[Sequence[str]], ClassesRead] = read_classes,
 ) -> Recorded3d:
-    """The boxes of messages, each with its log time in ns, as arrays; ``classes`` takes the texts of their classes.
+    """The boxes of messages at log times (M,): of some of them each, by their numbers.
 
-    Boxes without a position are left out; sizes that can't be are unknown. ``remarks`` counts both.
+    ``classes`` takes the texts of their classes. Boxes without a position are left out; sizes that can't be are
+    unknown. ``remarks`` counts both.
     """
-    boxes: list[Box3d] = []
-    owner: list[int] = []
-    heads: list[tuple[int, int, bool]] = []
+    stamp_ns, is_measured = np.zeros(len(log_ns), np.int64), np.zeros(len(log_ns), bool)
     remarks: Counter[str] = Counter()
-    for number, (t_ns, of_message) in enumerate(messages):
-        boxes += of_message.boxes
-        owner += [number] * len(of_message.boxes)
-        heads.append((t_ns, of_message.stamp_ns, of_message.is_measured))
-        remarks.update({f"{remark} are left out": count for remark, count in of_message.ignored.items()})
-    head_ns = np.array([head[:2] for head in heads], np.int64).reshape(-1, 2)
-    names = sorted({plain_frame(box.frame_id) for box in boxes})
-    place = {name: number for number, name in enumerate(names)}
-    of_boxes = classes([box.class_name for box in boxes])
-    message = np.array(owner, np.int64)
+    by_part = [Message3d(0).columns().boxes]
+    for which, seen in parts:
+        stamp_ns[which], is_measured[which] = seen.stamp_ns, seen.is_measured
+        remarks.update({f"{remark} are left out": count for remark, count in seen.ignored.items()})
+        by_part.append(seen.boxes._replace(message=which[seen.boxes.message]))
+    boxes = joined(by_part)
+    plain = {name: plain_frame(name) for name in dict.fromkeys(boxes.frame_id)}
+    names = sorted(set(plain.values()))
+    place = {name: names.index(own) for name, own in plain.items()}
+    of_boxes = classes(boxes.class_name)
     out = Recorded3d(
         names,
-        np.array([place[plain_frame(box.frame_id)] for box in boxes], np.int64),
-        message,
-        np.array([box.stamp_ns for box in boxes], np.int64),
-        head_ns[message, 0],
-        _columns([box.centre for box in boxes], 3),
-        _columns([box.orientation for box in boxes], 4),
-        _columns([box.size for box in boxes], 3),
-        _columns([box.velocity for box in boxes], 3),
-        np.array([box.has_heading for box in boxes], bool),
-        np.array([box.score for box in boxes], np.float64),
+        np.array([place[name] for name in boxes.frame_id], np.int64),
+        boxes.message,
+        boxes.stamp_ns,
+        log_ns[boxes.message],
+        boxes.centre,
+        boxes.orientation,
+        boxes.size,
+        boxes.velocity,
+        boxes.has_heading,
+        boxes.score,
         of_boxes.ids,
-        _ids([box.source_id for box in boxes]),
+        _ids(boxes.source_id),
         of_boxes,
-        head_ns[:, 0],
-        head_ns[:, 1],
-        np.array([head[2] for head in heads], bool),
+        log_ns,
+        stamp_ns,
+        is_measured,
         dict(remarks),
     )
     return _checked(out)
-
-
-def _columns(values: Sequence[tuple[float, ...]], width: int) -> Floats:
-    return np.array(values, np.float64).reshape(-1, width)
 
 
 def _ids(ids: Sequence[int | str | None]) -> Ints:
@@ -467,14 +463,15 @@ TRANSFORMS_READ: Final = (
 _LATCHED: Final = "tf_static"
 
 
-class _Transform(NamedTuple):
-    """A recorded transform, from points of ``child`` to points of ``parent``."""
+class _Transforms(NamedTuple):
+    """Recorded transforms (N,), from points of ``child`` to points of ``parent``, and the messages that they are in."""
 
-    parent: str
-    child: str
-    stamp_ns: int
-    translation: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
+    message: Ints
+    parent: Any
+    child: Any
+    stamp_ns: Ints
+    translation: Floats
+    quaternion: Floats
 
 
 class FramesRead(NamedTuple):
@@ -523,7 +520,7 @@ def poses_at(
     tree, _, unread = read_frames(opened)
     tree = tree or TransformTree([])
     for text in unread:
-        warn(f"{opened.path}: {text}", "lost")
+        warn(text, "lost")
     poses = tree.lookup(target, source, stamps_ns)
     if len(stamps_ns) and not poses.is_known.any():
         by_log_time = tree.on_log_time.lookup(target, source, log_ns)
@@ -541,65 +538,48 @@ def poses_at(
 
 
 def _read(opened: log.Log) -> FramesRead:
-    by_edge: dict[tuple[str, str, bool], list[tuple[_Transform, int]]] = {}
+    edges: dict[tuple[str, str, bool], int] = {}
+    of_edge, samples = list[int](), list[PoseSamples]()
     topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
-    unread: list[str] = []
+    problems: list[str] = []
     for topic in topics:
-        is_latched = topic.endswith(_LATCHED)
-        bad, why = 0, ""
         try:
-            decode = decoder_with_errors(message_type_of(opened, topic), lambda message: list(_transforms(message)))
-            for message in opened.timed(topic):
-                try:
-                    for transform in decode(message.payload):
-                        edge = (transform.parent, transform.child, is_latched)
-                        by_edge.setdefault(edge, []).append((transform, message.t_ns))
-                except McaptrackError as error:
-                    bad, why = bad + 1, why or str(error)
+            log_ns, parts, unread = read_channel(opened, topic, _transforms, _FIELDS)
         except McaptrackError as error:
-            unread.append(f"{topic} can't be read: {error}")
-        if bad:
-            unread.append(f"{topic}: {bad:,} message{'' if bad == 1 else 's'} can't be read; the first: {why}")
-    recorded = [
-        Recorded(parent, child, is_latched, _samples(those)) for (parent, child, is_latched), those in by_edge.items()
-    ]
-    return FramesRead(TransformTree(recorded) if recorded else None, tuple(topics), tuple(unread))
+            problems.append(str(error))
+            continue
+        problems += [str(unread)] if str(unread) else []
+        for which, read in parts:
+            names = zip(read.parent, read.child, strict=True)
+            of_edge += [edges.setdefault((*pair, topic.endswith(_LATCHED)), len(edges)) for pair in names]
+            times = log_ns[which[read.message]]
+            samples.append(PoseSamples(read.stamp_ns, times, read.translation, read.quaternion))
+    if not edges:
+        return FramesRead(None, tuple(topics), tuple(problems))
+    poses, order = joined(samples), _groups(np.array(of_edge), np.arange(len(of_edge)))
+    recorded = [Recorded(*edge, taken(poses, which)) for edge, (_, which) in zip(edges, order, strict=True)]
+    return FramesRead(TransformTree(recorded), tuple(topics), tuple(problems))
 
 
-def _samples(those: list[tuple[_Transform, int]]) -> PoseSamples:
-    return PoseSamples(
-        np.array([transform.stamp_ns for transform, _ in those], np.int64),
-        np.array([t_ns for _, t_ns in those], np.int64),
-        np.array([transform.translation for transform, _ in those], np.float64),
-        np.array([transform.quaternion for transform, _ in those], np.float64),
-    )
+#: The fields of transforms of all schemas.
+_FIELDS: Final = [
+    (*at, name)
+    for at in ((), ("transforms",))
+    for name in ("header", "timestamp", "parent_frame_id", "child_frame_id", "transform", "translation", "rotation")
+]
 
 
-def _transforms(message: Any) -> Iterator[_Transform]:
-    """Yield the transforms of a message of any of the schemas."""
-    if hasattr(message, "transforms"):
-        for transform in message.transforms:
-            yield from _transforms(transform)
-        return
-    if hasattr(message, "parent_frame_id"):
-        parent, inner = message.parent_frame_id, message
-    else:
-        parent, inner = message.header.frame_id, message.transform
-    child = message.child_frame_id
-    if not isinstance(parent, str) or not isinstance(child, str):
-        raise ValueError("names of frames are text")
-    x, y, z = (float(getattr(inner.translation, axis)) for axis in "xyz") if _has(inner, "translation") else (0.0,) * 3
-    turn = (
-        [float(getattr(inner.rotation, axis)) for axis in "xyzw"] if _has(inner, "rotation") else [0.0, 0.0, 0.0, 1.0]
-    )
-    yield _Transform(parent, child, stamp_of(message), (x, y, z), (turn[0], turn[1], turn[2], turn[3]))
-
-
-def _has(message: Any, name: str) -> bool:
-    """Return whether an optional field of a message is set: in protobuf and JSON it may be missing."""
-    if hasattr(message, "HasField"):
-        return bool(message.HasField(name))
-    return getattr(message, name, None) is not None
+def _transforms(messages: Things) -> _Transforms:
+    """The transforms of messages of any of the schemas."""
+    owner, each = messages.members(("transforms", EACH) if messages.has(("transforms",)) else ())
+    is_foxglove = each.has(("parent_frame_id",))
+    at: Path = () if is_foxglove else ("transform",)
+    parent = each.texts(("parent_frame_id",) if is_foxglove else ("header", "frame_id"))
+    stamp_ns = each.stamps(("timestamp",) if each.has(("timestamp",)) else ("header", "stamp"))
+    shift, turn = each.vectors((*at, "translation")), each.vectors((*at, "rotation"), "xyzw")
+    shift[~each.is_set((*at, "translation"))] = 0.0
+    turn[~each.is_set((*at, "rotation"))] = [0.0, 0.0, 0.0, 1.0]
+    return _Transforms(owner, parent, each.texts(("child_frame_id",)), stamp_ns, shift, turn)
 
 
 def holds_boxes_3d(opened: log.Log, topic: str) -> bool:
@@ -632,7 +612,7 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
     """
     reading = foreign.reading_of(opened, topic)
     if reading is None:
-        decoded_messages(opened, topic, unpacker, None)  # says why, if its messages can't be decoded
+        payload_decoder(opened, topic, unpacker)  # says why, if its messages can't be decoded
         name = opened.channel(topic).schema_name or "no schema"
         raise McaptrackError(f"{opened.path}: {topic} holds {name}, not detections; {', '.join(BOXES_READ)} are read")
     if reading.known is None and reading.fields is not None and not choice_for(opened, topic).fields:
@@ -643,14 +623,14 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
 
 def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> foreign.NamedFrames:
     """The boxes in space of a channel, as ``named_detections`` returns them."""
-    nothing = Message3d(0, "", is_measured=False)
-    decoded = decoded_messages(opened, topic, lambda kind: decoder_with_errors(kind, reading.read), nothing)
     own = reading.class_name
 
     def classes(texts: Sequence[str]) -> ClassesRead:
         return classes_of(opened, topic, reading, [text or own for text in texts])
 
-    boxes, unnamed = recorded(((message.t_ns, of_message) for message, of_message in decoded), classes).in_usual_frame()
+    log_ns, parts, unread = read_channel(opened, topic, reading.read, reading.paths)
+    unread.warn("it counts as empty")
+    boxes, unnamed = recorded(log_ns, parts, classes).in_usual_frame()
     for remark, count in boxes.remarks.items():
         warn(f"{opened.path}: {topic}: {count:,} {remark}", "left-out")
     if unnamed:
@@ -680,10 +660,10 @@ def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> f
         remark = "times have boxes of several messages, where others have those of one, as if a clock was set back"
         warn(f"{opened.path}: {topic}: {several:,} of {len(start_ns):,} {remark}: they count as one frame", "clock")
     order = np.argsort(frame, kind="stable")
-    parts = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
+    by_frame = np.split(rows[order], np.searchsorted(frame[order], np.arange(1, len(start_ns))))
     kept = np.flatnonzero(~is_left_out).tolist()
     times = start_ns.tolist()
-    frames = [Frame(times[at], index, parts[at]) for index, at in enumerate(kept)]
+    frames = [Frame(times[at], index, by_frame[at]) for index, at in enumerate(kept)]
     clock = "stamps" if not boxes.times()[1] else "stamps, and log times where they are missing or off"
     facts = facts_of(choice_for(opened, topic), reading, clock=clock, classes=boxes.classes.source, scale="metres")
     return foreign.NamedFrames(frames, boxes.classes.names, fixed, facts)

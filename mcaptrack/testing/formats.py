@@ -23,7 +23,7 @@ from mcaptrack.contracts import Exporter, LabelFormat, MessageReader, is_in_spac
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.registry import Entry, Kind, in_words
-from mcaptrack.sources.foreign.boxes import checked_boxes, checked_message_3d
+from mcaptrack.sources.foreign.boxes import checked_boxes, checked_boxes_3d
 from mcaptrack.sources.ingest.labels.format import LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage
 from mcaptrack.sources.ingest.labels.reading import read_by
@@ -170,7 +170,7 @@ def check_message_reader(reader: MessageReader, messages: Sequence[Any]) -> None
         except Exception as error:
             raise LawError(f"conforms: it raises {type(error).__name__}: {error}") from None
         try:
-            return checked_message_3d(entry, message, given).boxes if in_space else list(checked_boxes(entry, given))
+            return [checked_boxes_3d(entry, message, given).boxes if in_space else checked_boxes(entry, given)]
         except McaptrackError as error:
             raise LawError(f"conforms: {error}") from None
 

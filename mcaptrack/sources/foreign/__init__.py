@@ -6,7 +6,6 @@ drawings to a picture.
 
 from mcaptrack.sources.foreign.boxes import BOXES_READ as BOXES_READ
 from mcaptrack.sources.foreign.boxes import NamedFrames as NamedFrames
-from mcaptrack.sources.foreign.boxes import boxes_decoder as boxes_decoder
 from mcaptrack.sources.foreign.boxes import holds_boxes as holds_boxes
 from mcaptrack.sources.foreign.boxes import is_drawing as is_drawing
 from mcaptrack.sources.foreign.boxes import reading_of as reading_of

@@ -10,22 +10,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
-from math import isfinite
-from types import SimpleNamespace
 from typing import Any, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.contracts import Box, Box3d, is_in_space
+from mcaptrack.contracts import is_in_space
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Floats, Ints, joined
 from mcaptrack.geometry.boxes import outside
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
@@ -35,33 +33,30 @@ from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.classes import COCO, PERSON, UNKNOWN, ClassMap, is_person
 from mcaptrack.schema.names import plain_name, shared_parts
 from mcaptrack.schema.provenance import Provenance, boxes_of, input_of
-from mcaptrack.sources.foreign.decoding import (
-    decoder_with_errors,
-    integer,
-    number,
-    stamp_of,
-    text,
-)
-from mcaptrack.sources.foreign.definitions import MessageType
+from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, number, text
 from mcaptrack.sources.foreign.fields import (
+    NO_BOXES,
     NO_THINGS,
     PEOPLE,
     THINGS,
+    Boxes2d,
     FieldReader,
     FieldShape,
     Message3d,
+    Seen3d,
     ThingFields,
-    check_box,
+    check_boxes,
     head_of,
+    identity,
     mapped,
-    message_head,
     parse_map,
     recognised,
     shape_of_message,
     shape_of_type,
 )
-from mcaptrack.sources.foreign.flatten import UnreadMessages, message_type_of, payload_decoder
+from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.foreign.known_types import KNOWN, Known
+from mcaptrack.sources.foreign.things import Path, Things, read_channel
 
 _KIND: Final = "message_reader"
 #: What is read, in messages.
@@ -156,9 +151,11 @@ class Reading(NamedTuple):
     in_space : bool
         Whether boxes are in metres.
     read : callable
-        From a message to a list of ``Box``, or of boxes in space a ``Message3d``.
+        From messages to ``Boxes2d``, or of boxes in space to ``Seen3d``.
     fields : ThingFields or None
         What its fields are; None for drawings, and readers of packages.
+    paths : sequence of tuple of str
+        The fields that are read, if messages can be read as columns.
     is_certain : bool
         Whether it holds boxes of what moves, or only may.
     class_name : str
@@ -168,8 +165,9 @@ class Reading(NamedTuple):
     """
 
     in_space: bool
-    read: Callable[[Any], Any]
+    read: Callable[[Things], Any]
     fields: ThingFields | None = None
+    paths: Sequence[Path] = ()
     is_certain: bool = True
     class_name: str = ""
     known: Known | None = None
@@ -201,7 +199,7 @@ def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Read
     try:
         if not choice.fields and (special := _special(name)):
             if name in BUILT_IN[_KIND]:
-                return _of_drawings(special, _samples(opened, channel.topic, special.read), words, person)
+                return _of_drawings(special, _samples(opened, channel.topic, _single(special.read)), words, person)
             return special
     except McaptrackError as error:
         warn(f"{error}; messages of {channel.topic} are not read", "other")
@@ -218,22 +216,28 @@ def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Read
     if reader is None:
         return None
     if reader.fields.in_picture and reader.in_space:  # of both the one that is filled in
-        centres = [box.centre for message in _samples(opened, channel.topic, reader.in_frame) for box in message.boxes]
-        reader.in_space = not centres or any(any(centre) for centre in centres)
+        samples = _samples(opened, channel.topic, _single(reader.in_frame))
+        centres = [seen.boxes.centre for seen in samples if len(seen.boxes.centre)]
+        reader.in_space = not centres or bool(np.concatenate(centres).any())
     known = KNOWN.get(name)
     is_certain = known is not None or reader.fields.is_certain or bool(choice.fields or person)
-    return Reading(reader.in_space, reader.read, reader.fields, is_certain, person, known)
+    return Reading(reader.in_space, reader.read, reader.fields, reader.paths, is_certain, person, known)
 
 
-def _of_drawings(special: Reading, messages: Sequence[Message3d], words: Sequence[str], person: str) -> Reading | None:
+def _of_drawings(special: Reading, messages: Sequence[Seen3d], words: Sequence[str], person: str) -> Reading | None:
     """The way drawings are read; None if there is no box among the first ones.
 
     What is round may be a mark of anything, where nothing names it.
     """
-    boxes = [box for message in messages for box in message.boxes]
-    is_certain = any(box.has_heading for box in boxes) or any(THINGS.fullmatch(word) for word in words)
-    is_certain |= any(is_person(box.class_name) for box in boxes)
-    return special._replace(is_certain=is_certain, class_name=person) if boxes else None
+    drawn = [seen.boxes for seen in messages if len(seen.boxes.message)]
+    is_certain = any(boxes.has_heading.any() for boxes in drawn) or any(THINGS.fullmatch(word) for word in words)
+    is_certain |= any(is_person(name) for boxes in drawn for name in boxes.class_name)
+    return special._replace(is_certain=is_certain, class_name=person) if drawn else None
+
+
+def _single(read: Callable[[Things], Any]) -> Callable[[Any], Any]:
+    """A function that reads one decoded message."""
+    return lambda message: read(Things([message]))
 
 
 def _shape_of(messages: Sequence[Any]) -> FieldShape:
@@ -270,7 +274,7 @@ def fields_reader(name: str, shape: FieldShape, chosen: str = "") -> FieldReader
         fields = replace(fields, names=dict(enumerate(known.classes.split(","))))
     if chosen:
         fields = mapped(shape, name, parse_map(chosen))
-    return None if fields is None else FieldReader(fields, fields.in_space, None if chosen else known.adjust)
+    return None if fields is None else FieldReader(fields, None if chosen else known.adjust, known.also)
 
 
 def is_drawing(type_name: str) -> bool:
@@ -284,7 +288,8 @@ def _special(name: str) -> Reading | None:
     Raises McaptrackError if the reader of a package can't be imported. Packages that aren't needed are not imported.
     """
     if name in BUILT_IN[_KIND]:
-        return Reading(True, find(_KIND, name).cls)
+        drawn: Callable[[Any], Message3d] = find(_KIND, name).cls
+        return Reading(True, lambda messages: drawn(messages.single).columns())
     other = "" if name in KNOWN else next((other for other in others(_KIND) if plain_name(other) == name), "")
     return _of_package(find(_KIND, other)) if other else None
 
@@ -294,74 +299,42 @@ def _of_package(entry: Entry) -> Reading:
     reader, guard = entry.made("read"), Guard(str(entry))
     in_space = is_in_space(entry, reader)
 
-    def read(message: Any) -> list[Box] | Message3d:
+    def read(messages: Things) -> Boxes2d | Seen3d:
         with blamed(entry, "failed", guard):
-            boxes = list(reader.read(message))
-        return checked_message_3d(entry, message, boxes) if in_space else checked_boxes(entry, boxes)
+            boxes = list(reader.read(messages.single))
+        return checked_boxes_3d(entry, messages.single, boxes) if in_space else checked_boxes(entry, boxes)
 
     return Reading(in_space, read)
 
 
-def boxes_decoder(kind: MessageType, in_space: bool = False) -> Callable[[bytes], Any]:
-    """A function that decodes payloads of a type to a list of ``Box``, or of boxes in space to a ``Message3d``.
-
-    Raises McaptrackError for other types; the returned function raises it for malformed payloads.
-    """
-    name = plain_name(kind.name)
-    reading, shape = _special(name), None
-    if reading is None and (shape := shape_of_type(kind)) is not None and (reader := fields_reader(name, shape)):
-        reading = Reading(in_space, reader.in_frame if in_space else reader.in_picture, reader.fields)
-        if not (reader.in_space if in_space else reader.fields.in_picture):
-            reading = None
-    if reading is None and shape is None and name in KNOWN:
-        return decoder_with_errors(kind, lambda message: _read_json(name, message, in_space))
-    if reading is None or reading.in_space != in_space:
-        what = "3D boxes" if in_space else "detections"
-        raise McaptrackError(f"it holds {kind.name or 'no schema'}, not {what}; {', '.join(BOXES_READ)} are read")
-    return decoder_with_errors(kind, reading.read)
-
-
-def _read_json(name: str, message: Any, in_space: bool) -> Any:
-    """The boxes of a message in JSON, by its own fields."""
-    reader = fields_reader(name, shape_of_message(message))
-    if reader is None:
-        return Message3d(*message_head(message, [])) if in_space else []
-    return reader.in_frame(message) if in_space else reader.in_picture(message)
-
-
-def checked_boxes(entry: Entry, boxes: list[Any]) -> list[Box]:
-    """The boxes in a picture that a reader gave, as numbers of Python. Raises McaptrackError for what is none."""
+def checked_boxes(entry: Entry, boxes: list[Any]) -> Boxes2d:
+    """The boxes in a picture that a reader gave for a message. Raises McaptrackError for what is none."""
     with blamed(entry, "gave what is no Box"):
-        out = [Box(float(x), float(y), float(w), float(h), number(s), text(name)) for x, y, w, h, s, name in boxes]
-        for x, y, w, h, *_ in out:
-            check_box(x, y, w, h)
-    return out
+        rows = [(float(x), float(y), float(w), float(h), number(score)) for x, y, w, h, score, _ in boxes]
+        columns = np.array(rows, np.float64).reshape(-1, 5)
+        check_boxes(columns[:, :4])
+        names = np.array([text(name) for *_, name in boxes], object)
+    return Boxes2d(np.zeros(len(boxes), np.int64), columns[:, :4], columns[:, 4], names)
 
 
-def checked_message_3d(entry: Entry, message: Any, boxes: list[Any]) -> Message3d:
+def checked_boxes_3d(entry: Entry, message: Any, boxes: list[Any]) -> Seen3d:
     """The boxes in space that a reader gave, with the header of their message, if it has one."""
-    try:
-        head = head_of(message)
-    except (AttributeError, ValueError):
-        head = (0, "")
+    stamp_ns, frame_id = 0, ""
+    with suppress(AttributeError, ValueError):
+        stamp_ns, frame_id = head_of(message)
     with blamed(entry, "gave what is no Box3d"):
-        return Message3d(*head, [_checked_box_3d(box, head) for box in boxes])
-
-
-def _checked_box_3d(box: Any, head: tuple[int, str]) -> Box3d:
-    vectors = [tuple(map(float, values)) for values in (box.centre, box.size, box.velocity, box.orientation)]
-    if [len(values) for values in vectors] != [3, 3, 3, 4]:
-        raise ValueError("a centre, size and velocity are three numbers, and an orientation is four")
-    centre, size, velocity, orientation = vectors
-    if not all(map(isfinite, (*centre, *orientation))) or any(side < 0 for side in size):
-        raise ValueError(f"a box can't be at {centre}, turned by {orientation}, with the size {size}")
-    if box.source_id is not None and not isinstance(box.source_id, str):
-        integer(box.source_id)
-    stamp, frame = (integer(box.stamp_ns), text(box.frame_id))
-    return box._replace(  # type: ignore[no-any-return]
-        stamp_ns=stamp or head[0], frame_id=frame or head[1], centre=centre, size=size, velocity=velocity,
-        orientation=orientation, class_name=text(box.class_name), score=float(box.score),
-    )  # fmt: skip
+        stated = [
+            box._replace(
+                stamp_ns=integer(box.stamp_ns) or stamp_ns, frame_id=text(box.frame_id) or frame_id,
+                class_name=text(box.class_name), source_id=identity(box.source_id),
+            )
+            for box in boxes
+        ]  # fmt: skip
+        seen = Message3d(stamp_ns, stated).columns()
+        centre, turn, size = seen.boxes.centre, seen.boxes.orientation, seen.boxes.size
+        if not (np.isfinite(centre).all() and np.isfinite(turn).all()) or (size < 0).any():
+            raise ValueError("a box can't be so: places and turns are finite, and no size is negative")
+    return seen
 
 
 # Which channels have boxes
@@ -483,24 +456,24 @@ def named_boxes(opened: log.Log, topic: str, reading: Reading) -> NamedFrames:
     picture are scaled to its size. What is assumed is said.
     """
     where, choice = f"{opened.path}: {topic}", choice_for(opened, topic)
-    convert = lambda message: (picture_stamp_of(message), reading.read(message))  # noqa: E731
-    log_ns, stamps_ns, boxes, ends = list[int](), list[int | None](), list[Box](), [0]
-    for message, (stamp_ns, of_message) in decoded_messages(
-        opened, topic, lambda kind: decoder_with_errors(kind, convert), (None, ())
-    ):
-        log_ns.append(message.t_ns)
-        stamps_ns.append(stamp_ns)
-        boxes += of_message
-        ends.append(len(boxes))
-    t_ns, pictures, clock = _times_of_pictures(opened, topic, log_ns, stamps_ns)
-    texts = [box.class_name or reading.class_name or "" for box in boxes]
-    classes = classes_of(opened, topic, reading, texts)
-    columns = np.array([box[:5] for box in boxes], np.float64).reshape(-1, 5)
-    size = _size_stated(choice) or picture_size_near(opened, topic, pictures)
-    scale = scale_boxes(where, columns[:, :4], size)
-    rows = DETECTIONS.rows(
-        class_id=classes.ids, **dict(zip(("x_px", "y_px", "w_px", "h_px", "score"), columns.T, strict=True))
+    log_ns, parts, unread = read_channel(
+        opened, topic, lambda messages: (picture_stamps(messages), reading.read(messages)), reading.paths
     )
+    unread.warn("it counts as empty")
+    stamp_ns = np.zeros(len(log_ns), np.int64)
+    for which, (stamps_ns, _) in parts:
+        stamp_ns[which] = stamps_ns
+    boxes = joined([NO_BOXES, *(seen._replace(message=which[seen.message]) for which, (_, seen) in parts)])
+    t_ns, pictures, clock = _times_of_pictures(opened, topic, log_ns.tolist(), stamp_ns.tolist())
+    classes = classes_of(opened, topic, reading, [name or reading.class_name for name in boxes.class_name])
+    size = _size_stated(choice) or picture_size_near(opened, topic, pictures)
+    scale = scale_boxes(where, boxes.sides, size)
+    rows = DETECTIONS.rows(
+        class_id=classes.ids,
+        score=boxes.score,
+        **dict(zip(("x_px", "y_px", "w_px", "h_px"), boxes.sides.T, strict=True)),
+    )
+    ends = np.searchsorted(boxes.message, np.arange(len(log_ns) + 1))
     order = np.argsort(t_ns, kind="stable").tolist()
     frames = [Frame(t_ns[at], index, rows[ends[at] : ends[at + 1]]) for index, at in enumerate(order)]
     return NamedFrames(
@@ -587,27 +560,29 @@ def _pictures_near(opened: log.Log, topic: str) -> list[str]:
     return sorted(topics, key=lambda other: (-shared_parts(other, topic), other))
 
 
-def picture_stamp_of(message: Any) -> int | None:
-    """The stamp in ns of the picture of a message: of its ``image_header`` (darknet), or its own; None if unset."""
-    about = getattr(message, "image_header", None)
-    try:
-        stamp_ns = stamp_of(message) if about is None else stamp_of(SimpleNamespace(header=about))
-    except (AttributeError, TypeError, ValueError):
-        return None
-    return stamp_ns or None
+def picture_stamps(messages: Things) -> Ints:
+    """The stamps in ns of the pictures that messages are about (M,): of their ``image_header`` (darknet), or their own;
+    0 where there is none.
+    """
+    paths = (("image_header", "stamp"), ("timestamp",), ("header", "stamp"))
+    with suppress(AttributeError, TypeError, ValueError):
+        return next(
+            (messages.stamps(path) for path in paths if messages.has(path[:1])), np.zeros(len(messages), np.int64)
+        )
+    return np.zeros(len(messages), np.int64)
 
 
 def _times_of_pictures(
-    opened: log.Log, topic: str, log_ns: Sequence[int], stamps_ns: Sequence[int | None]
+    opened: log.Log, topic: str, log_ns: Sequence[int], stamps_ns: Sequence[int]
 ) -> tuple[Sequence[int], str, str]:
-    """The log times of the pictures that boxes are about, by their stamps, the channel of these pictures, and the
-    clock.
+    """The log times of the pictures that boxes are about, by their stamps (0 where there is none), the channel of these
+    pictures, and the clock.
 
     Their own log times if no channel has such pictures. A picture that was not recorded is as late as the others.
     """
     from mcaptrack.sources.foreign.picture_messages import stamps
 
-    if all(stamp in (None, at_ns) for stamp, at_ns in zip(stamps_ns, log_ns, strict=True)):
+    if all(stamp in (0, at_ns) for stamp, at_ns in zip(stamps_ns, log_ns, strict=True)):
         return log_ns, "", "log times"
     for pictures in _pictures_near(opened, topic):
         try:
@@ -617,42 +592,12 @@ def _times_of_pictures(
         except McaptrackError:
             continue  # pictures that can't be read have no stamps
         at = dict(zip(reversed(taken_ns.tolist()), reversed(shown_ns.tolist()), strict=True))
-        if 2 * sum(stamp in at for stamp in stamps_ns) > len(stamps_ns):
+        if 2 * sum(stamp in at for stamp in stamps_ns if stamp) > len(stamps_ns):
             late_ns = int(np.median(shown_ns - taken_ns))
             pairs = zip(stamps_ns, log_ns, strict=True)
-            t_ns = [own if stamp is None else at.get(stamp, max(stamp + late_ns, 0)) for stamp, own in pairs]
+            t_ns = [at.get(stamp, max(stamp + late_ns, 0)) if stamp else own for stamp, own in pairs]
             return t_ns, pictures, f"stamps of the pictures of {pictures}"
     late_s = np.median([(own - stamp) / NS_PER_S for stamp, own in zip(stamps_ns, log_ns, strict=True) if stamp])
     said = f"boxes are taken at their log times, {late_s:.3g} s after their stamps, which no picture has"
     warn(f"{opened.path}: {topic}: {said}", "clock")
     return log_ns, "", "log times"
-
-
-# Messages of a channel
-
-
-def decoded_messages(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]], empty: Any
-) -> Iterator[tuple[log.Message, Any]]:
-    """The messages of a channel with what the function that ``make`` makes for their type gives.
-
-    Messages that can't be read count as ``empty``, with a warning. Raises McaptrackError, with topic and time, if most
-    can't.
-    """
-    decode = payload_decoder(opened, topic, make)
-    return _read_messages(opened, topic, decode, empty)
-
-
-def _read_messages(
-    opened: log.Log, topic: str, decode: Callable[[bytes], Any], empty: Any
-) -> Iterator[tuple[log.Message, Any]]:
-    unread = UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
-    for message in opened.timed(topic):
-        unread.count(1)
-        try:
-            decoded = decode(message.payload)
-        except McaptrackError as error:
-            unread.add(message.t_ns, str(error))
-            decoded = empty
-        yield message, decoded
-    unread.warn("it counts as empty")

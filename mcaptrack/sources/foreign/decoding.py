@@ -67,7 +67,7 @@ def unpacker(kind: MessageType) -> Unpack:
     if kind.encoding == MessageEncoding.Protobuf and plain.startswith("foxglove."):
         return lambda payload: foxglove.unpack(plain, payload)
     if kind.encoding == MessageEncoding.Protobuf:
-        return protobuf_unpacker(kind)
+        return protobuf_class(kind).FromString  # type: ignore[no-any-return]
     if kind.encoding == MessageEncoding.JSON:
         return lambda payload: json.loads(payload, object_hook=lambda fields: SimpleNamespace(**fields))
     if kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR):
@@ -75,11 +75,6 @@ def unpacker(kind: MessageType) -> Unpack:
     raise McaptrackError(
         f"{kind.name} in the encoding {kind.encoding or 'unknown'!r} is not read; {', '.join(ENCODINGS)} are"
     )
-
-
-def protobuf_unpacker(kind: MessageType) -> Unpack:
-    """A decoder for protobuf, by the definition in the log."""
-    return protobuf_class(kind).FromString  # type: ignore[no-any-return]
 
 
 def protobuf_class(kind: MessageType) -> Any:
@@ -132,7 +127,11 @@ _LIMIT_NS: Final = 2**63
 
 def stamp_of(message: Any) -> int:
     """The stamp of a message in nanoseconds: ``timestamp`` in Foxglove messages, ``header.stamp`` in ROS messages."""
-    stamp = message.timestamp if hasattr(message, "timestamp") else message.header.stamp
+    return time_of(message.timestamp if hasattr(message, "timestamp") else message.header.stamp)
+
+
+def time_of(stamp: Any) -> int:
+    """A time in nanoseconds. Raises ValueError for what is none."""
     if isinstance(stamp, str):
         match = _RFC3339.fullmatch(stamp)
         if not match:

@@ -17,28 +17,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, reduce
 from itertools import count
-from math import cos, isfinite, nan, sin
-from operator import attrgetter
+from math import nan
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from mcap.well_known import MessageEncoding
 
-from mcaptrack.contracts import UNKNOWN_VECTOR, Box, Box3d, Quaternion, Vector
+from mcaptrack.contracts import Box3d, Quaternion, Vector
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.sources.foreign.decoding import (
-    integer,
-    number,
-    protobuf_unpacker,
-    stamp_of,
-    text,
-    to_bytes,
-)
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.sources.foreign.decoding import integer, number, protobuf_class, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.definitions import MessageType, ros_types
+from mcaptrack.sources.foreign.things import EACH, HEADS, Path, Things, heads
 
-Path = tuple[str, ...]
-#: The token of a list in a path: of things, or of guesses of their class.
-_EACH: Final = "[]"
 #: A quaternion of zeros: the orientation isn't stated.
 UNSTATED: Final[Quaternion] = (0.0, 0.0, 0.0, 0.0)
 #: Types are looked at up to this depth, and up to this number of messages in them.
@@ -66,7 +57,7 @@ class FieldShape(NamedTuple):
         here = self
         for token in path:
             if token.startswith("["):
-                if here.count is None or (token == _EACH and here.kind != "struct"):
+                if here.count is None or (token == EACH and here.kind != "struct"):
                     return None
                 here = here._replace(count=None)
                 continue
@@ -81,8 +72,7 @@ def shape_of_type(kind: MessageType) -> FieldShape | None:
     """The fields of a type by its definition in the log; None for JSON. Raises McaptrackError as ``unpacker`` does."""
     fields = count(1)  # a definition that is made to be endless is cut
     if kind.encoding == MessageEncoding.Protobuf:
-        from_string: Any = protobuf_unpacker(kind)
-        return _of_descriptor(from_string.__self__.DESCRIPTOR, 0, fields)
+        return _of_descriptor(protobuf_class(kind).DESCRIPTOR, 0, fields)
     if kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR):
         store, name = ros_types(kind)
         return _of_ros(store, name, 0, fields)
@@ -291,7 +281,7 @@ def _lists(shape: FieldShape, type_name: str) -> Iterator[tuple[Path, FieldShape
     for path, inner in insides:
         if inner.kind == "struct" and inner.count is not None:
             words = [*own, *(word for name in (*path, inner.name) for word in _words_in(name))]
-            yield (*path, _EACH), inner._replace(count=None), words
+            yield (*path, EACH), inner._replace(count=None), words
     yield (), shape, own
 
 
@@ -338,7 +328,7 @@ def _thing(things: Path, each: FieldShape, words: Sequence[str]) -> ThingFields 
 
 def _add_posed_guess(each: FieldShape, guess: Mapping[str, Path], paths: dict[str, list[Path]]) -> None:
     """Add the pose in a guess of what a thing is, for things that state no other."""
-    prefix = guess["class"][: guess["class"].index(_EACH) + 1] if guess and "position" in paths else ()
+    prefix = guess["class"][: guess["class"].index(EACH) + 1] if guess and "position" in paths else ()
     for key, path in _position(each.at(prefix) or _NOTHING, ()).items() if prefix else ():
         if key in paths:
             paths[key].append((*prefix, *path))
@@ -350,7 +340,7 @@ def _with_classes(each: FieldShape, fields: ThingFields) -> ThingFields:
     kind = each.at(path)
     if not path or kind is None:
         return fields
-    return replace(fields, names=_names_of(each, path), has_zero=_EACH in path or kind.kind == "text")
+    return replace(fields, names=_names_of(each, path), has_zero=EACH in path or kind.kind == "text")
 
 
 def _word(name: str) -> str:
@@ -453,7 +443,7 @@ def _guess(shape: FieldShape) -> dict[str, Path]:
             score = _fact(each, _SCORES, "number")
             own = _fact(each, words, "text") or _fact(each, words, "number")
             if score and own:
-                return {"class": (name, _EACH, *own), "score": (name, _EACH, *score)}
+                return {"class": (name, EACH, *own), "score": (name, EACH, *score)}
     return {}
 
 
@@ -467,7 +457,7 @@ def _names_of(each: FieldShape, path: Path) -> dict[int, str]:
         named = named or tuple((name[len(prefix) :], own) for name, own in owner.constants if name.startswith(prefix))
     numbers = [name for name, inner in owner.fields if inner == _NUMBER and _word(name) not in _SCORES]
     named = named or (owner.constants if numbers == [path[-1]] else ())
-    return {own: "" if name.lower() == "unknown" else name.lower() for name, own in named}
+    return {own: plain_class(name) for name, own in named}
 
 
 def _picture(shape: FieldShape, depth: int = 0) -> dict[str, Path]:
@@ -480,7 +470,7 @@ def _picture(shape: FieldShape, depth: int = 0) -> dict[str, Path]:
     name, corners = _members(shape).get("corners", ("", _NOTHING))
     for path in ((), ("kp",)) if corners.kind == "struct" and not out else ():
         if _axes(corners._replace(count=None).at(path)) == 2:
-            return {"corners": (name, _EACH, *path)}
+            return {"corners": (name, EACH, *path)}
     for word in _PICTURED if depth < 2 and not out else ():
         name, inner = _members(shape).get(word, ("", _NOTHING))
         if below := _picture(inner, depth + 1) if inner.is_struct else {}:
@@ -577,9 +567,9 @@ _ENOUGH: Final = (
 def _begin(shape: FieldShape, path: Path, lists: Sequence[Path]) -> tuple[Path, Path] | None:
     """The list of a path, and the path from a thing of it on; None if the type has no such field."""
     if shape.at(path) is not None:
-        if _EACH not in path:
+        if EACH not in path:
             return (), path
-        end = path.index(_EACH) + 1
+        end = path.index(EACH) + 1
         return path[:end], path[end:]
     return next(((things, path) for things in lists if shape.at((*things, *path)) is not None), None)
 
@@ -587,192 +577,228 @@ def _begin(shape: FieldShape, path: Path, lists: Sequence[Path]) -> tuple[Path, 
 # Messages to boxes
 
 
-@dataclass
-class Message3d:
-    """The boxes of a message, and a count of its other parts for each description of them.
-
-    ``is_measured`` is false for a message that only takes boxes away from a viewer: nothing was measured then.
+class Boxes2d(NamedTuple):
+    """Boxes in pictures: the number of the message of each (N,), ``sides`` (N, 4) as left, top, width and height in px,
+    ``score`` (N,), NaN where there is none, and ``class_name`` (N,).
     """
 
+    message: Ints
+    sides: Floats
+    score: Floats
+    class_name: Any
+
+
+NO_BOXES: Final = Boxes2d(np.empty(0, np.int64), np.empty((0, 4)), np.empty(0), np.empty(0, object))
+
+
+class Boxes3d(NamedTuple):
+    """Boxes in space: the number of the message of each (N,), and what ``Box3d`` has, as columns."""
+
+    message: Ints
+    stamp_ns: Ints
+    frame_id: Any
+    centre: Floats
+    orientation: Floats
+    size: Floats
+    class_name: Any
+    score: Floats
+    source_id: Any
+    velocity: Floats
+    has_heading: Bools
+
+
+#: The types of these columns, and how many numbers each box has of them.
+_COLUMNS: Final = (
+    (np.int64, ()), (object, ()), (float, (3,)), (float, (4,)), (float, (3,)), (object, ()), (float, ()), (object, ()),
+    (float, (3,)), (bool, ()),
+)  # fmt: skip
+
+
+class Seen3d(NamedTuple):
+    """The contents of M messages: their stamps, 0 where there is none, boxes, and counts of other parts by kind.
+
+    ``is_measured`` (M,) is false for messages that only take boxes away from a viewer: nothing was measured then.
+    """
+
+    stamp_ns: Ints
+    is_measured: Bools
+    boxes: Boxes3d
+    ignored: Mapping[str, int]
+
+
+@dataclass
+class Message3d:
+    """The boxes of a message that is read as an object; as ``Seen3d``."""
+
     stamp_ns: int
-    frame_id: str
     boxes: list[Box3d] = field(default_factory=list)
     ignored: dict[str, int] = field(default_factory=dict)
     is_measured: bool = True
 
+    def columns(self) -> Seen3d:
+        """The same as columns."""
+        values = list(zip(*self.boxes, strict=True)) or [()] * len(_COLUMNS)
+        kinds = zip(values, _COLUMNS, strict=True)
+        columns = [np.array(of, kind).reshape(len(self.boxes), *shape) for of, (kind, shape) in kinds]
+        boxes = Boxes3d(np.zeros(len(self.boxes), np.int64), *columns)
+        return Seen3d(np.array([self.stamp_ns], np.int64), np.array([self.is_measured]), boxes, self.ignored)
 
-#: What a type's fields don't tell: a box as it is meant, by its thing; None if it is to be left out.
-Adjust = Callable[[Any, Box3d], Box3d | None]
+
+#: What a type's fields don't tell: boxes as they are meant, by their things; those that are no measurements left out.
+Adjust = Callable[[Things, Boxes3d], Boxes3d]
 
 
 _ENDED: Final = "boxes of tracks that have ended"
 
 
 class FieldReader:
-    """Takes messages to boxes, by the paths of their fields."""
+    """Takes messages to boxes, by the paths of their fields; ``adjust`` also reads fields of a thing."""
 
-    def __init__(self, fields: ThingFields, in_space: bool, adjust: Adjust | None = None) -> None:
-        self.fields, self.in_space, self._adjust = fields, in_space, adjust
-        self._get = {key: [_getter(path) for path in paths] for key, paths in fields.paths.items()}
+    def __init__(self, fields: ThingFields, adjust: Adjust | None = None, also: str = "") -> None:
+        self.fields, self.in_space, self._adjust = fields, fields.in_space, adjust
+        each = [("header",), *map(_tokens, also.split()), *(path for paths in fields.paths.values() for path in paths)]
+        self.paths: list[Path] = [*HEADS, ("image_header",)]
+        self.paths += [(*fields.things, *path) for path in each]
 
-    def read(self, message: Any) -> list[Box] | Message3d:
-        """The boxes of a message."""
-        return self.in_frame(message) if self.in_space else self.in_picture(message)
+    def read(self, messages: Things) -> Boxes2d | Seen3d:
+        """The boxes of messages."""
+        return self.in_frame(messages) if self.in_space else self.in_picture(messages)
 
-    def in_picture(self, message: Any) -> list[Box]:
-        """The boxes of a message in a picture."""
-        return [self._box(thing) for thing in things_of(message, self.fields.things)]
-
-    def in_frame(self, message: Any) -> Message3d:
-        """The boxes of a message in space."""
-        things = things_of(message, self.fields.things)
-        head = message_head(message, things)
-        out = Message3d(*head)
-        for thing in things:
-            box = self._box_3d(thing, head)
-            if self._adjust and (box := self._adjust(thing, box)) is None:  # type: ignore[assignment]
-                out.ignored[_ENDED] = out.ignored.get(_ENDED, 0) + 1
-            else:
-                out.boxes.append(box)
-        return out
-
-    def _value(self, thing: Any, key: str) -> Any:
-        return self._get[key][0](thing) if key in self._get else None
-
-    def _number(self, thing: Any, key: str) -> float:
-        return number(self._value(thing, key))
-
-    def _numbers(self, thing: Any, keys: str) -> list[float]:
-        """Numbers that a thing has to have. Raises AttributeError for one that JSON leaves out."""
-        values = [self._value(thing, key) for key in keys.split()]
-        if None in values:
-            raise AttributeError(name=_joined(self.fields.paths[keys.split()[values.index(None)]][0]))
-        return [number(value) for value in values]
-
-    def _box(self, thing: Any) -> Box:
-        """A box in a picture: upright around what the message states."""
-        name, score = self._class(thing)
-        if "corners" in self._get:
-            path = self.fields.paths["corners"][0]
-            rest = _getter(path[path.index(_EACH) + 1 :])
-            points = [vector(rest(corner)) for corner in things_of(thing, path[: path.index(_EACH) + 1])]
-            (x, y, _), (w, h, _) = around(points or [UNKNOWN_VECTOR])
-            left, top = x - w / 2, y - h / 2
-        elif "cx" in self._get:
-            x, y, w, h = self._numbers(thing, "cx cy w h")
-            theta = number(self._value(thing, "theta") or 0.0)
-            check_box(x, y, w, h, theta)
-            w, h = (abs(w * cos(theta)) + abs(h * sin(theta)), abs(w * sin(theta)) + abs(h * cos(theta)))
-            left, top = x - w / 2, y - h / 2
-        elif "right" in self._get:
-            left, top, right, bottom = self._numbers(thing, "left top right bottom")
-            w, h = right - left, bottom - top
+    def in_picture(self, messages: Things) -> Boxes2d:
+        """The boxes of messages in pictures, upright around what they state. Raises ValueError for impossible ones."""
+        owner, things = messages.members(self.fields.things)
+        names, score = self._classes(things)
+        if corners := self._path("corners"):
+            inside = corners.index(EACH) + 1
+            of, points = things.members(corners[:inside])
+            middle, size = around(points.vectors(corners[inside:]), of, len(things))
+            sides = np.concatenate([middle - size / 2, size], axis=1)[:, [0, 1, 3, 4]]
+        elif "cx" in self.fields.paths:
+            x, y, w, h = (self._numbers(things, key) for key in ("cx", "cy", "w", "h"))
+            theta = self._numbers(things, "theta") if "theta" in self.fields.paths else np.zeros(len(things))
+            theta = np.where(np.isnan(theta), 0.0, theta)
+            check_boxes(np.stack([x, y, w, h], axis=1), theta)
+            cos, sin = np.abs(np.cos(theta)), np.abs(np.sin(theta))
+            w, h = w * cos + h * sin, w * sin + h * cos
+            sides = np.stack([x - w / 2, y - h / 2, w, h], axis=1)
         else:
-            left, top, w, h = self._numbers(thing, "left top w h")
-        check_box(left, top, w, h)
-        return Box(left, top, w, h, score, name)
+            left, top, right, bottom, w, h = (
+                self._numbers(things, key) for key in ("left", "top", "right", "bottom", "w", "h")
+            )
+            if "right" in self.fields.paths:
+                w, h = right - left, bottom - top
+            sides = np.stack([left, top, w, h], axis=1)
+        check_boxes(sides)
+        return Boxes2d(owner, sides, score, names)
 
-    def _box_3d(self, thing: Any, head: tuple[int, str]) -> Box3d:
-        name, score = self._class(thing)
-        centre, orientation = self._pose(thing)
-        has_heading = "orientation" in self._get
-        if "heading" in self._get and isfinite(heading := self._number(thing, "heading")):
-            orientation, has_heading = (0.0, 0.0, sin(heading / 2), cos(heading / 2)), True
-        stamp_ns, frame_id = own_head(thing, head)
-        diameter = 2 * self._number(thing, "radius")
-        x, y, z = self._vector(thing, "velocity", "vx vy vz")
-        return Box3d(
-            stamp_ns,
-            text(self._value(thing, "frame") or "") or frame_id,
+    def in_frame(self, messages: Things) -> Seen3d:
+        """The boxes of messages in space."""
+        owner, things = messages.members(self.fields.things)
+        stamp_ns, frame_id = message_heads(messages, owner, things)
+        own_ns, own_frame = _own_heads(things, stamp_ns[owner], frame_id[owner])
+        if path := self._path("frame"):
+            stated = things.texts(path)
+            own_frame = np.where(stated != "", stated, own_frame)
+        names, score = self._classes(things)
+        centre, orientation = self._pose(things)
+        heading = self._numbers(things, "heading")
+        is_turned = np.isfinite(heading)
+        half = heading[is_turned] / 2
+        orientation[is_turned] = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+        size = self._vectors(things, "size", ("length", "width", "height"))
+        if "radius" in self.fields.paths:
+            size = np.outer(self._numbers(things, "radius"), [2.0, 2.0, nan])
+        velocity = self._vectors(things, "velocity", ("vx", "vy", "vz"))
+        is_flat = np.isfinite(velocity[:, :2]).all(axis=1) & ~np.isfinite(velocity[:, 2])
+        velocity[is_flat, 2] = 0.0  # along the ground where there is no z
+        ids = things.values(path) if (path := self._path("id")) else [None] * len(things)
+        boxes = Boxes3d(
+            owner,
+            own_ns,
+            own_frame,
             centre,
             orientation,
-            (diameter, diameter, nan) if "radius" in self._get else self._vector(thing, "size", "length width height"),
-            name,
+            size,
+            names,
             score,
-            _identity(self._value(thing, "id")),
-            (x, y, 0.0 if isfinite(x + y) and not isfinite(z) else z),  # along the ground where there is no z
-            has_heading,
+            np.array(list(map(identity, ids)), object),
+            velocity,
+            is_turned | ("orientation" in self.fields.paths),
         )
+        if self._adjust:
+            boxes = self._adjust(things, boxes)
+        ended = len(owner) - len(boxes.message)
+        return Seen3d(stamp_ns, np.ones(len(messages), bool), boxes, {_ENDED: ended} if ended else {})
 
-    def _pose(self, thing: Any) -> tuple[Vector, Quaternion]:
-        """Position and orientation of a thing; those of its first guess where only these are filled in."""
-        if "position" not in self._get:
-            x, y = self._numbers(thing, "x y")
-            return (x, y, self._number(thing, "z")), UNSTATED
-        turns = self._get.get("orientation", [])
-        out: list[tuple[Vector, Quaternion]] = []
-        for at, place in enumerate(self._get["position"]):
-            if (value := place(thing)) is not None:
-                out.append((vector(value), quaternion(turns[at](thing)) if at < len(turns) else UNSTATED))
-                if any(out[-1][0]):
-                    return out[-1]
-        if not out:
-            raise AttributeError(name=_joined(self.fields.paths["position"][0]) or "x")
-        return out[0]
+    def _path(self, key: str) -> Path | None:
+        paths = self.fields.paths.get(key)
+        return paths[0] if paths else None
 
-    def _vector(self, thing: Any, key: str, flat: str) -> Vector:
-        if key in self._get:
-            value = self._value(thing, key)
-            return UNKNOWN_VECTOR if value is None else vector(value)
-        x, y, z = (self._number(thing, name) for name in flat.split())
-        return x, y, z
+    def _numbers(self, things: Things, key: str) -> Floats:
+        path = self._path(key)
+        return np.full(len(things), nan) if path is None else things.numbers(path)
 
-    def _class(self, thing: Any) -> tuple[str, float]:
-        """The class of a thing, and its score: its own, or of the likeliest guess of its class."""
-        own, score = self.fields.class_name, self._number(thing, "score")
-        path = self.fields.paths.get("class", [()])[0]
-        if _EACH in path:
-            share, value = self._likeliest(thing, path)
-            score = score if score > 0 else share
+    def _vectors(self, things: Things, key: str, flat: Sequence[str]) -> Floats:
+        path = self._path(key)
+        if path is not None:
+            return things.vectors(path)
+        return np.stack([self._numbers(things, name) for name in flat], axis=1)
+
+    def _pose(self, things: Things) -> tuple[Floats, Floats]:
+        """Positions and orientations of things; those of their first guess where only these are filled in."""
+        turns = self.fields.paths.get("orientation", ())
+        centre, turn = self._vectors(things, "position", ("x", "y", "z")), np.zeros((len(things), 4))
+        for order, place in enumerate(self.fields.paths.get("position", ())):
+            values, is_missing = things.vectors(place), np.isnan(centre).all(axis=1)
+            is_better = is_missing | ((centre == 0).all(axis=1) & (values != 0).any(axis=1))
+            is_better = (is_better & ~np.isnan(values).all(axis=1)) | (order == 0)
+            centre[is_better], turn[is_better] = values[is_better], 0.0
+            if order < len(turns):
+                is_stated = is_better & things.is_set(turns[order])
+                turn[is_stated] = things.vectors(turns[order], "xyzw")[is_stated]
+        return centre, turn
+
+    def _classes(self, things: Things) -> tuple[Any, Floats]:
+        """The class of each thing, and its score: its own, or of the likeliest guess of its class."""
+        score, path = self._numbers(things, "score"), self._path("class")
+        if path is None:
+            return np.full(len(things), self.fields.class_name, object), score
+        if EACH in path:
+            share, values = self._likeliest(things, path)
+            score = np.where(score > 0, score, share)
         else:
-            value = self._value(thing, "class")
+            values = things.values(path)
+        return np.array(list(map(self._class_name, values)), object), score
+
+    def _class_name(self, value: Any) -> str:
         if value is None:
-            return own, score
-        if isinstance(value, str):
-            return value.strip(), score
-        return self.fields.names.get(integer(value), str(integer(value))), score
+            return self.fields.class_name
+        if not isinstance(value, str):
+            return self.fields.names.get(integer(value), str(integer(value)))
+        return plain_class(value) if self.fields.names else value.strip()  # enumerations of protobuf are by name
 
-    def _likeliest(self, thing: Any, path: Path) -> tuple[float, Any]:
+    def _likeliest(self, things: Things, path: Path) -> tuple[Floats, list[Any]]:
         """The highest score of guesses that is a number, and the class with it; NaN and None if there is no guess."""
-        after = path.index(_EACH) + 1
-        of_class, of_score = _getter(path[after:]), _getter(self.fields.paths["guess"][0][after:])
-        scored = [(number(of_score(guess)), of_class(guess)) for guess in things_of(thing, path[:after])]
-        finite = [pair for pair in scored if isfinite(pair[0])]
-        score, best = max(finite or scored, key=lambda pair: pair[0], default=(nan, None))
-        return score if finite else nan, best
+        inside = path.index(EACH) + 1
+        owner, guesses = things.members(path[:inside])
+        scores = guesses.numbers(self.fields.paths["guess"][0][inside:])
+        finite = np.where(np.isfinite(scores), scores, -np.inf)
+        order = np.lexsort((-finite, owner))
+        with_guess, first = np.unique(owner[order], return_index=True)
+        best, values = order[first], guesses.values(path[inside:])
+        share, classes = np.full(len(things), nan), [None] * len(things)
+        share[with_guess] = np.where(np.isfinite(finite[best]), finite[best], nan)
+        for thing, place in zip(with_guess.tolist(), best.tolist(), strict=True):
+            classes[thing] = values[place]
+        return share, classes
 
 
-def things_of(message: Any, path: Path) -> Sequence[Any]:
-    """The members of a list; the message itself where the path is ()."""
-    if not path:
-        return [message]
-    return _getter(path[:-1])(message) or ()
+def plain_class(name: str) -> str:
+    """The class of a constant: its name in lower case, "" for what says that it is unknown."""
+    return "" if name.lower() == "unknown" else name.lower()
 
 
-@lru_cache(maxsize=1024)
-def _getter(path: Path) -> Callable[[Any], Any]:
-    """A function that takes a message to the value at a path; None where JSON leaves it out.
-
-    Of lists the first member counts.
-    """
-    if not path:
-        return lambda message: message
-    steps = [int(token[1:-1] or 0) if token.startswith("[") else attrgetter(token) for token in path]
-    if all(map(callable, steps)):
-        steps = [attrgetter(".".join(path))]
-
-    def get(message: Any) -> Any:
-        try:
-            for step in steps:
-                message = step(message) if callable(step) else message[step]
-        except (AttributeError, IndexError, TypeError):
-            return None
-        return message
-
-    return get
-
-
-def _identity(value: Any) -> int | str | None:
+def identity(value: Any) -> int | str | None:
     """An id: a number, a text, or the hexadecimal digits of a UUID; None if there is none."""
     if value is None or isinstance(value, str):
         return value or None
@@ -781,13 +807,25 @@ def _identity(value: Any) -> int | str | None:
     return integer(value)
 
 
-def message_head(message: Any, things: Sequence[Any]) -> tuple[int, str]:
-    """Stamp in ns and frame of a message: of its header, its own, or those of its first thing."""
-    if hasattr(message, "header"):
-        return head_of(message)
-    if hasattr(message, "timestamp"):
-        return stamp_of(message), text(part(message, "frame_id") or "")
-    return head_of(things[0]) if things and hasattr(things[0], "header") else (0, "")
+def message_heads(messages: Things, owner: Ints, things: Things) -> tuple[Ints, Any]:
+    """Stamps in ns and frames of messages (M,): of their headers, their own, or those of their first things."""
+    if messages.has(("header",)) or messages.has(("timestamp",)):
+        return heads(messages)
+    stamp_ns, frame_id = np.zeros(len(messages), np.int64), np.full(len(messages), "", object)
+    if things.has(("header",)):
+        with_things, first = np.unique(owner, return_index=True)
+        stamp_ns[with_things] = things.stamps(("header", "stamp"))[first]
+        frame_id[with_things] = things.texts(("header", "frame_id"))[first]
+    return stamp_ns, frame_id
+
+
+def _own_heads(things: Things, stamp_ns: Ints, frame_id: Any) -> tuple[Ints, Any]:
+    """Stamps and frames of things (N,): their own, or, where they state no frame, those of the messages around them."""
+    if not things.has(("header",)):
+        return stamp_ns, frame_id
+    own_ns, own_frame = things.stamps(("header", "stamp")), things.texts(("header", "frame_id"))
+    is_own = own_frame != ""
+    return np.where(is_own & (own_ns != 0), own_ns, stamp_ns), np.where(is_own, own_frame, frame_id)
 
 
 def head_of(message: Any) -> tuple[int, str]:
@@ -795,24 +833,13 @@ def head_of(message: Any) -> tuple[int, str]:
     return stamp_of(message), text(message.header.frame_id)
 
 
-def own_head(message: Any, around: tuple[int, str]) -> tuple[int, str]:
-    """Stamp and frame of a part of a message: its own, or, where it states no frame, those of the message around it."""
-    if not hasattr(message, "header"):
-        return around
-    stamp_ns, frame_id = head_of(message)
-    return (stamp_ns or around[0], frame_id) if frame_id else around
-
-
 def vector(value: Any) -> Vector:
-    """A point or vector, or an array of numbers; the origin where it is missing, as protobuf leaves out zeros.
+    """A point or vector; the origin where it is missing, as protobuf leaves out zeros.
 
     A point without z has NaN, which is unknown.
     """
     if value is None:
         return 0.0, 0.0, 0.0
-    if isinstance(value, np.ndarray | list | tuple):
-        x, y, z = (*map(float, value[:3]), nan, nan, nan)[:3]
-        return x, y, z
     return number(value.x), number(value.y), number(value.z) if hasattr(value, "z") else nan
 
 
@@ -826,36 +853,35 @@ def part(message: Any, name: str) -> Any:
     return getattr(message, name, None)
 
 
-def rotated(orientation: Quaternion, point: Vector) -> Vector:
-    """A point turned by a quaternion; as it is by one of zeros."""
-    x, y, z, w = orientation
+def rotated(orientation: Floats, points: Floats) -> Floats:
+    """Points (N, 3) turned by quaternions (N, 4), or by one (4,); as they are by those of zeros."""
+    x, y, z, w = np.broadcast_to(orientation, (len(points), 4)).T
     norm = x * x + y * y + z * z + w * w
-    if not norm or not isfinite(norm):
-        return point
-    a, b, c = point
+    a, b, c = points.T
     # p + 2 w (q x p) + 2 q x (q x p), for a quaternion that need not have length 1
     u, v, t = y * c - z * b, z * a - x * c, x * b - y * a
-    return (
-        a + 2 * (w * u + y * t - z * v) / norm,
-        b + 2 * (w * v + z * u - x * t) / norm,
-        c + 2 * (w * t + x * v - y * u) / norm,
-    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        turned = (
+            a + 2 * (w * u + y * t - z * v) / norm,
+            b + 2 * (w * v + z * u - x * t) / norm,
+            c + 2 * (w * t + x * v - y * u) / norm,
+        )
+    is_turned = np.isfinite(norm) & (norm != 0)
+    return np.where(is_turned[:, None], np.stack(turned, axis=1), points)
 
 
-def moved(centre: Vector, orientation: Quaternion, point: Vector) -> Vector:
-    """A point of a box or group, given along its axes, in the frame of the box."""
-    x, y, z = rotated(orientation, point)
-    return centre[0] + x, centre[1] + y, centre[2] + z
+def around(points: Floats, owner: Ints, count: int) -> tuple[Floats, Floats]:
+    """Middle and size (N, 3) of the boxes around the points (K, 3) of each of N owners (K,); NaN without points."""
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, owner, points)
+    np.maximum.at(high, owner, points)
+    low[low > high] = nan
+    return (low + high) / 2, high - low
 
 
-def around(points: Sequence[Vector]) -> tuple[Vector, Vector]:
-    """Middle and size of the box around points, along their axes. There has to be one at least."""
-    low, high = (tuple(pick(point[axis] for point in points) for axis in range(3)) for pick in (min, max))
-    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2)
-    return middle, (high[0] - low[0], high[1] - low[1], high[2] - low[2])
-
-
-def check_box(x: float, y: float, w: float, h: float, theta: float = 0.0) -> None:
-    """Raise ValueError for a box that can't be."""
-    if not all(isfinite(value) for value in (x, y, theta, w, h)) or w < 0 or h < 0:
+def check_boxes(sides: Floats, turn: Floats | float = 0.0) -> None:
+    """Raise ValueError for a box (N, 4), as left or middle, top or middle, width and height, that can't be."""
+    can_be = np.isfinite(sides).all(axis=1) & np.isfinite(turn) & (sides[:, 2:] >= 0).all(axis=1)
+    if not can_be.all():
+        x, y, w, h = sides[int(np.argmin(can_be))]
         raise ValueError(f"a box can't be {w:g} x {h:g} at ({x:g}, {y:g})")

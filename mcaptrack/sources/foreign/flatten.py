@@ -22,7 +22,6 @@ from mcaptrack.sources.foreign.decoding import (
     decoder_with_errors,
     frame_named,
     protobuf_class,
-    protobuf_unpacker,
     unpacker,
 )
 from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defined, ros_types
@@ -92,7 +91,7 @@ class UnreadMessages:
         self._first = min(self._first, (t_ns, why)) if self._unread else (t_ns, why)
         self._unread += 1
         if self._unread == self._total or (self._unread > _MOST_UNREAD and 2 * self._unread > self._seen):
-            raise McaptrackError(f"{self._where}{self}")
+            raise McaptrackError(str(self))
 
     def lose(self, messages: int, why: str) -> None:
         """Count messages in a damaged chunk. Raises McaptrackError if all are."""
@@ -104,14 +103,16 @@ class UnreadMessages:
     def warn(self, so: str) -> None:
         """Warn of them, if there are any, and ``so`` of what follows."""
         if self._unread:
-            warn(f"{self._where}{self}; {so}", "lost")
+            warn(f"{self}; {so}", "lost")
         if self._lost:
             where = f"{self._lost} of {self._total} messages are in damaged chunks ({self._damage})"
             warn(f"{self._where}: {where}; {so}", "lost")
 
     def __str__(self) -> str:
+        if not self._unread:
+            return ""
         many = f"; {self._unread} of {self._seen} messages are like this" if self._unread > 1 else ""
-        return f" at {self._first[0]} ns: {self._first[1]}{many}"
+        return f"{self._where} at {self._first[0]} ns: {self._first[1]}{many}"
 
 
 def payload_decoder(
@@ -182,7 +183,7 @@ def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
     if kind.encoding == MessageEncoding.JSON:
         return json.loads
     if kind.encoding == MessageEncoding.Protobuf:
-        return protobuf_unpacker(kind)
+        return protobuf_class(kind).FromString  # type: ignore[no-any-return]
     return unpacker(kind)
 
 

@@ -2,22 +2,25 @@
 
 A type that isn't here is read by its fields all the same, which is said. A line says nothing but that names of fields
 don't mislead, or names the fields that do, the classes behind numbers (for JSON, which has no constants), or a function
-that takes a box as the fields have it, with its thing, to the box as it is meant.
+that takes boxes as the fields have them, with their things, to boxes as they are meant.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import isnan, nan
-from typing import Any, Final, NamedTuple
+from math import nan
+from typing import Final, NamedTuple
 
-from mcaptrack.contracts import UNKNOWN_VECTOR, Box3d, Vector
-from mcaptrack.sources.foreign.decoding import integer, number
-from mcaptrack.sources.foreign.fields import Adjust, around, moved, part, rotated, vector
+import numpy as np
+
+from mcaptrack.geometry.arrays import Floats, taken
+from mcaptrack.sources.foreign.fields import Adjust, Boxes3d, around, rotated
+from mcaptrack.sources.foreign.things import EACH, Things
 
 
 class Known(NamedTuple):
-    """A type: ``fields`` as for ``map=``, from a thing on; ``classes`` from 0 on; and what a box of it means.
+    """A type: ``fields`` as for ``map=``, from a thing on; ``classes`` from 0 on; and what boxes of it mean, for which
+    ``also`` are read: paths of fields with blanks between them.
 
     ``has_coco`` says that numbers of classes are those of COCO.
     """
@@ -25,14 +28,20 @@ class Known(NamedTuple):
     fields: str = ""
     classes: str = ""
     adjust: Adjust | None = None
+    also: str = ""
     has_coco: bool = False
+
+
+def _stated(score: Floats) -> Floats:
+    """Scores (N,), NaN for those of 0, where no value is set."""
+    return np.where(score == 0, nan, score)
 
 
 # jsk_recognition_msgs
 
 
-def _jsk(_: Any, box: Box3d) -> Box3d:
-    return box._replace(score=box.score or nan)  # 0 where no value is set
+def _jsk(_: Things, boxes: Boxes3d) -> Boxes3d:
+    return boxes._replace(score=_stated(boxes.score))
 
 
 # derived_object_msgs
@@ -41,36 +50,35 @@ def _jsk(_: Any, box: Box3d) -> Box3d:
 _CERTAIN: Final = 255
 #: The level of detection from which the velocity is known.
 _TRACKED: Final = 1
-#: The types of shape_msgs/SolidPrimitive.
-_BOX, _SPHERE, _CYLINDER, _CONE = 1, 2, 3, 4
+#: The types of shape_msgs/SolidPrimitive, with the places of length, width and height among their dimensions, and by
+#: which factors: cylinders and cones have height and radius.
+_SHAPES: Final = {
+    1: ((0, 1, 2), (1, 1, 1)),
+    2: ((0, 0, 0), (2, 2, 2)),
+    3: ((1, 1, 0), (2, 2, 1)),
+    4: ((1, 1, 0), (2, 2, 1)),
+}
 
 
-def _shape_size(shape: Any) -> Vector:
-    """The size of the box around a shape; NaN if it has none."""
-    kind, lengths = integer(shape.type), [number(dimension) for dimension in shape.dimensions]
-    if kind == _BOX and len(lengths) >= 3:
-        return lengths[0], lengths[1], lengths[2]
-    if kind == _SPHERE and lengths:
-        return 2 * lengths[0], 2 * lengths[0], 2 * lengths[0]
-    if kind in (_CYLINDER, _CONE) and len(lengths) >= 2:  # height and radius
-        return 2 * lengths[1], 2 * lengths[1], lengths[0]
-    return UNKNOWN_VECTOR
-
-
-def _derived(seen: Any, box: Box3d) -> Box3d:
+def _derived(things: Things, boxes: Boxes3d) -> Boxes3d:
     """Objects without a shape, as of radars, have the size of their polygon, or none."""
-    size, centre = _shape_size(seen.shape), box.centre
-    if isnan(size[0]) and (points := [vector(point) for point in part(part(seen, "polygon"), "points") or ()]):
-        x, y, z, w = box.orientation
-        along = [rotated((-x, -y, -z, w), point) for point in points]  # the polygon is in the frame of the message
-        middle, (length, width, _) = around(along)
-        centre, size = rotated(box.orientation, middle), (length, width, nan)
-    is_tracked = integer(seen.detection_level) == _TRACKED
-    return box._replace(
+    kind, dimensions = things.numbers(("shape", "type")), things.vectors(("shape", "dimensions"))
+    size, centre = np.full_like(boxes.size, nan), boxes.centre.copy()
+    for number, (places, factors) in _SHAPES.items():
+        size[kind == number] = dimensions[kind == number][:, places] * factors
+    size[np.isnan(size).any(axis=1)] = nan
+    owner, points = things.members(("polygon", "points", EACH))
+    back = boxes.orientation[owner] * [-1, -1, -1, 1]
+    middle, extent = around(rotated(back, points.vectors(())), owner, len(things))  # it is in the frame of the message
+    is_outlined = np.isnan(size[:, 0]) & np.isfinite(middle).all(axis=1)
+    centre[is_outlined] = rotated(boxes.orientation, middle)[is_outlined]
+    size[is_outlined] = extent[is_outlined] * [1, 1, nan]
+    is_tracked = things.numbers(("detection_level",)) == _TRACKED
+    return boxes._replace(
         centre=centre,
         size=size,
-        score=box.score / _CERTAIN if box.score else nan,
-        velocity=box.velocity if is_tracked else UNKNOWN_VECTOR,
+        score=_stated(boxes.score) / _CERTAIN,
+        velocity=np.where(is_tracked[:, None], boxes.velocity, nan),
     )
 
 
@@ -79,24 +87,28 @@ def _derived(seen: Any, box: Box3d) -> Box3d:
 _ROUND, _POLYGON, _HEADING_UNKNOWN = 1, 2, 0
 
 
-def _autoware(item: Any, box: Box3d) -> Box3d:
+def _autoware(things: Things, boxes: Boxes3d) -> Boxes3d:
     """Footprints and cylinders are sizes, and velocities are along the axes of the object."""
-    kinematics, shape, size, centre = item.kinematics, item.shape, box.size, box.centre
-    if integer(shape.type) == _ROUND:  # x is the diameter
-        size = (size[0], size[0], size[2])
-    elif integer(shape.type) == _POLYGON:
-        points = [vector(point) for point in shape.footprint.points]
-        (x, y, _), (length, width, _) = around(points) if points else ((0.0, 0.0, 0.0), UNKNOWN_VECTOR)
-        centre, size = moved(centre, box.orientation, (x, y, 0.0)), (length, width, size[2])
-    velocity = rotated(box.orientation, box.velocity) if getattr(kinematics, "has_twist", True) else UNKNOWN_VECTOR
-    is_turned = integer(getattr(kinematics, "orientation_availability", 1)) != _HEADING_UNKNOWN
-    score = box.score if box.score > 0 else nan
-    return box._replace(centre=centre, size=size, velocity=velocity, has_heading=is_turned, score=score)
+    kind, size, turn = things.numbers(("shape", "type")), boxes.size.copy(), boxes.orientation
+    size[kind == _ROUND, 1] = size[kind == _ROUND, 0]  # x is the diameter
+    owner, points = things.members(("shape", "footprint", "points", EACH))
+    middle, extent = around(points.vectors(()), owner, len(things))
+    is_outlined = kind == _POLYGON
+    size[is_outlined, :2] = extent[is_outlined, :2]
+    centre = boxes.centre.copy()
+    centre[is_outlined] += rotated(turn, np.nan_to_num(middle) * [1, 1, 0])[is_outlined]
+    has_twist = [value in (None, True) for value in things.values(("kinematics", "has_twist"))]
+    velocity = np.where(np.reshape(has_twist, (-1, 1)), rotated(turn, boxes.velocity), nan)
+    is_turned = things.numbers(("kinematics", "orientation_availability")) != _HEADING_UNKNOWN
+    score = _stated(boxes.score)
+    return boxes._replace(centre=centre, size=size, velocity=velocity, has_heading=is_turned, score=score)
 
 
 _AUTOWARE: Final = Known(
-    classes=",car,truck,bus,trailer,motorcycle,bicycle,pedestrian,animal,hazard,over_drivable,under_drivable",
-    adjust=_autoware,
+    "",
+    ",car,truck,bus,trailer,motorcycle,bicycle,pedestrian,animal,hazard,over_drivable,under_drivable",
+    _autoware,
+    "shape kinematics.has_twist kinematics.orientation_availability",
 )
 
 
@@ -105,16 +117,18 @@ _AUTOWARE: Final = Known(
 _OFF, _ENDED = 0, 3
 
 
-def _zed(thing: Any, box: Box3d) -> Box3d | None:
+def _zed(things: Things, boxes: Boxes3d) -> Boxes3d:
     """Confidences are in percent; tracks that are off or have ended are no measurements."""
-    is_tracked = bool(thing.tracking_available)
-    if is_tracked and integer(thing.tracking_state) in (_OFF, _ENDED):
-        return None
-    return box._replace(score=box.score / 100, source_id=box.source_id if is_tracked else None)
+    is_tracked = np.array(things.values(("tracking_available",)), bool)
+    is_over = is_tracked & np.isin(things.numbers(("tracking_state",)), (_OFF, _ENDED))
+    source_id = np.where(is_tracked, boxes.source_id, None)
+    return taken(boxes._replace(score=boxes.score / 100, source_id=source_id), ~is_over)
 
 
 _ZED: Final = Known(
-    "class=label,id=label_id,length=dimensions_3d[2],width=dimensions_3d[0],height=dimensions_3d[1]", adjust=_zed
+    "class=label,id=label_id,length=dimensions_3d[2],width=dimensions_3d[0],height=dimensions_3d[1]",
+    adjust=_zed,
+    also="tracking_available tracking_state",
 )
 _YOLO: Final = Known(has_coco=True)
 _OPENCV: Final = Known("cx=x,cy=y,w=width,h=height")
@@ -143,6 +157,7 @@ KNOWN: Final[Mapping[str, Known]] = {
         "class=classification,score=classification_certainty",
         ",unknown_small,unknown_medium,unknown_big,pedestrian,bike,car,truck,motorcycle,other_vehicle,barrier,sign",
         _derived,
+        "shape polygon.points detection_level",
     ),
     "people_msgs/People": Known(),
     "people_msgs/PositionMeasurementArray": Known(),

@@ -16,7 +16,7 @@ import numpy as np
 
 from mcaptrack.contracts import Box3d, Quaternion, Vector
 from mcaptrack.sources.foreign.decoding import integer, number, stamp_of, text
-from mcaptrack.sources.foreign.fields import Message3d, head_of, moved, part, quaternion, vector
+from mcaptrack.sources.foreign.fields import Message3d, head_of, part, quaternion, rotated, vector
 
 _WORD: Final = re.compile(r"[^\W\d_][\w-]*")
 _PERCENT: Final = re.compile(r"(?<![\w.])(\d{1,3}(?:\.\d+)?)\s*%")
@@ -65,9 +65,15 @@ def _boxed(sides: Any, lengths: Any, middle: Any, centre: Vector, orientation: Q
     turn = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=1))
     is_turned = any(orientation) and all(map(isfinite, orientation))
     whole = (Rotation.from_quat(orientation) * turn if is_turned else turn).as_quat().tolist()
-    place = moved(centre, orientation, (float(middle[0]), float(middle[1]), float(middle[2])))
+    (place,) = _placed(centre, orientation, [middle])
     size = (float(lengths[along]), float(lengths[across]), float(lengths[up]))
     return Solid(place, (whole[0], whole[1], whole[2], whole[3]), size)
+
+
+def _placed(centre: Vector, orientation: Quaternion, points: Sequence[Any]) -> list[Vector]:
+    """Points of a group, given along its axes, in the frame of the group."""
+    turned = rotated(np.array(orientation), np.array(points, np.float64).reshape(-1, 3))
+    return [(x, y, z) for x, y, z in (np.array(centre) + turned).tolist()]
 
 
 def words_of(said: str) -> tuple[str, float]:
@@ -92,7 +98,7 @@ def scene_solids(message: Any) -> Message3d:
     """The solids of a message."""
     entities, deletions = list(part(message, "entities") or ()), list(part(message, "deletions") or ())
     first = next(iter([*entities, *deletions]), None)
-    out = Message3d(_stamp(first), text(part(first, "frame_id") or ""))
+    out = Message3d(_stamp(first))
     without = 0
     for entity in entities:
         solids = list(_solids(entity))
@@ -181,7 +187,7 @@ _GENERIC: Final = re.compile(
 def marker_solids(message: Any) -> Message3d:
     """The solids of a message; lines count only where there are none."""
     markers = list(message.markers) if hasattr(message, "markers") else [message]
-    out = Message3d(*(head_of(markers[0]) if markers else (0, "")))
+    out = Message3d(head_of(markers[0])[0] if markers else 0)
     # Deletions say nothing about what is measured.
     added = [marker for marker in markers if integer(part(marker, "action") or 0) == _ADD]
     labels = _labels(added)
@@ -203,8 +209,7 @@ def _of_marker(marker: Any) -> Iterator[Solid]:
     if kind in (_CUBE, _SPHERE, _CYLINDER):
         yield Solid(centre, orientation, vector(marker.scale), kind == _CUBE)
     elif kind in (_CUBE_LIST, _SPHERE_LIST):
-        for point in part(marker, "points") or ():
-            place = moved(centre, orientation, vector(point))
+        for place in _placed(centre, orientation, [vector(point) for point in part(marker, "points") or ()]):
             yield Solid(place, orientation, vector(marker.scale), kind == _CUBE_LIST)
     elif kind == _LINE_LIST:
         yield from wired([vector(point) for point in part(marker, "points") or ()], centre, orientation)

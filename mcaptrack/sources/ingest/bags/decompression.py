@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import zlib
-from collections.abc import Callable
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -47,7 +46,7 @@ def too_large(size: int | None, most: int) -> NotUnpackedError:
 
 
 def unzstd(data: bytes, most: int) -> bytes:
-    """Decompress one zstd frame to at most ``most`` bytes. Raises NotUnpackedError."""
+    """Decompress zstd to at most ``most`` bytes. Raises NotUnpackedError."""
     import zstandard
 
     try:
@@ -56,10 +55,9 @@ def unzstd(data: bytes, most: int) -> bytes:
             raise too_large(size, most)
         if size >= 0:
             return zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompress(data)
-        unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompressobj()
-        return decompress_pieces(lambda piece, _: unpacker.decompress(piece), lambda: unpacker.eof, data, most)
     except zstandard.ZstdError as error:
         raise NotUnpackedError(str(error)) from None
+    return _unpacked(data, True, most)
 
 
 def opened(path: Path) -> IO[bytes]:
@@ -72,22 +70,23 @@ def opened(path: Path) -> IO[bytes]:
         if not magic.startswith(_GZIP) and magic != ZSTD:
             return stream
         with stream:
-            return BytesIO(_unpacked(stream.read(), magic == ZSTD))
+            data = stream.read()
+            return BytesIO(_unpacked(data, magic == ZSTD, limit_of(len(data))))
     except OSError as error:
         raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
     except NotUnpackedError as error:
         raise McaptrackError(f"{path} can't be decompressed: {error}") from None
 
 
-def _unpacked(data: bytes, is_zstd: bool) -> bytes:
-    """Decompress all parts of gzip or zstd that follow each other. Raises NotUnpackedError."""
+def _unpacked(data: bytes, is_zstd: bool, most: int) -> bytes:
+    """Decompress all parts of gzip or zstd that follow each other, to at most ``most`` bytes; or NotUnpackedError."""
     import zstandard
 
     def unpackers() -> Any:
         return zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompressobj()
 
     new = unpackers if is_zstd else partial(zlib.decompressobj, zlib.MAX_WBITS + 16)
-    parts, size, most, unpacker = list[bytes](), 0, limit_of(len(data)), new()
+    parts, size, unpacker = list[bytes](), 0, new()
     try:
         for at in range(0, len(data), _FED_BYTES):
             piece = data[at : at + _FED_BYTES]
@@ -115,24 +114,6 @@ def decompress_steps(unpacker: Any, data: bytes, most: int) -> bytes:
         parts.append(unpacker.decompress(data, min(_PIECE_BYTES, most - size)))
         size += len(parts[-1])
         data = b""
-    return b"".join(parts)
-
-
-def decompress_pieces(
-    unpack: Callable[[bytes, int], bytes], ended: Callable[[], bool], data: bytes, most: int
-) -> bytes:
-    """Decompress ``data`` piece by piece with ``unpack``, until it has ``ended``. Raises NotUnpackedError."""
-    parts, size = [], 0
-    for at in range(0, len(data), _FED_BYTES):
-        if ended():
-            break
-        part = unpack(data[at : at + _FED_BYTES], most)
-        size += len(part)
-        if size > most:
-            raise too_large(None, most)
-        parts.append(part)
-    if not ended():
-        raise NotUnpackedError("it is cut off")
     return b"".join(parts)
 
 
