@@ -373,6 +373,8 @@ _CUT_CORRELATION: Final = 0.7
 #: A picture of less contrast shows nothing, such as a covered lens, nor does one of so much less than the one before,
 #: such as a flash.
 _LEAST_CONTRAST: Final = 4.0
+#: Small copies are alike in values that differ by no more than this, and the same if so large a share is alike.
+_ALIKE, _SAME_SHARE = 4, 0.8
 _LEAST_CONTRAST_KEPT: Final = 0.4
 # The mean brightness about each pixel, over so many pixels, is taken away, so that light that changes is no motion; so
 # is contrast, if it differs by more than this factor.
@@ -503,6 +505,9 @@ class MotionEstimator:
                     self._sure, self._unsure = self._keys, self._misses + 1
                 self._add_key(latest)
                 key = latest
+        cell_px = self._size[0] / picture.copy.shape[1]
+        if (fit is None or shift_px(fit[0], *self._size) > cell_px) and _is_same(key.picture, picture):
+            return self._posed(key.to_reference, 0)  # nor do those whose few features are of what moves by itself
         if fit is None:
             return self._unknown(before, picture, hidden)
         matrix, inliers = fit
@@ -708,6 +713,14 @@ def _correlation(first: _Picture, second: _Picture) -> float:
     a, b = (side.copy - side.copy.mean() for side in (first, second))
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum()) / scale if scale > 0 else float(not a.any() and not b.any())
+
+
+def _is_same(first: _Picture, second: _Picture) -> bool:
+    """Whether two pictures of one size are alike nearly everywhere."""
+    import cv2
+
+    off = np.asarray(cv2.absdiff(first.copy, second.copy))
+    return bool(np.count_nonzero(off <= _ALIKE) >= _SAME_SHARE * off.size)
 
 
 def _inside(points: Points, image: Image) -> Bools:
