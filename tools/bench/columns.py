@@ -38,7 +38,7 @@ STORE = get_typestore(Stores.LATEST)
 RANDOM = np.random.default_rng(1)
 #: Stands for each number of a message that is drawn; no number that is drawn has its bytes.
 _DRAWN = 1.2345678806304932
-#: Lists of messages have so many elements at most.
+#: Lists of messages have so many elements at most; those beside longer lists of numbers, as fields of a cloud, few.
 _MOST = 30
 #: Types, messages for each of ``--messages``, and elements of their lists.
 TYPES = {
@@ -73,7 +73,7 @@ def value(form: Any, size: int) -> Any:
     if int(member[0]) == 1 and member[1][0] != "string":
         kind = member[1][0].replace("byte", "uint8")
         return np.full(length, _DRAWN, kind) if "float" in kind else RANDOM.integers(0, 100, length).astype(kind)
-    return [value(member, min(size, 4)) for _ in range(min(length, _MOST))]
+    return [value(member, min(size, 4)) for _ in range(length if length <= _MOST else 4)]
 
 
 def drawn(kinds: list[bytes], count: int) -> Iterator[bytes]:
