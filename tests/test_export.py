@@ -12,6 +12,7 @@ import pandas as pd
 import polars as pl
 import pyarrow.parquet as pq
 import pytest
+from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from mcaptrack import log, tables
@@ -22,6 +23,7 @@ from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.tables.export import LogTables, export, recording_name, topic_folder
 from tests.logs import add_rows, some_log
+from tests.ros_messages import ros_writer
 from tests.worlds import ns, tracks_at
 
 
@@ -222,6 +224,22 @@ def test_a_foreign_channel_becomes_a_table_with_sql_names(tmp_path):
     assert field.metadata[b"path"] == b"gyro.x"
     with log.read(tmp_path / "a.mcap") as opened:
         assert field.metadata[b"description"].decode() == f"field gyro.x of {opened.channel('/imu').schema_name}"
+
+
+@pytest.mark.parametrize("ros1", [False, True])
+def test_fields_of_ros_have_the_units_that_it_states(ros1, tmp_path):
+    name, schema_encoding, definition, encoding = ros_writer("nav_msgs/Odometry", ros1=ros1).kind
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.register_channel("/odom", encoding, writer.register_schema(name, schema_encoding, definition))
+        writer.finish()
+    with log.read(tmp_path / "a.mcap") as opened:
+        schema = LogTables(opened).messages("/odom").schema
+    units = {field.name: field.metadata[b"unit"].decode() for field in schema}
+    wanted = {"header_stamp": "ns", "pose_pose_position_x": "m", "pose_pose_orientation_w": "1", "child_frame_id": ""}
+    wanted |= {"twist_twist_linear_y": "m/s", "twist_twist_angular_z": "rad/s", "pose_covariance": ""}
+    assert {name: units[name] for name in wanted} == wanted
 
 
 @pytest.mark.parametrize("form", ["csv", "jsonl", "arrow"])

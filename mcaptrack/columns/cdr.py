@@ -9,9 +9,9 @@ The elements of a list become the rows of another cursor. Their positions follow
 size. Otherwise (messages with strings or lists in them) the first elements of all messages are skipped together, then
 the second ones, and so on; where few messages have that many, element by element.
 
-Alignment (XCDR1) is relative to the end of the 4-byte head of a message, so the bodies of CDR messages are first copied
-to multiples of 8, unless all are as far from these already, or, if they are long, read in groups. ROS 1 has neither
-heads nor alignment, and is read in place.
+Alignment (XCDR1) is relative to the end of the 4-byte head of a message, wherever that stands. Short messages are
+copied to multiples of 8, unless all are as far from these already; long ones are read in place. So is ROS 1, which has
+neither heads nor alignment.
 
 Nothing is read, nor room made for it, before it is certain to be within its message: other messages raise Malformed.
 
@@ -42,7 +42,7 @@ _MAX_BYTES: Final = 2**31 - 1
 _NS_PER_S: Final = 10**9
 #: Numbers of CDR are aligned to at most so many bytes behind the head of a message.
 _GRID: Final = 8
-#: Longer messages, on average, are not copied to aligned places, but read in groups of equal alignment.
+#: Longer messages, on average, are not copied to aligned places.
 _COPIED: Final = 2048
 #: Writers may fill up the end of a message.
 _PADDING: Final = 3
@@ -107,14 +107,14 @@ def _are_equal(values: Ints) -> bool:
 
 
 class Cursor:
-    """Positions in ``data`` (N,): ``base + offset``. All ``base`` are multiples of ``grid``, and ``step`` apart if it
-    is not 0; ``end`` (N,) are the ends of the messages.
+    """Positions in ``data`` (N,): ``base + offset``. All ``base`` are multiples of ``grid`` behind their ``origin``,
+    (N,) or one for all, and ``step`` apart if it is not 0; ``end`` (N,) are the ends of the messages.
     """
 
-    __slots__ = ("base", "data", "end", "grid", "offset", "room", "step")
+    __slots__ = ("base", "data", "end", "grid", "offset", "origin", "room", "step")
 
-    def __init__(self, data: Bytes, base: Ints, end: Ints, grid: int, step: int = 0) -> None:
-        self.data, self.end, self.offset = data, end, 0
+    def __init__(self, data: Bytes, base: Ints, end: Ints, grid: int, step: int = 0, origin: Ints | int = 0) -> None:
+        self.data, self.end, self.origin, self.offset = data, end, origin, 0
         self._set(base, grid, step)
 
     def _set(self, base: Ints, grid: int, step: int = 0) -> None:
@@ -128,7 +128,8 @@ class Cursor:
 
     def rows(self, mask: NDArray[np.bool_]) -> Cursor:
         """The cursor of some of the rows."""
-        out = Cursor(self.data, self.base[mask], self.end[mask], self.grid)
+        origin = self.origin if isinstance(self.origin, int) else self.origin[mask]
+        out = Cursor(self.data, self.base[mask], self.end[mask], self.grid, origin=origin)
         out.offset = self.offset
         return out
 
@@ -137,7 +138,7 @@ class Cursor:
         if to <= self.grid and (where is None or not self.offset % to):
             self.offset += -self.offset % to
             return
-        pad = -self.at & (to - 1)
+        pad = (self.origin - self.at) & (to - 1)
         self._set(self.at + (pad if where is None else pad * where), to if where is None else 1)
 
     def move(self, sizes: Ints) -> None:
@@ -202,9 +203,9 @@ class _Type:
         cursor.need(self.size)
         cursor.offset += self.size
 
-    def walk(self, data: memoryview, at: int, end: int) -> int:
-        """The position behind the value of one row at ``at``."""
-        return at + -at % self.align + self.size
+    def walk(self, data: memoryview, at: int, end: int, origin: int) -> int:
+        """The position behind the value of one row at ``at``, which is aligned to ``origin``."""
+        return at + (origin - at) % self.align + self.size
 
 
 class _Number(_Type):
@@ -263,8 +264,8 @@ class _Text(_Counted):
     def skip(self, cursor: Cursor) -> None:
         cursor.move(self._sizes(cursor))
 
-    def walk(self, data: memoryview, at: int, end: int) -> int:
-        at += -at % self.align
+    def walk(self, data: memoryview, at: int, end: int, origin: int) -> int:
+        at += (origin - at) % self.align
         at = at + 4 + self.count(data, at)[0] if at + 4 <= end else end + 1
         if at > end:
             raise _Outside("its strings are longer than itself", end)
@@ -315,8 +316,10 @@ class _List(_Counted):
         ends = ends_of(counts)
         limits = pa.array(ends.astype(np.int32))
         if self.stride < 0:
+            origin = cursor.origin if isinstance(cursor.origin, int) else np.repeat(cursor.origin, counts)
             start, end = self._starts(cursor, counts), np.repeat(cursor.end, counts)
-            return pa.ListArray.from_arrays(limits, self.of.read(Cursor(cursor.data, start, end, self.of.align)))
+            inner = Cursor(cursor.data, start, end, self.of.align, origin=origin)
+            return pa.ListArray.from_arrays(limits, self.of.read(inner))
         sizes = self._aligned(cursor, counts)
         data = cursor.joined(sizes, ends * self.stride)
         cursor.move(sizes)
@@ -353,12 +356,13 @@ class _List(_Counted):
                 behind[row[~more]] = rest.at[~more]
                 row, rest = row[more], rest.rows(more)
         view, align = cursor.data.data, self.of.align
-        for index, begin, end in zip(row.tolist(), rest.at.tolist(), rest.end.tolist(), strict=True):
+        columns = (row, rest.at, rest.end, np.broadcast_to(rest.origin, len(row)))
+        for index, begin, end, origin in zip(*(values.tolist() for values in columns), strict=True):
             at = begin
             for place in range(int(first[index]) + number, int(first[index + 1])):
-                at += -at % align
+                at += (origin - at) % align
                 starts[place] = at
-                at = self.of.walk(view, at, end)
+                at = self.of.walk(view, at, end, origin)
             behind[index] = at
         cursor.move(behind - cursor.at)
         return starts
@@ -370,18 +374,18 @@ class _List(_Counted):
         else:
             cursor.move(self._aligned(cursor, counts))
 
-    def walk(self, data: memoryview, at: int, end: int) -> int:
+    def walk(self, data: memoryview, at: int, end: int, origin: int) -> int:
         count = self.fixed
         if count is None:
-            at += -at % self.align
+            at += (origin - at) % self.align
             count = self.count(data, at)[0] if at + 4 <= end else _MAX_BYTES
             at += 4
         if count * self.of.least > end - at:
             raise _Outside("its lists are longer than itself", end)
         if self.stride >= 0:
-            return int(at + -at % self.of.align + self._bytes(count)) if count else at
+            return int(at + (origin - at) % self.of.align + self._bytes(count)) if count else at
         for _ in range(count):
-            at = self.of.walk(data, at + -at % self.of.align, end)
+            at = self.of.walk(data, at + (origin - at) % self.of.align, end, origin)
         return at
 
 
@@ -433,11 +437,11 @@ class _Struct(_Type):
         for _, of, _ in self.fields:
             of.skip(cursor)
 
-    def walk(self, data: memoryview, at: int, end: int) -> int:
+    def walk(self, data: memoryview, at: int, end: int, origin: int) -> int:
         if self.size >= 0:
-            return super().walk(data, at, end)
+            return super().walk(data, at, end, origin)
         for _, of, _ in self.fields:
-            at = of.walk(data, at, end)
+            at = of.walk(data, at, end, origin)
         return at
 
 
@@ -531,39 +535,36 @@ class RosColumns:
         if (order > 1).any():  # parameter lists, and the encodings of XCDR2
             raise Unsupported(f"messages in the encapsulation {order.max():04x} are not read")
         body = start + 4
-        is_in_place = _are_equal(body % _GRID) or int((end - start).sum()) > _COPIED * len(start)
-        group = order * _GRID + (body % _GRID if is_in_place else 0)
-        if _are_equal(group):
-            return self._read(data, body, end, "<" if not len(order) or order[0] else ">", is_in_place)
-        rows, parts = [np.flatnonzero(group == number) for number in np.unique(group)], []
-        for which in rows:
+        if _are_equal(order):
+            return self._read(data, body, end, "<" if not len(order) or order[0] else ">")
+        rows, parts = [np.flatnonzero(order == number) for number in (0, 1)], []
+        for which, kind in zip(rows, "><", strict=True):
             try:
-                kind = "<" if order[which[0]] else ">"
-                parts.append(self._read(data, body[which], end[which], kind, is_in_place))
+                parts.append(self._read(data, body[which], end[which], kind))
             except Malformed as error:
                 raise Malformed(str(error), int(which[error.message])) from None
         back = pa.array(np.argsort(np.concatenate(rows)))
         return {path: pa.concat_arrays([part[path] for part in parts]).take(back) for path in parts[0]}
 
-    def _read(self, data: Bytes, start: Ints, end: Ints, order: str, is_in_place: bool = False) -> dict[Path, pa.Array]:
-        """The columns of messages of one byte order; of CDR that is read in place, also of one alignment."""
-        cursor = Cursor(data, start, end, 1, _step(start))
-        sizes = end - start
+    def _read(self, data: Bytes, start: Ints, end: Ints, order: str) -> dict[Path, pa.Array]:
+        """The columns of messages of one byte order."""
+        shift, sizes = start % _GRID, end - start
+        origin: Ints | int = 0
+        if self.is_cdr and not _are_equal(shift) and int(sizes.sum()) <= _COPIED * len(start):
+            slots = ends_of((sizes | (_GRID - 1)) + 1)
+            data, start = Cursor(data, start, end, 1, _step(start)).joined(sizes, slots), slots[:-1]
+            end = start + sizes
+        elif self.is_cdr and len(start):
+            origin = int(shift[0]) if _are_equal(shift) else shift
+        cursor = Cursor(data, start, end, _GRID, _step(start), origin)
         try:
-            if self.is_cdr and is_in_place and len(start):
-                shift = int(start[0]) % _GRID
-                cursor = Cursor(data[shift:], start - shift, end - shift, _GRID, _step(start))
-            elif self.is_cdr:
-                slots = ends_of((sizes | (_GRID - 1)) + 1)
-                base = slots[:-1]
-                cursor = Cursor(cursor.joined(sizes, slots), base, base + sizes, _GRID, _step(base))
             out = dict(self._by_order[order].columns(cursor))
             left = cursor.end - cursor.at
             bad = np.flatnonzero((left < 0) | (left > (_PADDING if self.is_cdr else 0)))
             if len(bad):
                 raise _Outside(f"{left[bad[0]]} bytes of it are left over", int(cursor.end[bad[0]]))
         except _Outside as error:
-            raise Malformed(str(error), int(np.argmax(cursor.end == error.end))) from None
+            raise Malformed(str(error), int(np.argmax(end == error.end))) from None
         return out
 
 

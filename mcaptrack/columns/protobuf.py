@@ -57,6 +57,9 @@ _PADDING: Final = 16
 
 def _varints(data: Bytes, at: Ints) -> tuple[NDArray[np.uint64], Ints]:
     """The varints at positions, and their sizes; 11 for those that do not end. 10 bytes must follow ``at`` in data."""
+    first = data[at]
+    if not (first >= 0x80).any():
+        return first.astype(np.uint64), np.ones(len(at), np.int64)
     octets = windows(data, "<u8")[at]
     stops = ~octets & _MORE
     low = stops & (~stops + np.uint64(1))  # the bit that ends a varint; 0 if it is longer than 8 bytes
@@ -89,7 +92,7 @@ def _titled(field: FieldDescriptor) -> str:
 
 
 class _Fields:
-    """The fields in rows (F,): row, number, wire type, position and size of the value; in order of rows."""
+    """The fields in rows (F,): row, number, wire type, position and size of the value; those of a row in its order."""
 
     def __init__(self, data: Bytes, start: Ints, end: Ints, message: Ints) -> None:
         self.data, self.message, self.count = data, message, len(start)
@@ -104,8 +107,13 @@ class _Fields:
         if len(row):
             parts.append(self._singly(row, at, end[row]))
         joined = [np.concatenate(values) for values in zip(*parts, strict=True)] or [np.empty(0, np.int64)] * 5
-        order = np.argsort(joined[0], kind="stable")
-        self.row, self.number, self.wire, self.at, self.size = (values[order] for values in joined)
+        self.row, self.number, self.wire, self.at, self.size = joined
+
+    def of(self, number: int) -> Ints:
+        """The places of the fields with a number, in order of rows."""
+        which = np.flatnonzero(self.number == number)
+        row = self.row[which]
+        return which if (row[1:] >= row[:-1]).all() else which[np.argsort(row, kind="stable")]
 
     def _singly(self, row: Ints, at: Ints, end: Ints) -> tuple[Ints, ...]:
         """All fields of a few rows."""
@@ -138,8 +146,9 @@ class _Fields:
         """The next field of many rows."""
         tag, tag_size = _varints(self.data, at)
         at, wire = at + tag_size, (tag & np.uint64(7)).astype(np.int64)
-        length, size = _varints(self.data, np.minimum(at, end))
         is_sized = wire == _SIZED_BYTES
+        has_varint = is_sized | (wire == _VARINT)
+        length, size = _varints(self.data, np.where(has_varint, np.minimum(at, end), len(self.data) - _PADDING))
         at = at + np.where(is_sized, size, 0)
         wide, narrow = np.full_like(at, 8), np.full_like(at, 4)
         sizes = [length.astype(np.int64), size, wide, narrow]
@@ -211,7 +220,8 @@ class ProtobufColumns:
 
     def _embedded(self, field: FieldDescriptor, rows: _Fields) -> tuple[_Fields, pa.Array]:
         """The rows of a message in another one, and for each outer row its place among them, or null."""
-        which = np.flatnonzero((rows.number == field.number) & (rows.wire == _SIZED_BYTES))
+        which = rows.of(field.number)
+        which = which[rows.wire[which] == _SIZED_BYTES]
         if len(which) and (np.diff(rows.row[which]) == 0).any():
             raise Unsupported("parts of a message are to be merged")
         place = np.zeros(rows.count, np.int64)
@@ -224,7 +234,7 @@ class ProtobufColumns:
 
     def _column(self, field: FieldDescriptor, rows: _Fields, path: Path) -> pa.Array:
         """The column of a field with values, or with a list of anything."""
-        which = np.flatnonzero(rows.number == field.number)
+        which = rows.of(field.number)
         if field.is_repeated:
             row, values = self._values(field, rows, which, path)
             ends = ends_of(np.bincount(row, minlength=rows.count))

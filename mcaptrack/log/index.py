@@ -56,8 +56,7 @@ _NUMBERS: Final = (
 _numbers_of: Final = attrgetter(*_NUMBERS)
 _WIDTH: Final = len(_NUMBERS)
 _START, _END, _OFFSET, _LENGTH, _INDEX_LENGTH = range(5)
-#: Entries of chunks with so many channels are kept, and how many of them.
-_MANY_CHANNELS: Final = 256
+#: So many entries of chunks are kept.
 _MOST_KEPT: Final = 8
 
 
@@ -74,7 +73,7 @@ class ChunkList:
         self._ends = array("Q")  # for each chunk, the end of its channels in the following two
         self._channels = array("H")
         self._indexes = array("Q")  # offsets of message indexes
-        #: Entries of large chunks that were asked for last: each of their channels asks again.
+        #: Entries of chunks that were asked for last: each of their channels asks again.
         self._kept: dict[int, ChunkIndex] = {}
         self._by_channel: tuple[Ints, Ints] | None = None
         for chunk in chunks:
@@ -108,16 +107,14 @@ class ChunkList:
         return self._entry(rows) if isinstance(rows, int) else list(map(self._entry, rows))
 
     def _entry(self, row: int) -> ChunkIndex:
-        low, high = self._ends[row - 1] if row else 0, self._ends[row]
-        if high - low < _MANY_CHANNELS:
-            return self._made(row, low, high)
-        if row not in self._kept:
-            if len(self._kept) == _MOST_KEPT:
-                del self._kept[next(iter(self._kept))]
-            self._kept[row] = self._made(row, low, high)
-        return self._kept[row]
+        if (entry := self._kept.get(row)) is None:
+            if len(self._kept) >= _MOST_KEPT:
+                self._kept.pop(next(iter(self._kept)), None)
+            entry = self._kept[row] = self._made(row)
+        return entry
 
-    def _made(self, row: int, low: int, high: int) -> ChunkIndex:
+    def _made(self, row: int) -> ChunkIndex:
+        low, high = self._ends[row - 1] if row else 0, self._ends[row]
         first, last, offset, length, index_length, stored, opened = self._numbers[row * _WIDTH : (row + 1) * _WIDTH]
         indexes = dict(zip(self._channels[low:high], self._indexes[low:high], strict=True))
         sizes = (self._names[self._compression[row]], stored, opened)

@@ -51,6 +51,8 @@ _KEPT_BYTES: Final = 8 * 2**20
 _MAX_GAP_BYTES: Final = 16 * 2**10
 #: Payloads come in batches of this many bytes at least: fewer make each step for few messages, more exceed the caches.
 _BATCH_BYTES: Final = 4 * 2**20
+#: Longer messages, on average, are not packed if they need not wait.
+_LONG_BYTES: Final = 2048
 #: Chunks are read together until they have so many bytes.
 _WINDOW_BYTES: Final = 16 * 2**20
 #: Payloads of all topics together wait for others of their batch in so many bytes at most.
@@ -457,7 +459,9 @@ class _Window:
                 if lose is None:
                     raise
                 part = _located_in(data, [(batch, _checked(data, number, batch, at, lose)) for batch, at in batches])
-            if 2 * int((part.end - part.start).sum()) < len(data):  # what waits holds no bytes of others
+            size = int((part.end - part.start).sum())
+            is_long = size >= max(_BATCH_BYTES, _LONG_BYTES * len(part.start))  # they don't wait, and are far apart
+            if 2 * size < len(data) and not is_long:  # what waits holds no bytes of others
                 part = _packed([part])
             yield number, part
 

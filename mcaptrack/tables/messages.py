@@ -11,6 +11,7 @@ a temporary file: numbers, texts, lists and structs; values that no type holds b
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -35,6 +36,19 @@ Path = tuple[str, ...]
 Columns = Mapping[Path, Any]
 Flatten = Callable[[bytes], Mapping[Path, Any]]
 
+#: Types with units that their definitions state (REP 103 for those of ROS), and these, by the ends of paths of fields.
+_STATED: Final = re.compile(r"(geometry_msgs|nav_msgs|sensor_msgs|foxglove)[./].*")
+_UNITS: Final[Mapping[str, str]] = {
+    "m": r"\.(position|translation|point)\.[xyz]|\.altitude|/LaserScan\.range(s|_min|_max)",
+    "m/s": r"/(Twist\w*|Odometry)\..*linear\.[xyz]",
+    "rad/s": r"/(Twist\w*|Odometry)\..*angular\.[xyz]|/Imu\.angular_velocity\.[xyz]",
+    "m/s^2": r"/Imu\.linear_acceleration\.[xyz]",
+    "rad": r"/LaserScan\.angle_(min|max|increment)",
+    "deg": r"(/NavSatFix|\.LocationFix)\.(latitude|longitude)",
+    "T": r"/MagneticField\.magnetic_field\.[xyz]",
+    "Pa": r"/FluidPressure\.fluid_pressure",
+    "1": r"\.(orientation|rotation)\.[xyzw]",
+}
 #: A part of flat messages ends after so many of them.
 _PART_MESSAGES: Final = 4096
 #: Bytes of rows after which a piece of the table ends, so that a table of pictures is made in pieces, too.
@@ -77,6 +91,13 @@ class MessagesTable(NamedTuple):
     left_out: Sequence[Path]
 
 
+def _unit(schema_name: str, path: Path) -> str:
+    """The unit of a field where its type states one; otherwise ""."""
+    name = ".".join([schema_name, *path])
+    units = _UNITS.items() if _STATED.fullmatch(name) else ()
+    return next((unit for unit, pattern in units if re.search(rf"({pattern})$", name)), "")
+
+
 class _Rows:
     """Rows of messages: time and place of each, then its fields, of the types by path."""
 
@@ -88,7 +109,7 @@ class _Rows:
         names = dict.fromkeys(head.names, ())
         columns = list(head)
         for path, kind in types.items():
-            unit = "ns" if path[-1].endswith("_ns") else ""
+            unit = "ns" if path[-1].endswith("_ns") or pa.types.is_timestamp(kind) else _unit(source.schema_name, path)
             metadata = {"unit": unit, "description": f"field {'.'.join(path)} of {source.schema_name or 'the message'}"}
             name = _free_name("_".join(path), names)
             columns.append(pa.field(name, kind, metadata=metadata | {"path": ".".join(path)}))

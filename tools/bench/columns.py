@@ -17,12 +17,13 @@ import importlib.util
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from mcap.reader import make_reader
+from mcap.reader import McapReader, make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -35,7 +36,9 @@ from mcaptrack.log.chunks import chunk_record, open_chunk
 
 STORE = get_typestore(Stores.LATEST)
 RANDOM = np.random.default_rng(1)
-#: Lists of messages have so many elements at most.
+#: Stands for each number of a message that is drawn; no number that is drawn has its bytes.
+_DRAWN = 1.2345678806304932
+#: Lists of messages have so many elements at most; those beside longer lists of numbers, as fields of a cloud, few.
 _MOST = 30
 #: Types, messages for each of ``--messages``, and elements of their lists.
 TYPES = {
@@ -59,7 +62,7 @@ def value(form: Any, size: int) -> Any:
             if what[0] == "string"
             else bool(size % 2)
             if what[0] == "bool"
-            else float(RANDOM.random())
+            else _DRAWN
             if "float" in what[0]
             else 1
         )
@@ -68,15 +71,31 @@ def value(form: Any, size: int) -> Any:
     member, count = what
     length = count if node == 3 else size
     if int(member[0]) == 1 and member[1][0] != "string":
-        return (
-            RANDOM.random(length) if "float" in member[1][0] else np.ones(length, member[1][0].replace("byte", "uint8"))
-        )
-    return [value(member, min(size, 4)) for _ in range(min(length, _MOST))]
+        kind = member[1][0].replace("byte", "uint8")
+        return np.full(length, _DRAWN, kind) if "float" in kind else RANDOM.integers(0, 100, length).astype(kind)
+    return [value(member, min(size, 4)) for _ in range(length if length <= _MOST else 4)]
+
+
+def drawn(kinds: list[bytes], count: int) -> Iterator[bytes]:
+    """So many messages, each with numbers of its own: as sensors give them, in single precision."""
+    forms = []
+    for kind in kinds:
+        for number in ("<f8", "<f4"):
+            mark, places = np.array(_DRAWN, number).tobytes(), []
+            while (at := kind.find(mark, places[-1] + 1 if places else 0)) >= 0:
+                places.append(at)
+            forms.append((kind, number, np.add.outer(places, np.arange(len(mark))).astype(np.int64)))
+    for step in range(count):
+        message = np.frombuffer(kinds[step % len(kinds)], np.uint8).copy()
+        for _, number, places in forms[2 * (step % len(kinds)) :][:2]:
+            numbers = RANDOM.standard_normal(len(places), np.float32).astype(number)
+            message[places] = numbers.view(np.uint8).reshape(places.shape)
+        yield message.tobytes()
 
 
 def ros_messages(name: str, count: int, size: int) -> Iterator[bytes]:
-    kinds = [bytes(STORE.serialize_cdr(value((2, name), size + step % 3), name)) for step in range(50)]
-    return (kinds[number % len(kinds)] for number in range(count))
+    kinds = [bytes(STORE.serialize_cdr(value((2, name), size + step % 3), name)) for step in range(20)]
+    return drawn(kinds, count)
 
 
 def protobuf_messages(kind: Any, count: int, size: int) -> Iterator[bytes]:
@@ -88,13 +107,13 @@ def protobuf_messages(kind: Any, count: int, size: int) -> Iterator[bytes]:
                 if field.type == field.TYPE_STRING:
                     setattr(inner, field.name, "frame")
                 elif field.name in ("translation", "rotation"):
-                    getattr(inner, field.name).x = float(RANDOM.random())
+                    for axis in getattr(inner, field.name).DESCRIPTOR.fields_by_name:
+                        setattr(getattr(inner, field.name), axis, _DRAWN)
                 elif field.type == field.TYPE_DOUBLE and not field.is_repeated:
-                    setattr(inner, field.name, float(RANDOM.random()))
+                    setattr(inner, field.name, _DRAWN)
         return bytes(out.SerializeToString())
 
-    kinds = [message() for _ in range(50)]
-    return (kinds[number % len(kinds)] for number in range(count))
+    return drawn([message()], count)
 
 
 def write(path: Path, name: str, encoding: tuple[str, str], definition: bytes, payloads: Iterator[bytes]) -> None:
@@ -165,19 +184,21 @@ def compare_export(paths: list[Path], folder: Path) -> None:
     Their messages stand between each other, as a robot records them.
     """
     robot, streams = folder / "robot.mcap", []
-    with robot.open("wb") as stream:
+    with robot.open("wb") as stream, ExitStack() as sources:
         writer = Writer(stream, compression=CompressionType.ZSTD)
         writer.start(profile="ros2")
+
+        def messages(reader: McapReader, channel: int) -> Iterator[tuple[int, int, int, bytes]]:
+            step_ns = 10**11 // reader.get_summary().statistics.message_count
+            for number, (_, _, message) in enumerate(reader.iter_messages()):
+                yield 10**18 + number * step_ns, channel, number, message.data
+
         for number, path in enumerate(paths):
-            with path.open("rb") as source:
-                reader = make_reader(source)
-                (schema,) = reader.get_summary().schemas.values()
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                encoding = "protobuf" if schema.encoding == "protobuf" else "cdr"
-                channel = writer.register_channel(f"/t{number}", encoding, schema_id)
-                payloads = [message.data for _, _, message in reader.iter_messages()]
-                step_ns = 10**11 // len(payloads)
-                streams.append([(10**18 + n * step_ns, channel, n, data) for n, data in enumerate(payloads)])
+            reader = make_reader(sources.enter_context(path.open("rb")))
+            (schema,) = reader.get_summary().schemas.values()
+            schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+            encoding = "protobuf" if schema.encoding == "protobuf" else "cdr"
+            streams.append(messages(reader, writer.register_channel(f"/t{number}", encoding, schema_id)))
         for t_ns, channel, sequence, data in heapq.merge(*streams):
             writer.add_message(channel, t_ns, data, t_ns, sequence)
         writer.finish()
