@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import typer
 
@@ -34,6 +35,23 @@ def _main(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_version, show_default=False)
     ] = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            envvar="MCAPTRACK_CONFIG",
+            show_envvar=False,
+            help="Read options from this file, not mcaptrack.toml in the working folder (tuning only) and your config "
+            "folder.",
+        ),
+    ] = None,
+    log_format: Annotated[
+        Literal["text", "json"],
+        typer.Option(
+            envvar="MCAPTRACK_LOG_FORMAT",
+            show_envvar=False,
+            help="Print notes, progress and errors as lines of text, or as objects of JSON with their times.",
+        ),
+    ] = "text",
 ) -> None:
     """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results
     into the log.

@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from pathlib import Path
 from typing import Any, Final
 
 import typer
@@ -16,7 +15,7 @@ from typer.core import TyperCommand, TyperOption
 from mcaptrack.api.declared import Parameter
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
-from mcaptrack.cli.text import log_format, refuse_usage, say
+from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.notices import warn
 
 #: The exception of Typer for a command line that it can't parse.
@@ -91,6 +90,7 @@ MORE_PANEL: Final = "More options"
 LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands")
 #: The option that shows all options; ``--help`` shows those that most people need.
 ALL: Final = "--help-all"
+HELP: Final = ("--help", "-h", ALL)
 
 #: The heading of a theme that not all detectors, trackers or predictors have: the names of those that have it.
 _THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
@@ -131,11 +131,9 @@ class Command(TyperCommand):
         arrange(self.most_used, self.params)
         self._is_short = False
         self._help_all: Any = None
-        parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
-        for parameter in parameters.values():
-            parameter.process_value = _refusing_empty(parameter.process_value)
-        config = parameters["config"]
-        config.envvar = self.settings["config"].variable  # the others are read with the files, once this is known
+        for parameter in self.params:
+            every: Any = parameter
+            every.process_value = _refusing_empty(every.process_value)
 
     def get_help_option(self, ctx: Any) -> Any:
         """Put ``--help`` below the heading of the options that all commands have."""
@@ -172,26 +170,27 @@ class Command(TyperCommand):
         return panel == FIRST_PANEL if self.most_used else panel not in LAST_PANELS[1:]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line; whatever is wrong with it ends the command in one line."""
-        with log_format(next(_values_of(args, "--log-format"), ""), self.name or ""):
-            return self._parse(ctx, args)
+        """Parse the command line; whatever is wrong with it ends the command in one line.
 
-    def _parse(self, ctx: Any, args: list[str]) -> list[str]:
+        The values of environment and files are the defaults.
+        """
         args_before = list(args)  # parsing may take words away
+        if ctx.parent is not None and not ctx.resilient_parsing and not {*args} & {*HELP}:
+            gather(ctx.parent.command.commands, ctx.parent.params["config"])
+            ctx.default_map = converted(ctx, ctx.info_name or "")
         with usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         for option in self.params:
             if isinstance(option, TyperOption) and not option.multiple and not option.is_flag:
-                _refuse_several(args_before, option.opts)
+                refuse_several(args_before, option.opts)
         return left
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; with --verbose first list the options that differ from the defaults, and their sources."""
         RUNNING.set(ctx)
-        with log_format(ctx.params.get("log_format", "text"), self.name or ""):
-            if ctx.params.get("verbose") and not ctx.params.get("quiet"):
-                say(self._options_in_use(ctx))
-            return super().invoke(ctx)
+        if ctx.params.get("verbose") and not ctx.params.get("quiet"):
+            say(self._options_in_use(ctx))
+        return super().invoke(ctx)
 
     def _options_in_use(self, ctx: Any) -> str:
         set_values = found_of(self.name or "")
@@ -223,14 +222,14 @@ def _refusing_empty(process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], 
     return processed
 
 
-def _refuse_several(args: Sequence[str], options: Sequence[str]) -> None:
+def refuse_several(args: Sequence[str], options: Sequence[str]) -> None:
     """Refuse several values of an option that takes one: the last would count, and the others be ignored."""
-    names = {value: None for option in options for value in _values_of(args, option)}
+    names = {value: None for option in options for value in values_of(args, option)}
     if len(names) > 1:
         refuse_usage(f"{options[0]} is given as {' and as '.join(names)}; give one")
 
 
-def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
+def values_of(args: Sequence[str], option: str) -> Iterator[str]:
     """Yield the values of an option on a command line that may be wrong."""
     for number, word in enumerate(args):
         if word == "--":
@@ -254,20 +253,6 @@ def _rank(ctx: Any, parameter: str, set_values: Mapping[str, tuple[Setting, Give
     if source.name == "DEFAULT_MAP":
         return set_values[parameter][1].rank, set_values[parameter][1].where
     return (1, "the environment") if source.name == "ENVIRONMENT" else (0, "")
-
-
-def read_config(context: typer.Context, path: Path | None) -> Path | None:
-    """Use the values of environment and files as defaults of this command's options.
-
-    This is the callback of ``--config``, which Typer parses first.
-    """
-    if context.resilient_parsing or context.parent is None:
-        return path
-    group: Any = context.parent.command
-    commands: Mapping[str, Command] = group.commands
-    gather(commands, path)
-    context.default_map = converted(context, context.info_name or "")
-    return path
 
 
 def converted(context: Any, command: str) -> dict[str, Any]:

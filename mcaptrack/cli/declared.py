@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
-from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Final, Generic, TypeVar, get_type_hints
 
 import typer
 
@@ -30,15 +30,13 @@ from mcaptrack.api.declared import (
 )
 from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import LAST_PANELS, read_config
+from mcaptrack.cli.command import LAST_PANELS
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 
 T = TypeVar("T")
 #: Heading of the options of all commands.
 COMMON: Final = LAST_PANELS[-1]
-_CONFIG = "Read options from this file, not mcaptrack.toml in the working folder (tuning only) and your config folder."
-_LOG_FORMAT = "Print notes, progress and errors as lines of text, or as objects of JSON with their times."
 
 
 class OfAll:
@@ -47,8 +45,6 @@ class OfAll:
     json: Annotated[bool, Option(COMMON, help="Print JSON for programs.")] = False
     quiet: Annotated[bool, Option(COMMON, short="q", help="Say nothing but errors and warnings.")] = False
     verbose: Annotated[bool, Option(COMMON, short="v", help="Print more, such as where each option was set.")] = False
-    config: Annotated[PathLike | None, Option(COMMON, help=_CONFIG)] = None
-    log_format: Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)] = "text"
 
 
 class Printed:
@@ -208,8 +204,6 @@ def annotation_of(parameter: Parameter) -> Any:
         rich_help_panel=about.panel or None,
         case_sensitive=False,
         autocompletion=about.names,
-        is_eager=parameter.name == "config",  # the file has the defaults of the others
-        callback=read_config if parameter.name == "config" else None,
     )
     kind: Any = list[parameter.kind] if parameter.many else parameter.kind  # type: ignore[name-defined]
     return Annotated[kind | None if parameter.default is None else kind, info]

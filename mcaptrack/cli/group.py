@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -15,12 +16,16 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from mcaptrack import _MODULES
-from mcaptrack.cli.command import Command, usage_in_one_line
+from mcaptrack.cli.command import HELP, Command, refuse_several, usage_in_one_line, values_of
 from mcaptrack.cli.settings import may_be_set
+from mcaptrack.cli.text import log_format
+from mcaptrack.environment import variable
 
 _MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
 _MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
 _OF_PACKAGES = "Of installed packages"
+#: The options of the program, which may stand before the command or after it.
+PROGRAM_OPTIONS: Final = ("--config", "--log-format")
 
 
 class Listed(NamedTuple):
@@ -235,10 +240,16 @@ class Group(TyperGroup):
         """Parse the options before the command; refuse an unknown one in one line."""
         if not args:
             return super().parse_args(ctx, args)  # which prints the help
-        functions = _with_plugins(self._own, args)
+        own, rest = _split(args)
+        config = Path(named) if (named := next(values_of(own, "--config"), variable("MCAPTRACK_CONFIG"))) else None
+        said = next(values_of(own, "--log-format"), variable("MCAPTRACK_LOG_FORMAT"))
+        ctx.with_resource(log_format(said, next((word for word in rest if not word.startswith("-")), "")))
+        functions = _with_plugins(self._own, rest, config)
         self.commands = self._own.changed({name: make(ENTRIES[name], functions[name]) for name in functions})
         with usage_in_one_line():
-            return super().parse_args(ctx, args)
+            for option in PROGRAM_OPTIONS:
+                refuse_several(own, [option])
+            return super().parse_args(ctx, [*own, *rest])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command; refuse an unknown one in one line."""
@@ -261,10 +272,29 @@ def _made_of_package(entry: Listed) -> Any:
         raise typer.Exit(REFUSED) from None
 
 
-def _with_plugins(commands: Commands, arguments: list[str]) -> dict[str, Any]:
+def _split(args: list[str]) -> tuple[list[str], list[str]]:
+    """The words of the options of the program, which may stand anywhere, and the others."""
+    own: list[str] = []
+    others: list[str] = []
+    words = iter(args)
+    for word in words:
+        if word == "--":
+            others += [word, *words]
+        elif word in PROGRAM_OPTIONS:
+            value = [*islice(words, 1)]
+            if not value:
+                return [word], []  # which is refused: it has no value
+            own += [word, *value]
+        else:
+            (own if word.partition("=")[0] in PROGRAM_OPTIONS else others).append(word)
+    return own, others
+
+
+def _with_plugins(commands: Commands, arguments: list[str], config: Path | None) -> dict[str, Any]:
     """The functions of commands with options of plug-ins in this call. Where there can be none, nothing is loaded."""
-    if not set(arguments) & set(_WITH_PLUGINS) and not may_be_set(arguments):
+    is_help = len(arguments) == 2 and arguments[1] in HELP
+    if is_help or not (set(arguments) & set(_WITH_PLUGINS) or config or may_be_set()):
         return {}
     from mcaptrack.cli.plugins import commands_with_plugins
 
-    return commands_with_plugins(commands, arguments)
+    return commands_with_plugins(commands, arguments, config)
