@@ -35,6 +35,7 @@ VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
         "MCAPTRACK_MAX_UNPACKED_MIB": "compressed data that unpacks to more is refused, in MiB",
         "MCAPTRACK_MAX_WORKER_MB": "a worker for many logs whose resident memory is larger is ended, in MB",
         "MCAPTRACK_MODELS": "the folder of fetched weights of detectors",
+        "MCAPTRACK_SCHEDULER": "the address of the scheduler of a Dask cluster, whose workers process many logs",
         "MCAPTRACK_DATA": "a folder with reference recordings, for the tests",
     }
 )

@@ -63,6 +63,9 @@ class Option:
         Returns the values to complete.
     commas : bool
         Whether several values are one text on the command line, with commas between them.
+    is_set : bool
+        Whether the command has no option of its own for it: ``--set name=value`` sets it. This is for numbers, choices
+        and switches that tune, and that few users can choose a value for.
     help : str
         The meaning of the parameter, where the docstring of a function doesn't say it.
     """
@@ -78,6 +81,7 @@ class Option:
     shown: str | bool | None = None
     names: Callable[[], Sequence[str]] | None = None
     commas: bool = False
+    is_set: bool = False
     help: str = ""
 
     @property

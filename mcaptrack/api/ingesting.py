@@ -120,12 +120,12 @@ def ingest(
     start_time: Annotated[float | str | dt.datetime | None, Option(_PICTURES)] = None,
     image_format: Annotated[ImageFormat, Option(_PICTURES, tuning=True)] = "auto",
     quality: Annotated[int | None, Option(_PICTURES, 1, 100, tuning=True)] = None,
-    keyframe_interval_s: Annotated[float | None, Option(_PICTURES, 0.01, 60, tuning=True)] = None,
+    keyframe_interval_s: Annotated[float | None, Option(_PICTURES, 0.01, 60, tuning=True, is_set=True)] = None,
     stream: Annotated[int | None, Option(_PICTURES, 0, 1000)] = None,
     ground_plane: GroundPlane = None,
     calibration: Annotated[PathLike | Sequence[PathLike] | None, Option(LABELS, metavar="FILE", shown=False)] = None,
     calibration_name: Annotated[str | None, Option(LABELS, metavar="NAME")] = None,
-    calibration_unit: Annotated[LengthUnit, Option(LABELS, tuning=True)] = "auto",
+    calibration_unit: Annotated[LengthUnit, Option(LABELS, tuning=True, is_set=True)] = "auto",
     point: PointOfBox = "foot",
     detections: _Labels = None,
     tracks: _Labels = None,
@@ -162,7 +162,7 @@ def ingest(
     source : path
         The input.
     output : path, optional
-        Write to this file; the input stays unchanged.
+        Write to this file, of several inputs to this folder; they stay unchanged.
     camera : str, default "camera"
         Name of the camera; its channels begin with /NAME.
     fps : float, str or Fraction, optional

@@ -85,7 +85,8 @@ def render(
     Parameters
     ----------
     output : path, optional
-        Write to this file: a video (.mp4 or .gif), with ``blur`` also a log (.mcap), with ``heatmap`` a picture.
+        Write to this file: a video (.mp4 or .gif), with ``blur`` also a log (.mcap), with ``heatmap`` a picture. Of
+        several logs, to this folder.
 
         By default LOG.mp4 beside the log, LOG.compared.mp4 with ``compare``, LOG.blurred.mp4 with ``blur``,
         LOG.heatmap.png with ``heatmap``.

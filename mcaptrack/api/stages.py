@@ -297,7 +297,7 @@ def sample(
     return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
 
 
-@declared(most_used=("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"))
+@declared(most_used=("predictor", "horizon_s", "output", "topic", "to", "camera", "force"))
 def predict(
     log: EachLog,
     *,

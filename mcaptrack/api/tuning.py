@@ -22,7 +22,6 @@ from mcaptrack.api.options import (
     GroundPlane,
     MinIou,
     PathLike,
-    PointOfBox,
     Reports,
     Topic,
     chooser,
@@ -110,15 +109,9 @@ def tune(
     gate_m: Annotated[float, gate_m()] = 1.0,
     min_iou: MinIou = 0.5,
     label_format: labels.Format = "auto",
-    columns: labels.Columns = None,
     classes: labels.Classes = None,
-    class_map: labels.ClassNames = None,
-    first_frame: labels.FirstFrame = None,
-    frames: labels.LabelledFrames = None,
     fps: labels.LabelFps = None,
-    size: labels.Size = None,
     ground_plane: GroundPlane = None,
-    point: PointOfBox = "foot",
     topic: Topic = None,
     camera: Camera = None,
     force: Force = False,
@@ -188,10 +181,7 @@ def tune(
     ranges = _ranges(type(base), search, entry)
     chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
-    how = labels.label_options(
-        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
-        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
-    )  # fmt: skip
+    how = labels.label_options(label_format=label_format, classes=classes, fps=fps, ground_plane=ground_plane)
     notes, trials_file = Notes(), optional_path(study)
     with collected() as warnings:
         if truth is None:

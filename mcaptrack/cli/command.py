@@ -7,14 +7,14 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from typing import Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperOption
 
-from mcaptrack.api.declared import Parameter
+from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.flags import RUNNING
-from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
+from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather, nearest
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.notices import warn
 
@@ -128,6 +128,7 @@ class Command(TyperCommand):
         self.settings = declared_settings(name, self.parameters)
         self.most_used: tuple[str, ...] = function.most_used
         self.settable: tuple[str, ...] = function.settable
+        self.set_parameters: list[Parameter] = function.set_parameters
         arrange(self.most_used, self.params)
         self._is_short = False
         self._help_all: Any = None
@@ -306,3 +307,73 @@ def warn_unused(reason: str, *parameters: str) -> None:
     for setting in command.settings.values():
         if setting.parameter in parameters and is_on_command_line(setting.parameter):
             warn(f"--{setting.name} changes nothing here: {reason}", "option-not-used")
+
+
+# Parameters without an option of their own.
+
+
+Set = Annotated[
+    Sequence[str] | None,
+    Option(
+        tuning=r"[A-Za-z0-9_-]+=[A-Za-z0-9_.,+ -]*",
+        metavar="NAME=VALUE",
+        shown=False,
+        help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
+    ),
+]
+_SWITCH: Final = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false", "no", "off", "0"), False)
+_KIND_WORDS: Final = {bool: "true or false", int: "a whole number", float: "a number"}
+
+
+class Settable(NamedTuple):
+    """A parameter that ``--set`` sets: the type of one value, and whether it may have several, and be None."""
+
+    kind: Any
+    many: bool = False
+    may_be_none: bool = True
+
+    def read(self, value: str) -> Any:
+        """The value that a text gives. Raises ValueError that says what it should be."""
+        if self.may_be_none and value.lower() == "none":
+            return None
+        try:
+            members = [self._one(member.strip()) for member in (value.split(",") if self.many else [value])]
+        except (KeyError, ValueError):
+            raise ValueError(_KIND_WORDS[self.kind]) from None
+        return tuple(members) if self.many else members[0]
+
+    def _one(self, value: str) -> Any:
+        if self.kind is bool:
+            return _SWITCH[value.lower()]
+        return self.kind(value) if self.kind in (int, float) else value
+
+
+def values_set(command: str, texts: Sequence[str] | None, parameters: Mapping[str, Settable]) -> dict[str, Any]:
+    """Return the values of ``--set name=value`` by parameter.
+
+    A text without a value, an unknown parameter, or a value that isn't of its type ends the command with exit code 2;
+    the line says where the text was set.
+    """
+    in_file = found_of(command).get("set")
+    where = f"{in_file[1].where}:" if in_file and not is_on_command_line("set") else "--set"
+    values: dict[str, Any] = {}
+    for text in texts or ():
+        written, equals, value = text.partition("=")
+        name = written.strip().lstrip("-").replace("-", "_")
+        if not equals or not name:
+            refuse_usage(f"{where} needs name=value, as in --set {name or 'name'}=0.5, not {text!r}")
+        if name not in parameters:
+            hint = nearest(name, parameters) or f"; there are {listed(sorted(parameters))}"
+            refuse_usage(f"{where} {text}: there is no parameter {name}{hint}")
+        if name in values:
+            refuse_usage(f"{where} gives {name} twice")
+        try:
+            values[name] = parameters[name].read(value.strip())
+        except ValueError as error:
+            refuse_usage(f"{where} {text}: {value.strip()!r} is not {error}")
+    return values
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in words: "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

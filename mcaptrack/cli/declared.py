@@ -30,7 +30,7 @@ from mcaptrack.api.declared import (
 )
 from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import LAST_PANELS
+from mcaptrack.cli.command import LAST_PANELS, Set, Settable, values_set
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 
@@ -150,14 +150,19 @@ def command(
     ``more`` are options that the function lacks. ``run`` gets the values of all.
     """
     hints, signature = hints_of(declared), inspect.signature(declared).parameters
-    parameters = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OfAll))}
+    every = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OfAll))}
+    settable = {name: Settable(each.kind, each.many) for name, each in every.items() if each.option.is_set}
+    parameters = {name: option for name, option in every.items() if name not in settable}
+    if settable:
+        parameters["set"] = parameter_of("set", Set, None)
     annotations = {
         about.name: argument_annotation(about, hints[parameter], signature[parameter].default)
         for parameter, about in arguments_of(declared).items()
     } | {option.name: (annotation_of(option), option.default) for option in parameters.values()}
 
     def call(**values: Any) -> None:
-        run(values)
+        defaults = {parameter: every[parameter].default for parameter in settable}
+        run(values | defaults | (values_set(name, values["set"], settable) if settable else {}))
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     function: Any = common.one_line(call)
@@ -165,7 +170,8 @@ def command(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
     function.__name__, function.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    function.parameters, function.settable = tuple(parameters.values()), ()
+    function.parameters, function.settable = tuple(parameters.values()), tuple(settable)
+    function.set_parameters = [every[parameter] for parameter in settable]
     function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
     return function  # type: ignore[no-any-return]
 

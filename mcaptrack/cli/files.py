@@ -46,7 +46,7 @@ class Check(EachLog["LogCheck"]):
         with common.printed_to(self.values["output"], self.values["force"]):
             if self.values["json"]:
                 common.print_json({"results": [_as_json(file) for file in files], **totals})
-            elif not self.many.json_lines:
+            else:
                 for file in files:
                     _print_check(file, self.values["quiet"])
 

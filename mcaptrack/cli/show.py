@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Printed
-from mcaptrack.cli.many import EachLog
+from mcaptrack.cli.many import BAG, EachLog
 from mcaptrack.cli.text import console, print_table, printable, show_left_out
 from mcaptrack.geometry.clocks import FIRST_DATE_NS
 from mcaptrack.location import Location
@@ -61,13 +61,8 @@ class Export(EachLog["ExportResult"]):
 
         logs = super().logs()
         if self.shares_output:
-            refuse_same_tables([log.path for log in logs], self._folder)
+            refuse_same_tables([log.path for log in logs], self.values["output"])
         return logs
-
-    @property
-    def _folder(self) -> Path | None:
-        folder: Path | None = self.values["output"] or self.values["output_dir"]
-        return folder
 
     def suffix(self) -> str:
         """Return the end of the names of bags and files."""
@@ -78,7 +73,7 @@ class Export(EachLog["ExportResult"]):
         of_package = exporter_of_package(form)
         if of_package is not None:
             return of_package.end
-        return ".rosbag2" if form.startswith("rosbag2") else ends_with(form)
+        return BAG if form.startswith("rosbag2") else ends_with(form)
 
     def show(self, log: Location, done: ExportResult, talk: common.Talk) -> None:
         """Print what was written."""
@@ -98,8 +93,9 @@ class Export(EachLog["ExportResult"]):
         """Print the results; bring the catalogue of several logs in one folder up to date."""
         from mcaptrack.tables.catalogue import refresh
 
-        if self._folder is not None and self.values["form"] == "parquet" and len(self.values["logs"]) > 1:
-            refresh(self._folder)
+        folder: Path | None = self.values["output"]
+        if folder is not None and self.values["form"] == "parquet" and len(self.values["logs"]) > 1:
+            refresh(folder)
         super().print_result(results, totals)
 
 
