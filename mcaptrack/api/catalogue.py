@@ -34,7 +34,7 @@ def models(
         Argument("words", "get NAME", "`get` fetches the weights of NAME.", shown="a list", words=True),
     ] = None,
 ) -> tuple[Model, ...]:
-    """List the learned detectors of the catalogue, or fetch the weights of one, once.
+    """List the learned detectors, or fetch the weights of one.
 
     Only a file with the known SHA-256 is taken. The weights are kept in your folder of caches, or where the environment
     variable MCAPTRACK_MODELS says.

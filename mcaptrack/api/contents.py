@@ -185,7 +185,7 @@ class LogInfo:
 
 @declared()
 def info(log: EachLog, *, frames: bool = False) -> LogInfo:
-    """Show the channels of a log, their number of messages, and what was made from what.
+    """Show the channels of a log, and what was made from what.
 
     Those of each camera are together, if there are several, under its name. Reads the summary only, unless ``frames``
     asks for more. On the command line -v shows also the parameters that channels were made with.

@@ -63,7 +63,7 @@ def fuse(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> mcaptrack.RunResult:
-    """Fuse the detections of several cameras with one ground to detections of the whole scene.
+    """Fuse the detections of several cameras to those of one scene.
 
     From /CAMERA/detections and /CAMERA/ground_plane to /world/detections: boxes that stand at the same place are
     joined, at most one of each camera, and the score is the probability that a person is there. The ground planes have

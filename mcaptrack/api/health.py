@@ -195,12 +195,12 @@ def doctor(
         str | None, Argument("store", "STORE", "A bucket or prefix to try, such as s3://robots/night.")
     ] = None,
 ) -> DoctorResult:
-    """Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with a store.
+    """Print what this installation, or a store, has and lacks.
 
-    Pictures are encoded and decoded, a table is written, and a log is written to the temporary folder and read back.
-    The network is used for a store only: objects are listed there, and a small hidden one is written, read, replaced
-    and removed. The exit code is 0 if all that a plain run needs is there, and 1 otherwise, with one line for each
-    fault.
+    Versions, codecs, memory, folders and plug-ins are listed. Pictures are encoded and decoded, a table is written, and
+    a log is written to the temporary folder and read back. The network is used for a store only: objects are listed
+    there, and a small hidden one is written, read, replaced and removed. The exit code is 0 if all that a plain run
+    needs is there, and 1 otherwise, with one line for each fault.
 
     Parameters
     ----------

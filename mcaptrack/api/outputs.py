@@ -71,12 +71,12 @@ def report(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> ReportResult:
-    """Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.
+    """Write a page about logs: scores, tracks, identity switches.
 
-    The page needs no network, and runs no script but its own; it contains its numbers as JSON, which --json prints.
-    Scores are those of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs;
-    `mcaptrack run` runs stages that are missing. Of a folder with the tables of many logs, the page has totals, trends,
-    the worst logs, outliers and warnings.
+    It has forecasts and the lineage of results, too. The page needs no network, and runs no script but its own; it
+    contains its numbers as JSON, which --json prints. Scores are those of `mcaptrack evaluate`; without ground truth in
+    the log there are none. Only reads logs; `mcaptrack run` runs stages that are missing. Of a folder with the tables
+    of many logs, the page has totals, trends, the worst logs, outliers and warnings.
 
     Parameters
     ----------

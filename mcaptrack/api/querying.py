@@ -46,7 +46,7 @@ def query(
         Mapping[str, PathLike] | None, Option(QUERY, flag="with", metavar="NAME=FILE", shown=False)
     ] = None,
 ) -> pa.Table:
-    """Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.
+    """Query the tables of logs in SQL: who was where, and how fast.
 
     The tables are those of `mcaptrack export` (`mcaptrack docs tables`); the column `recording` names the log. They are
     read from the files beside the log if those are up to date, otherwise from the log. Each other channel is a table

@@ -69,10 +69,11 @@ def render(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> RenderResult:
-    """Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.
+    """Draw boxes, trails and predictions on the video of a log.
 
-    Draws the views that Foxglove and Lichtblick show, in the same colours. Tracks of 3D boxes are drawn on the pictures
-    of a calibrated camera; without one, they are seen from above in their frame of reference, around the robot.
+    Writes LOG.mp4, or a GIF. Draws the views that Foxglove and Lichtblick show, in the same colours. Tracks of 3D boxes
+    are drawn on the pictures of a calibrated camera; without one, they are seen from above in their frame of reference,
+    around the robot.
 
     With ``compare`` SORT's tracks, re-tracked ones and the ground truth stand side by side. With ``heatmap`` it is a
     picture (.png, .jpg) of where people spend their time.

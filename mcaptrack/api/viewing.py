@@ -293,12 +293,13 @@ def view(
     lichtblick: Annotated[str, Option(_VIEWER)] = LICHTBLICK,
     browser: Annotated[bool, Option(_VIEWER, flag="open/no-open")] = False,
 ) -> LogServer:
-    """Look at a log in the browser: pictures with tracks, events to click, the ground from above, report and tables.
+    """Look at a log in the browser, with its tracks and events.
 
-    Serves one page until Ctrl-C; it needs no connection. Three buttons open the log where it is shown in Lichtblick,
-    Foxglove or Rerun, which read it from this machine. Layout files beside the log are served as they are, also while
-    they are edited; in Foxglove import them (Layouts, Import from file). Only the log and what is made of it is served,
-    and only to this machine; whoever works on it can open the page.
+    The page has pictures, the ground from above, the report and the tables. Serves one page until Ctrl-C; it needs no
+    connection. Three buttons open the log where it is shown in Lichtblick, Foxglove or Rerun, which read it from this
+    machine. Layout files beside the log are served as they are, also while they are edited; in Foxglove import them
+    (Layouts, Import from file). Only the log and what is made of it is served, and only to this machine; whoever works
+    on it can open the page.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ app = typer.Typer(
     name="mcaptrack",
     cls=Group,
     no_args_is_help=True,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
@@ -38,18 +38,19 @@ def _main(
     config: Annotated[
         Path | None,
         typer.Option(
+            metavar="FILE",
             envvar="MCAPTRACK_CONFIG",
             show_envvar=False,
-            help="Read options from this file, not mcaptrack.toml in the working folder (tuning only) and your config "
-            "folder.",
+            help="Read options from this file, not from mcaptrack.toml.",
         ),
     ] = None,
     log_format: Annotated[
         Literal["text", "json"],
         typer.Option(
+            metavar="text|json",
             envvar="MCAPTRACK_LOG_FORMAT",
             show_envvar=False,
-            help="Print notes, progress and errors as lines of text, or as objects of JSON with their times.",
+            help="Print notes and errors as text or as JSON.",
         ),
     ] = "text",
 ) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import difflib
 import re
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from typing import Annotated, Any, Final, NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple, get_args
 
 import typer
 from typer.core import TyperCommand, TyperOption
@@ -17,6 +19,7 @@ from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather, nearest
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.notices import warn
+from mcaptrack.ranges import limits
 
 #: The exception of Typer for a command line that it can't parse.
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
@@ -86,6 +89,7 @@ def _options_of(command: Any) -> list[str]:
 
 #: The first heading, that of options without a theme below it, and the last ones.
 FIRST_PANEL: Final = "Most used"
+OPTIONS: Final = "Options"
 MORE_PANEL: Final = "More options"
 LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands")
 #: The option that shows all options; ``--help`` shows those that most people need.
@@ -130,7 +134,6 @@ class Command(TyperCommand):
         self.settable: tuple[str, ...] = function.settable
         self.set_parameters: list[Parameter] = function.set_parameters
         arrange(self.most_used, self.params)
-        self._is_short = False
         self._help_all: Any = None
         for parameter in self.params:
             every: Any = parameter
@@ -145,29 +148,39 @@ class Command(TyperCommand):
         return option
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the parameters, with ``--help-all``; while the short help is printed, only those that stand in it."""
+        """Return the parameters, with ``--help-all``."""
         if self._help_all is None:
             self._help_all = copy(self.get_help_option(ctx))
             self._help_all.name, self._help_all.opts, self._help_all.callback = "help_all", [ALL], _show_all
             self._help_all.help = "Show all options, by theme, and exit."
-        parameters = [*super().get_params(ctx), self._help_all]
-        return list(filter(self._is_in_short_help, parameters)) if self._is_short else parameters
+        return [*super().get_params(ctx), self._help_all]
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help: with ``--help-all`` of all options, otherwise of those that most people need."""
-        left_out = [] if ctx.meta.get(ALL) else [o for o in self.get_params(ctx) if not self._is_in_short_help(o)]
-        if left_out:
-            panels = dict.fromkeys(re.sub(r" \(.*", "", option.rich_help_panel) for option in left_out)
-            self._is_short, self.epilog = True, f"`{ALL}` shows all options, also: {', '.join(panels)}."
-        try:
-            super().format_help(ctx, formatter)
-        finally:
-            self._is_short, self.epilog = False, None
+        """Print the help: with ``--help-all`` all of it, otherwise the options that most people need, and less text."""
+        is_all = bool(ctx.meta.get(ALL))
+        text, *examples = (self.help or "").split("\n\nExample: ")
+        summary, *more = re.split(r"\n{2,}", text)
+        arguments = [one for one in self.params if one.param_type_name == "argument"]
+        places = (f"{one.metavar}{'...' if one.nargs < 0 else ''}" for one in arguments)
+        places = (place if one.required else f"[{place}]" for place, one in zip(places, arguments, strict=True))
+        formatter.write_usage(ctx.command_path, " ".join(["[OPTIONS]", *places]))
+        for paragraph in (summary, *(more if is_all else more[:1])):
+            write_paragraph(formatter, paragraph)
+        write_section(formatter, "Examples", [(example, "") for example in (examples if is_all else examples[:2])])
+        write_section(formatter, "Arguments", [(one.metavar, one.help or "") for one in arguments])
+        panels: dict[str, list[Any]] = {}
+        for option in self.get_params(ctx):
+            if option.param_type_name == "option" and not option.hidden:
+                panels.setdefault(option.rich_help_panel or OPTIONS, []).append(option)
+        shown = {panel for panel in panels if is_all or self._is_first(panel)}
+        declared = {parameter.name: parameter for parameter in self.parameters}
+        for panel in filter(shown.__contains__, panels):
+            write_section(formatter, panel, [row_of(one, declared.get(one.name), is_all) for one in panels[panel]])
+        if others := dict.fromkeys(re.sub(r" \(.*", "", panel) for panel in panels if panel not in shown):
+            write_paragraph(formatter, f"`{ALL}` shows all options, also: {', '.join(others)}.")
 
-    def _is_in_short_help(self, parameter: Any) -> bool:
-        if parameter.param_type_name != "option":
-            return True
-        panel = parameter.rich_help_panel
+    def _is_first(self, panel: str) -> bool:
+        """Whether the options of a heading are in the short help."""
         return panel == FIRST_PANEL if self.most_used else panel not in LAST_PANELS[1:]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -203,6 +216,42 @@ class Command(TyperCommand):
                 text = " ".join(map(str, value)) if setting.many else str(value)
                 parts.append(f"{setting.name}={text} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
+
+
+def write_paragraph(formatter: Any, text: str) -> None:
+    """Write a paragraph of help; lines that begin with a dash are entries of a list."""
+    formatter.write("\n")
+    for part in re.split(r"\n(?=- )", text):
+        indent = "  " if part.startswith("- ") else ""
+        lines = textwrap.wrap(" ".join(part.split()), formatter.width, subsequent_indent=indent, break_on_hyphens=False)
+        formatter.write("".join(f"{line}\n" for line in lines))
+
+
+def write_section(formatter: Any, heading: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Write a heading and rows in two columns below it, unless there are none."""
+    if rows:
+        with formatter.section(heading):
+            formatter.write_dl(rows, col_max=_NAMES_WIDTH)
+
+
+#: The widest column of the names of options; a longer name has a line of its own.
+_NAMES_WIDTH: Final = 24
+_VALUES: Final[Mapping[Any, str]] = {str: "TEXT", Path: "PATH", int: "N", float: "X", bool: ""}
+
+
+def row_of(option: Any, parameter: Parameter | None = None, is_all: bool = True) -> tuple[str, str]:
+    """The names of an option with its values, and what it means: with its range if all is shown."""
+    names = [*sorted(option.opts, key=len), *option.secondary_opts]
+    if parameter is None:
+        return f"{', '.join(names)} {option.metavar or ''}".strip(), option.help
+    values = parameter.option.metavar or "|".join(get_args(parameter.kind)) or _VALUES[parameter.kind]
+    text, default = option.help or "", parameter.shown
+    if not is_all and (ends := limits(parameter.option.least, parameter.option.most)):
+        text = re.sub(rf" {re.escape(ends[0].upper() + ends[1:])}(?= \(|\.)", "", text).replace("..", ".")
+    if default is None and parameter.option.panel not in LAST_PANELS and parameter.kind is not bool:
+        default = None if parameter.default is None else str(parameter.default)
+    name = "/".join(names) if option.secondary_opts else ", ".join(names)
+    return f"{name} {values}".strip(), f"{text} [{default}]" if isinstance(default, str) and default != "none" else text
 
 
 def _show_all(ctx: Any, _: Any, is_asked: bool) -> None:

@@ -16,13 +16,21 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from mcaptrack import _MODULES
-from mcaptrack.cli.command import HELP, Command, refuse_several, usage_in_one_line, values_of
+from mcaptrack.cli.command import (
+    HELP,
+    Command,
+    refuse_several,
+    row_of,
+    usage_in_one_line,
+    values_of,
+    write_paragraph,
+    write_section,
+)
 from mcaptrack.cli.settings import may_be_set
 from mcaptrack.cli.text import log_format
 from mcaptrack.environment import variable
 
-_MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
-_MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
+_FIRST, _STEP, _RESULTS, _IMPROVE = "Start here", "One step alone", "Results", "Improve and repair"
 _OF_PACKAGES = "Of installed packages"
 #: The options of the program, which may stand before the command or after it.
 PROGRAM_OPTIONS: Final = ("--config", "--log-format")
@@ -64,34 +72,34 @@ def _source_of(module: str) -> str:
 
 
 _LISTED: Final = (
-    Listed("ingest", _MAKE, "ingest:Ingest"),
-    Listed("demo", _MAKE, "demo:Demo"),
-    Listed("run", _RUN, "running:Run"),
-    Listed("detect", _RUN, "stages:StageCommand"),
-    Listed("motion", _RUN, "stages:StageCommand"),
-    Listed("track", _RUN, "stages:StageCommand"),
-    Listed("sample", _RUN, "stages:StageCommand"),
-    Listed("predict", _RUN, "stages:StageCommand"),
-    Listed("retrack", _RUN, "stages:StageCommand"),
-    Listed("fuse", _RUN, "running:Fuse"),
-    Listed("models", _RUN, "models:Models"),
-    Listed("info", _LOOK, "show:Info"),
-    Listed("view", _LOOK, "view:ViewCommand"),
-    Listed("render", _LOOK, "render:Render"),
-    Listed("report", _LOOK, "report:ReportCommand"),
-    Listed("query", _LOOK, "query:Query"),
-    Listed("export", _LOOK, "show:Export"),
-    Listed("docs", _LOOK, "docs:Docs"),
-    Listed("evaluate", _MEASURE, "evaluate:Evaluate"),
-    Listed("events", _MEASURE, "running:Events"),
-    Listed("zones", _MEASURE, "zones:Zones"),
-    Listed("calibrate", _MEASURE, "calibrate:Calibrate"),
-    Listed("tune", _MEASURE, "tune:Tune"),
-    Listed("train", _MEASURE, "train:Train"),
-    Listed("check", _KEEP, "files:Check"),
-    Listed("recover", _KEEP, "files:Recover"),
-    Listed("drop", _KEEP, "files:Drop"),
-    Listed("doctor", _KEEP, "doctor:Doctor"),
+    Listed("demo", _FIRST, "demo:Demo"),
+    Listed("ingest", _FIRST, "ingest:Ingest"),
+    Listed("run", _FIRST, "running:Run"),
+    Listed("view", _FIRST, "view:ViewCommand"),
+    Listed("info", _FIRST, "show:Info"),
+    Listed("report", _FIRST, "report:ReportCommand"),
+    Listed("detect", _STEP, "stages:StageCommand"),
+    Listed("motion", _STEP, "stages:StageCommand"),
+    Listed("track", _STEP, "stages:StageCommand"),
+    Listed("sample", _STEP, "stages:StageCommand"),
+    Listed("predict", _STEP, "stages:StageCommand"),
+    Listed("retrack", _STEP, "stages:StageCommand"),
+    Listed("fuse", _STEP, "running:Fuse"),
+    Listed("models", _STEP, "models:Models"),
+    Listed("render", _RESULTS, "render:Render"),
+    Listed("query", _RESULTS, "query:Query"),
+    Listed("export", _RESULTS, "show:Export"),
+    Listed("evaluate", _RESULTS, "evaluate:Evaluate"),
+    Listed("events", _RESULTS, "running:Events"),
+    Listed("zones", _RESULTS, "zones:Zones"),
+    Listed("tune", _IMPROVE, "tune:Tune"),
+    Listed("train", _IMPROVE, "train:Train"),
+    Listed("calibrate", _IMPROVE, "calibrate:Calibrate"),
+    Listed("check", _IMPROVE, "files:Check"),
+    Listed("recover", _IMPROVE, "files:Recover"),
+    Listed("drop", _IMPROVE, "files:Drop"),
+    Listed("doctor", _IMPROVE, "doctor:Doctor"),
+    Listed("docs", _IMPROVE, "docs:Docs"),
 )
 #: The commands by name.
 ENTRIES: Final = {entry.name: entry for entry in _LISTED}
@@ -102,7 +110,7 @@ _WITH_PLUGINS: Final = ("run", *(entry.name for entry in _LISTED if entry.place 
 def make(entry: Listed, function: Any = None) -> Any:
     """Make a command of Typer of an entry; ``function`` is its function, if it is not the usual one."""
     function = function or entry.command.function_of(entry.name)
-    app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     app.command(
         entry.name,
         cls=Command,
@@ -221,12 +229,16 @@ class Group(TyperGroup):
         return line
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help."""
-        self._lists = True
-        try:
-            super().format_help(ctx, formatter)
-        finally:
-            self._lists = False
+        """Print the help: all commands with their lines, without making them."""
+        formatter.write_usage(ctx.command_path, "[OPTIONS] COMMAND ...")
+        write_paragraph(formatter, self.help or "")
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for entry in {**ENTRIES, **of_packages()}.values():
+            panels.setdefault(entry.panel, []).append((entry.name, entry.summary))
+        for panel, rows in panels.items():
+            write_section(formatter, panel, rows)
+        options = [option for option in self.get_params(ctx) if "completion" not in option.name]
+        write_section(formatter, "Options", [row_of(option) for option in options])
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
         """Complete the name of a command."""
