@@ -6,6 +6,7 @@ shows the option instead, and a command instead of a call.
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -24,13 +25,42 @@ class DamagedError(McaptrackError):
     """A damaged log; `mcaptrack.recover` saves what is intact."""
 
 
-def did_you_mean(name: str, names: Iterable[str]) -> str:
-    """A question for a message, about the name that is meant; "" if none is close."""
+def similar(name: str, names: Iterable[str]) -> str:
+    """The name that is meant by one that there isn't; "" if none is close. All messages ask here.
+
+    It is the same but for capitals, slashes around it, and dashes for other marks; or the only one that ends or begins
+    with it, as a topic and an option with a unit do; or the most similar one.
+    """
     from difflib import get_close_matches
 
-    folded = {each.casefold(): each for each in names}
-    close = get_close_matches(name.casefold(), list(folded), 1)
-    return f"did you mean {folded[close[0]]}? " if close else ""
+    wanted, plain = _plain(name), {_plain(each): each for each in names}
+    if not wanted or wanted in plain:
+        return plain.get(wanted, "")
+    ends = [each for each in plain if each.endswith(f"/{wanted}") or each.startswith(f"{wanted}-")]
+    close = ends if len(ends) == 1 else get_close_matches(wanted, list(plain), 1)
+    return plain[close[0]] if close else ""
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[_ ]", "-", name.casefold()).strip("/")
+
+
+def did_you_mean(name: str, names: Iterable[str]) -> str:
+    """A question for a message, about the name that is meant; "" if none is close."""
+    meant = similar(name, names)
+    return f"did you mean {meant}? " if meant else ""
+
+
+def offer(name: str, names: Iterable[str], has: str = "it has") -> str:
+    """The end of a message about a name that there isn't: which one may be meant, and what there is.
+
+    Examples
+    --------
+    >>> offer("/lidar/box", ["/lidar/boxes", "/imu"])
+    'did you mean /lidar/boxes? it has /lidar/boxes, /imu'
+    """
+    every = list(names)
+    return f"{did_you_mean(name, every)}{has} {list_names(every)}"
 
 
 def call(function: str, *values: str | Path, **parameters: Any) -> str:

@@ -30,7 +30,7 @@ from mcaptrack.api.options import (
     similarity,
 )
 from mcaptrack.choices import Similarity
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, offer
 from mcaptrack.evaluation import (
     COMBINED,
     DEFAULT_GATES_M,
@@ -292,7 +292,7 @@ def _check_name(name: str, row: Mapping[str, Any]) -> None:
     """Raise McaptrackError if a row has no score of this name."""
     scores = [key for key, value in row.items() if isinstance(value, int | float) and key != "gate"]
     if name not in scores:
-        raise McaptrackError(f"there is no score {name}; there are {', '.join(scores)}")
+        raise McaptrackError(f"there is no score {name}; {offer(name, scores, 'there are')}")
 
 
 #: Several distances are one text on the command line: 0.5,1,2.

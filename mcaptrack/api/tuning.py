@@ -31,7 +31,7 @@ from mcaptrack.api.options import (
 )
 from mcaptrack.api.running import transform_of
 from mcaptrack.choices import Similarity
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
 from mcaptrack.evaluation import tuning as searching
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
@@ -230,8 +230,8 @@ def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -
     out = {}
     for name, span in asked.items():
         if name not in declared:
-            text = ", ".join(declared)
-            raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {text}")
+            every = offer(name, declared, "there are")
+            raise McaptrackError(f"`search=` has {name}, which can't be searched; {every}")
         out[name] = declared[name]
         if span is not None:
             low, high = span

@@ -22,6 +22,7 @@ from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.notebook import Choice, arrow_html, show_log
 from mcaptrack.api.options import PathLike, no_progress
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.files import unreadable
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
@@ -456,7 +457,7 @@ def _chosen_layouts(
         try:
             json.loads(file.read_bytes())
         except OSError as error:
-            raise McaptrackError(f"the layout {file} can't be read: {error.strerror}") from None
+            raise unreadable(file, error) from None
         except (ValueError, RecursionError):
             raise McaptrackError(f"{file} is no layout: it is not JSON") from None
         return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}

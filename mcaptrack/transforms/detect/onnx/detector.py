@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.files import missing
 from mcaptrack.geometry.arrays import Image, taken
 from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
@@ -227,7 +228,7 @@ class OnnxDetector:
         if not self.file:
             raise McaptrackError("detector onnx needs a file, as in onnx:FILE")
         if not Path(self.file).is_file():
-            raise McaptrackError(f"detector onnx: there is no file {self.file}")
+            raise McaptrackError(f"detector onnx: {missing(Path(self.file))}")
         return Path(self.file)
 
     def weights_sha256(self) -> str:
