@@ -286,9 +286,8 @@ def missing(path: Path) -> str:
     if meant:
         return f"{path} does not exist; did you mean {folder / meant}?"
     where = "the working folder" if folder == Path() else f"the folder {folder}"
-    return (
-        f"{path} does not exist; {where} has {list_names(of_kind, 5) if of_kind else f'no file {path.suffix}'.strip()}"
-    )
+    has = list_names(of_kind, 5) if of_kind else f"no file that ends with {path.suffix}"
+    return f"{path} does not exist; {where} has {has}" if path.suffix else f"{path} does not exist"
 
 
 def refuse_special(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,6 +17,7 @@ from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather, nearest
 from mcaptrack.cli.text import refuse_usage, say
+from mcaptrack.errors import similar
 from mcaptrack.notices import warn
 from mcaptrack.ranges import limits
 
@@ -55,26 +55,29 @@ def _message(error: Any) -> str:
         if fault["type"] in _NOT:
             return f"{fault['input']!r} is not {_NOT[fault['type']]}"
     message = str(error.message).replace("Value error, ", "")
+    if choice := re.match(r"'(.+)' is not one of (.+)", message):
+        message = message.rstrip(".") + nearest(choice[1], re.findall(r"'(.+?)'", choice[2]))
     return re.sub(r"Got unexpected extra argument(?:s|\(s\))? \((.*)\)", r"too many arguments: \1", message)
 
 
 def _unknown_option(error: Any) -> str:
-    """Return the message about an unknown option: which commands have it, and which options have similar names."""
+    """Return the message about an unknown option: which commands have it, and which option may be meant."""
     name, context = error.option_name, error.ctx
     text = f"no such option: {name}"
     if context is None or context.parent is None:
-        return text
+        return f"{text}{nearest(name, error.possibilities or ())}"
     theirs = {command: _options_of(command_class) for command, command_class in context.parent.command.commands.items()}
     if having := [command for command, options in theirs.items() if name in options]:
         text += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
-    parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
-    if parameter in getattr(context.command, "settable", ()):
-        return f"{text}; did you mean --set {parameter}=VALUE?"
     own_options = theirs.get(context.info_name, [])
-    stem = name.replace("_", "-")
-    alike = [option for option in own_options if option == stem or option.startswith(f"{stem}-")]
-    alike = alike or difflib.get_close_matches(name, own_options, 1, 0.75)
-    return f"{text}; did you mean {' or '.join(alike)}?" if alike else text
+    begin = f"--{name.removeprefix('--').replace('_', '-')}-"
+    if len(alike := [option for option in own_options if option.startswith(begin)]) > 1:
+        return f"{text}; did you mean {' or '.join(alike)}?"
+    settable = {f"--{parameter.replace('_', '-')}": parameter for parameter in getattr(context.command, "settable", ())}
+    meant = similar(name, [*own_options, *settable])
+    if not meant:
+        return text
+    return f"{text}; did you mean {f'--set {settable[meant]}=VALUE' if meant in settable else meant}?"
 
 
 def _options_of(command: Any) -> list[str]:

@@ -26,8 +26,8 @@ from mcaptrack.cli.command import (
     write_paragraph,
     write_section,
 )
-from mcaptrack.cli.settings import may_be_set
-from mcaptrack.cli.text import log_format
+from mcaptrack.cli.settings import may_be_set, nearest
+from mcaptrack.cli.text import log_format, refuse_usage
 from mcaptrack.environment import variable
 
 _FIRST, _STEP, _RESULTS, _IMPROVE = "Start here", "One step alone", "Results", "Improve and repair"
@@ -265,6 +265,12 @@ class Group(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command; refuse an unknown one in one line."""
+        name = args[0]
+        every = self.list_commands(ctx)
+        if name not in every and not name.startswith("-"):
+            is_file = "; a file comes after the command, as in `mcaptrack info FILE`" if Path(name).exists() else ""
+            text = f"there is no command {name}{nearest(name, every) if not is_file else is_file}"
+            refuse_usage(f"{text}{'' if text.endswith('?') else ';'} `mcaptrack --help` lists the commands")
         with usage_in_one_line():
             return super().resolve_command(ctx, args)
 
