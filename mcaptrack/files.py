@@ -281,10 +281,13 @@ def missing(path: Path) -> str:
             names = [entry.name for entry in islice(entries, _MOST_NAMES)]
     except OSError:
         return f"{path} does not exist: there is no folder {folder}"
-    meant = similar(path.name, [name for name in names if not name.startswith(".")])
+    stems: dict[str, list[str]] = {}
+    for name in names:
+        stems.setdefault(Path(name).stem, []).append(name)
+    stem = "" if path.stem.startswith(".") else similar(path.stem, stems)
     of_kind = sorted(name for name in names if path.suffix and name.endswith(path.suffix) and not name.startswith("."))
-    if meant:
-        return f"{path} does not exist; did you mean {folder / meant}?"
+    if stem:
+        return f"{path} does not exist; did you mean {folder / similar(path.name, stems[stem], 0)}?"
     where = "the working folder" if folder == Path() else f"the folder {folder}"
     has = list_names(of_kind, 5) if of_kind else f"no file that ends with {path.suffix}"
     return f"{path} does not exist; {where} has {has}" if path.suffix else f"{path} does not exist"

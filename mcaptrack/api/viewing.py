@@ -21,7 +21,7 @@ from mcaptrack.api.common import as_path, log_file
 from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.notebook import Choice, arrow_html, show_log
 from mcaptrack.api.options import PathLike, no_progress
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, offer
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn
@@ -463,8 +463,8 @@ def _chosen_layouts(
         return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}
     layouts = _layouts(path, opened, made_layouts, notes)
     if chosen is not None and str(chosen) not in layouts:
-        text = ", ".join(layouts) or "none"
-        raise McaptrackError(f"{path} has no layout {chosen}; it has {text}. A file of a layout ends with .json")
+        every = offer(str(chosen), layouts)
+        raise McaptrackError(f"{path} has no layout {chosen}; {every}. A file of a layout ends with .json")
     return {
         name: (layout_path(path, name).name, content)
         for name, content in layouts.items()

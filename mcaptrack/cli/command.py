@@ -73,11 +73,10 @@ def _unknown_option(error: Any) -> str:
     begin = f"--{name.removeprefix('--').replace('_', '-')}-"
     if len(alike := [option for option in own_options if option.startswith(begin)]) > 1:
         return f"{text}; did you mean {' or '.join(alike)}?"
-    settable = {f"--{parameter.replace('_', '-')}": parameter for parameter in getattr(context.command, "settable", ())}
-    meant = similar(name, [*own_options, *settable])
-    if not meant:
-        return text
-    return f"{text}; did you mean {f'--set {settable[meant]}=VALUE' if meant in settable else meant}?"
+    parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
+    is_set = parameter in getattr(context.command, "settable", ())
+    meant = f"--set {parameter}=VALUE" if is_set else similar(name, own_options, 0.75)
+    return f"{text}; did you mean {meant}?" if meant else text
 
 
 def _options_of(command: Any) -> list[str]:

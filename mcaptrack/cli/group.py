@@ -29,6 +29,7 @@ from mcaptrack.cli.command import (
 from mcaptrack.cli.settings import may_be_set, nearest
 from mcaptrack.cli.text import log_format, refuse_usage
 from mcaptrack.environment import variable
+from mcaptrack.errors import command
 
 _FIRST, _STEP, _RESULTS, _IMPROVE = "Start here", "One step alone", "Results", "Improve and repair"
 _OF_PACKAGES = "Of installed packages"
@@ -268,8 +269,9 @@ class Group(TyperGroup):
         name = args[0]
         every = self.list_commands(ctx)
         if name not in every and not name.startswith("-"):
-            is_file = "; a file comes after the command, as in `mcaptrack info FILE`" if Path(name).exists() else ""
-            text = f"there is no command {name}{nearest(name, every) if not is_file else is_file}"
+            if Path(name).exists():
+                refuse_usage(f"{name} is a file, not a command; commands come first, as in {command('info', name)}")
+            text = f"there is no command {name}{nearest(name, every)}"
             refuse_usage(f"{text}{'' if text.endswith('?') else ';'} `mcaptrack --help` lists the commands")
         with usage_in_one_line():
             return super().resolve_command(ctx, args)
