@@ -47,7 +47,8 @@ def similar(name: str, names: Iterable[str], least: float = 0.6) -> str:
     ends = [each for each in plain if each.endswith(f"/{wanted}") or each.startswith(f"{wanted}-")]
     nearly, close = (get_close_matches(wanted, list(plain), 1, cutoff) for cutoff in (_NEARLY, least))
     meant = (nearly or (ends if len(ends) == 1 else close) or [""])[0]
-    shared = os.path.commonprefix([wanted, meant]).rfind("/") + 1  # names below one folder are alike by that alone
+    # names below one folder are alike by that alone
+    shared = os.path.commonprefix([wanted, meant]).rfind("/") + 1  # noqa: RUF071  # characters are meant
     is_close = meant in ends or SequenceMatcher(None, wanted[shared:], meant[shared:]).ratio() >= least
     return plain[meant] if meant and is_close else ""
 
