@@ -76,8 +76,8 @@ def run(
         bool | None, Option(_CLASSES, tuning=True, flag="across-classes/within-classes", shown="within")
     ] = None,
     class_limits: Annotated[str | None, Option(_CLASSES, tuning=LIMITS_PATTERN, shown="a table")] = None,
-    fit_plane: Annotated[bool | None, Option(tuning=True, is_set=True, shown="estimate")] = None,
-    person_height_m: Annotated[float | None, Option("", 0.1, 10, tuning=True, is_set=True, shown="1.7")] = None,
+    fit_plane: Annotated[bool | None, Option(tuning=True, shown="estimate")] = None,
+    person_height_m: Annotated[float | None, Option("", 0.1, 10, tuning=True, shown="1.7")] = None,
     ground_frame: Annotated[str | None, Option(shown="the fixed frame")] = None,
     stages: Stages = None,
     follows: Annotated[PathLike | Sequence[PathLike] | None, PYTHON_ONLY] = None,

@@ -122,7 +122,7 @@ class RetrackOptions:
     across_classes: bool = option(False, theme=_ASSOCIATION)
     class_limits: str = setting("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
     smooth: bool = option(True, theme=_OFFLINE)
-    side_view: bool = setting(False, theme=_ASSOCIATION)
+    side_view: bool = option(False, theme=_ASSOCIATION)
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
     class_names: ClassNames = context(tuple, is_recorded=False)
