@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from mcaptrack import environment
-from mcaptrack.cli.command import FIRST_PANEL, LAST_PANELS
 from mcaptrack.cli.group import ENTRIES
+from mcaptrack.cli.help import FIRST_PANEL, LAST_PANELS
 from mcaptrack.cli.many import NAMES
 from mcaptrack.cli.stages import shown_default
 from mcaptrack.transforms import STAGES

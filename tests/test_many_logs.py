@@ -49,7 +49,9 @@ def test_outputs_go_to_a_folder_under_the_names_of_the_logs(folder):
     Path("made").mkdir()
     done("drop", "logs/a.mcap", "/camera/video", "-o", "made")
     assert Path("made/a.mcap").read_bytes() == Path("small/a.mcap").read_bytes()
-    assert call("drop", "logs", "/camera/video", "-o", "one.mcap").err.endswith("name a folder for their results, or leave it out\n")
+    assert call("drop", "logs", "/camera/video", "-o", "one.mcap").err.endswith(
+        "name a folder for their results, or leave it out\n"
+    )
 
 
 def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):

@@ -431,7 +431,9 @@ class TestInLogs:
         assert "detector knn takes no file" in call("detect", log, "--detector", "knn:file").err
         assert "are two files; give one" in call("detect", log, "--detector", "onnx:a", "--file", "b").err
         err = call("detect", log, "--set", "layout=yolox").err
-        assert err == "mcaptrack: --set layout is an option of onnx, yolox-nano, yolox-tiny and yolox-s, not of median\n"
+        assert (
+            err == "mcaptrack: --set layout is an option of onnx, yolox-nano, yolox-tiny and yolox-s, not of median\n"
+        )
 
 
 def test_the_laws_of_transforms_hold(network):

@@ -182,7 +182,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "render", "LOG"
     ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
-    "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says("evaluate", "LOG", "--set", "smoothed=true"),
+    "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says(
+        "evaluate", "LOG", "--set", "smoothed=true"
+    ),
     "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/following.py:_check_camera:run": Scene.followed,
     "pipeline/fusing.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,

@@ -456,7 +456,11 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
     ("words", "changed", "corrupted"),
     [
         ("--epochs 3 --set batch=9 --set rate=0.01", {"epochs": 3, "batch": 9, "rate": 0.01}, {}),
-        ("--set patience=4 --seed 6 --set consistency_weight=2", {"patience": 4, "seed": 6, "consistency_weight": 2.0}, {}),
+        (
+            "--set patience=4 --seed 6 --set consistency_weight=2",
+            {"patience": 4, "seed": 6, "consistency_weight": 2.0},
+            {},
+        ),
         ("--set noise_m=0.2 --set gaps=0.1 --set scale=0.3", {}, {"noise_m": 0.2, "gaps": 0.1, "scale": 0.3}),
         ("--set noise_m=0 --set gaps=0 --set scale=0", {}, {"noise_m": 0.0, "gaps": 0.0, "scale": 0.0}),
         ("--recipe paper --epochs 1 --set gaps=0.9", {"epochs": 1}, {"gaps": 0.9}),

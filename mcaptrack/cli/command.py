@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from pathlib import Path
-from typing import Annotated, Any, Final, NamedTuple, get_args
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperOption
 
 from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.flags import RUNNING
+from mcaptrack.cli.help import ALL, HELP, LAST_PANELS, write_page
 from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather, nearest
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.errors import similar
 from mcaptrack.notices import warn
-from mcaptrack.ranges import limits
 
 #: The exception of Typer for a command line that it can't parse.
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
@@ -83,47 +81,6 @@ def _options_of(command: Any) -> list[str]:
     return [name for option in command.params if not getattr(option, "hidden", False) for name in option.opts]
 
 
-# The headings of options in the help, and the options that come first: those that most people need.
-#
-# The other options of a command stand below their themes, then input and output, many logs, and those of all
-# commands.
-
-
-#: The first heading, that of options without a theme below it, and the last ones.
-FIRST_PANEL: Final = "Most used"
-OPTIONS: Final = "Options"
-MORE_PANEL: Final = "More options"
-LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands")
-#: The option that shows all options; ``--help`` shows those that most people need.
-ALL: Final = "--help-all"
-HELP: Final = ("--help", "-h", ALL)
-
-#: The heading of a theme that not all detectors, trackers or predictors have: the names of those that have it.
-_THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
-
-
-def arrange(first: Sequence[str], parameters: list[Any]) -> None:
-    """Put the parameters of a command into the order of its help, below its headings; ``first`` come first."""
-    for parameter in parameters:
-        if parameter.param_type_name != "option":
-            continue
-        if parameter.name in first:
-            those = _THOSE.search(parameter.rich_help_panel or "")
-            if those:
-                parameter.help = f"{parameter.help.rstrip('.')} ({those[1] or those[2]})."
-            parameter.rich_help_panel = FIRST_PANEL
-        elif first and not parameter.rich_help_panel:
-            parameter.rich_help_panel = MORE_PANEL
-
-    def place(parameter: Any) -> tuple[int, int]:
-        panel = getattr(parameter, "rich_help_panel", None)
-        if panel == FIRST_PANEL:
-            return -1, first.index(parameter.name)
-        return (1 + LAST_PANELS.index(panel), 0) if panel in LAST_PANELS else (0, 0)
-
-    parameters.sort(key=place)
-
-
 class Command(TyperCommand):
     """A command. ``settings`` has its options by name."""
 
@@ -135,7 +92,7 @@ class Command(TyperCommand):
         self.most_used: tuple[str, ...] = function.most_used
         self.settable: tuple[str, ...] = function.settable
         self.set_parameters: list[Parameter] = function.set_parameters
-        arrange(self.most_used, self.params)
+        self._function = function
         self._help_all: Any = None
         for parameter in self.params:
             every: Any = parameter
@@ -146,7 +103,6 @@ class Command(TyperCommand):
         option = super().get_help_option(ctx)
         if option is not None:
             option.rich_help_panel = LAST_PANELS[-1]
-            option.help = "Show the options that most people need, and exit."
         return option
 
     def get_params(self, ctx: Any) -> list[Any]:
@@ -154,36 +110,11 @@ class Command(TyperCommand):
         if self._help_all is None:
             self._help_all = copy(self.get_help_option(ctx))
             self._help_all.name, self._help_all.opts, self._help_all.callback = "help_all", [ALL], _show_all
-            self._help_all.help = "Show all options, by theme, and exit."
         return [*super().get_params(ctx), self._help_all]
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help: with ``--help-all`` all of it, otherwise the options that most people need, and less text."""
-        is_all = bool(ctx.meta.get(ALL))
-        text, *examples = (self.help or "").split("\n\nExample: ")
-        summary, *more = re.split(r"\n{2,}", text)
-        arguments = [one for one in self.params if one.param_type_name == "argument"]
-        places = (f"{one.metavar}{'...' if one.nargs < 0 else ''}" for one in arguments)
-        places = (place if one.required else f"[{place}]" for place, one in zip(places, arguments, strict=True))
-        formatter.write_usage(ctx.command_path, " ".join(["[OPTIONS]", *places]))
-        for paragraph in (summary, *(more if is_all else more[:1])):
-            write_paragraph(formatter, paragraph)
-        write_section(formatter, "Examples", [(example, "") for example in (examples if is_all else examples[:2])])
-        write_section(formatter, "Arguments", [(one.metavar, one.help or "") for one in arguments])
-        panels: dict[str, list[Any]] = {}
-        for option in self.get_params(ctx):
-            if option.param_type_name == "option" and not option.hidden:
-                panels.setdefault(option.rich_help_panel or OPTIONS, []).append(option)
-        shown = {panel for panel in panels if is_all or self._is_first(panel)}
-        declared = {parameter.name: parameter for parameter in self.parameters}
-        for panel in filter(shown.__contains__, panels):
-            write_section(formatter, panel, [row_of(one, declared.get(one.name), is_all) for one in panels[panel]])
-        if others := dict.fromkeys(re.sub(r" \(.*", "", panel) for panel in panels if panel not in shown):
-            write_paragraph(formatter, f"`{ALL}` shows all options, also: {', '.join(others)}.")
-
-    def _is_first(self, panel: str) -> bool:
-        """Whether the options of a heading are in the short help."""
-        return panel == FIRST_PANEL if self.most_used else panel not in LAST_PANELS[1:]
+        """Print the help: with ``--help-all`` all of it."""
+        write_page(formatter, ctx.command_path, self._function, bool(ctx.meta.get(ALL)))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line; whatever is wrong with it ends the command in one line.
@@ -218,42 +149,6 @@ class Command(TyperCommand):
                 text = " ".join(map(str, value)) if setting.many else str(value)
                 parts.append(f"{setting.name}={text} ({where or 'command line'})")
         return f"options: {', '.join(parts)}"
-
-
-def write_paragraph(formatter: Any, text: str) -> None:
-    """Write a paragraph of help; lines that begin with a dash are entries of a list."""
-    formatter.write("\n")
-    for part in re.split(r"\n(?=- )", text):
-        indent = "  " if part.startswith("- ") else ""
-        lines = textwrap.wrap(" ".join(part.split()), formatter.width, subsequent_indent=indent, break_on_hyphens=False)
-        formatter.write("".join(f"{line}\n" for line in lines))
-
-
-def write_section(formatter: Any, heading: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Write a heading and rows in two columns below it, unless there are none."""
-    if rows:
-        with formatter.section(heading):
-            formatter.write_dl(rows, col_max=_NAMES_WIDTH)
-
-
-#: The widest column of the names of options; a longer name has a line of its own.
-_NAMES_WIDTH: Final = 24
-_VALUES: Final[Mapping[Any, str]] = {str: "TEXT", Path: "PATH", int: "N", float: "X", bool: ""}
-
-
-def row_of(option: Any, parameter: Parameter | None = None, is_all: bool = True) -> tuple[str, str]:
-    """The names of an option with its values, and what it means: with its range if all is shown."""
-    names = [*sorted(option.opts, key=len), *option.secondary_opts]
-    if parameter is None:
-        return f"{', '.join(names)} {option.metavar or ''}".strip(), option.help
-    values = parameter.option.metavar or "|".join(get_args(parameter.kind)) or _VALUES[parameter.kind]
-    text, default = option.help or "", parameter.shown
-    if not is_all and (ends := limits(parameter.option.least, parameter.option.most)):
-        text = re.sub(rf" {re.escape(ends[0].upper() + ends[1:])}(?= \(|\.)", "", text).replace("..", ".")
-    if default is None and parameter.option.panel not in LAST_PANELS and parameter.kind is not bool:
-        default = None if parameter.default is None else str(parameter.default)
-    name = "/".join(names) if option.secondary_opts else ", ".join(names)
-    return f"{name} {values}".strip(), f"{text} [{default}]" if isinstance(default, str) and default != "none" else text
 
 
 def _show_all(ctx: Any, _: Any, is_asked: bool) -> None:

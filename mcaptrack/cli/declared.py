@@ -30,7 +30,8 @@ from mcaptrack.api.declared import (
 )
 from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import LAST_PANELS, Set, Settable, values_set
+from mcaptrack.cli.command import Set, Settable, values_set
+from mcaptrack.cli.help import LAST_PANELS, arranged
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 
@@ -155,10 +156,14 @@ def command(
     parameters = {name: option for name, option in every.items() if name not in settable}
     if settable:
         parameters["set"] = parameter_of("set", Set, None)
-    annotations = {
-        about.name: argument_annotation(about, hints[parameter], signature[parameter].default)
+    most_used = most_used or getattr(declared, "most_used", ())
+    options = arranged(most_used, parameters.values())
+    arguments = [
+        (about, *argument_annotation(about, hints[parameter], signature[parameter].default))
         for parameter, about in arguments_of(declared).items()
-    } | {option.name: (annotation_of(option), option.default) for option in parameters.values()}
+    ]
+    annotations = {about.name: (hint, default) for about, _, hint, default in arguments}
+    annotations |= {option.name: (annotation_of(option), option.default) for option in options}
 
     def call(**values: Any) -> None:
         defaults = {parameter: every[parameter].default for parameter in settable}
@@ -170,9 +175,10 @@ def command(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
     function.__name__, function.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    function.parameters, function.settable = tuple(parameters.values()), tuple(settable)
+    function.parameters, function.settable = tuple(options), tuple(settable)
     function.set_parameters = [every[parameter] for parameter in settable]
-    function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
+    function.help, function.most_used = help_of(declared), most_used
+    function.places = [(usage, about.metavar, about.text) for about, usage, *_ in arguments]
     return function  # type: ignore[no-any-return]
 
 
@@ -182,30 +188,30 @@ def parameters_of(options: type) -> list[Parameter]:
     return [parameter_of(name, hint, getattr(options, name)) for name, hint in hints.items()]
 
 
-def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:
-    """Return the annotation and the default of an argument, as Typer takes them; ``hint`` is its type in Python."""
+def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[str, Any, Any]:
+    """Return how the usage shows an argument, and its annotation and default, as Typer takes them.
+
+    ``hint`` is its type in Python.
+    """
     kind, many = (str, True) if about.words else on_command_line(bare(hint))
     many = many or (isinstance(about, OneOfMany) and not about.is_one)
     is_needed = default is inspect.Parameter.empty and not about.words
     kind = list[kind] if many else kind  # type: ignore[valid-type]
-    argument = typer.Argument(metavar=about.metavar, help=about.text, show_default=about.shown)
-    return Annotated[kind if is_needed else kind | None, argument], default if is_needed else None
+    usage = f"{about.metavar}{'...' if many else ''}"
+    annotation = Annotated[kind if is_needed else kind | None, typer.Argument(metavar=about.metavar, help=about.text)]
+    return usage if is_needed else f"[{usage}]", annotation, default if is_needed else None
 
 
 def annotation_of(parameter: Parameter) -> Any:
-    """Return the annotation of an option, as Typer takes it. The help names the range.
-
-    Options of all commands, and of input and output, show no defaults unless they are declared to.
-    """
+    """Return the annotation of an option, as Typer takes it. The help names the range."""
     about, text = parameter.option, parameter.help
     if ends := limits(about.least, about.most):
         text += f" {ends[0].upper()}{ends[1:]}."
-    shown = about.panel not in (COMMON, FILES) if parameter.shown is None else parameter.shown
     info = typer.Option(
         *parameter.flags,
         help=text,
         metavar=about.metavar,
-        show_default=shown,
+        show_default=parameter.shown if parameter.shown is not None else True,
         show_envvar=False,
         rich_help_panel=about.panel or None,
         case_sensitive=False,

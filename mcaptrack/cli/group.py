@@ -16,16 +16,8 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from mcaptrack import _MODULES
-from mcaptrack.cli.command import (
-    HELP,
-    Command,
-    refuse_several,
-    row_of,
-    usage_in_one_line,
-    values_of,
-    write_paragraph,
-    write_section,
-)
+from mcaptrack.cli.command import Command, refuse_several, usage_in_one_line, values_of
+from mcaptrack.cli.help import ALL, HELP, write_page, write_paragraph, write_section
 from mcaptrack.cli.settings import may_be_set, nearest
 from mcaptrack.cli.text import log_format, refuse_usage
 from mcaptrack.environment import variable
@@ -239,7 +231,8 @@ class Group(TyperGroup):
         for panel, rows in panels.items():
             write_section(formatter, panel, rows)
         options = [option for option in self.get_params(ctx) if "completion" not in option.name]
-        write_section(formatter, "Options", [row_of(option) for option in options])
+        rows = [(f"{', '.join(option.opts)} {option.metavar or ''}".strip(), option.help) for option in options]
+        write_section(formatter, "Options", rows)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
         """Complete the name of a command."""
@@ -257,6 +250,12 @@ class Group(TyperGroup):
         config = Path(named) if (named := next(values_of(own, "--config"), variable("MCAPTRACK_CONFIG"))) else None
         said = next(values_of(own, "--log-format"), variable("MCAPTRACK_LOG_FORMAT"))
         ctx.with_resource(log_format(said, next((word for word in rest if not word.startswith("-")), "")))
+        if len(rest) == 2 and rest[1] in HELP and rest[0] in self._own:
+            formatter = ctx.make_formatter()
+            path, function = f"{ctx.command_path} {rest[0]}", ENTRIES[rest[0]].command.function_of(rest[0])
+            write_page(formatter, path, function, rest[1] == ALL)
+            typer.echo(formatter.getvalue().rstrip("\n"))
+            ctx.exit()
         functions = _with_plugins(self._own, rest, config)
         self.commands = self._own.changed({name: make(ENTRIES[name], functions[name]) for name in functions})
         with usage_in_one_line():
@@ -312,8 +311,7 @@ def _split(args: list[str]) -> tuple[list[str], list[str]]:
 
 def _with_plugins(commands: Commands, arguments: list[str], config: Path | None) -> dict[str, Any]:
     """The functions of commands with options of plug-ins in this call. Where there can be none, nothing is loaded."""
-    is_help = len(arguments) == 2 and arguments[1] in HELP
-    if is_help or not (set(arguments) & set(_WITH_PLUGINS) or config or may_be_set()):
+    if not (set(arguments) & set(_WITH_PLUGINS) or config or may_be_set()):
         return {}
     from mcaptrack.cli.plugins import commands_with_plugins
 

@@ -19,8 +19,8 @@ from mcaptrack import notices
 from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import LAST_PANELS
 from mcaptrack.cli.declared import Called, parameters_of
+from mcaptrack.cli.help import LAST_PANELS
 from mcaptrack.cli.text import is_json, printable, say, stdout_to_stderr
 from mcaptrack.environment import variable
 from mcaptrack.errors import McaptrackError

@@ -16,8 +16,9 @@ from typing import Any
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.command import HELP, values_of
+from mcaptrack.cli.command import values_of
 from mcaptrack.cli.config import ConfigFile, read_files
+from mcaptrack.cli.help import HELP
 from mcaptrack.cli.stages import StageCommand
 from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.environment import PREFIX
