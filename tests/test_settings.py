@@ -193,8 +193,8 @@ class TestUnknownNames:
         monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")
         assert refused("run", "x.mcap").endswith("; did you mean MCAPTRACK_TRACK_MAX_AGE_S?\n")
 
-    def test_variables_that_are_not_options_are_in_one_list(self, monkeypatch):
-        values = {"MCAPTRACK_CONFIG": os.devnull, "MCAPTRACK_LOG_FORMAT": "text"}
+    def test_variables_that_are_not_options_are_in_one_list(self, folder, monkeypatch):
+        values = {"MCAPTRACK_CONFIG": str(put(folder.parent / "a.toml", "")), "MCAPTRACK_LOG_FORMAT": "text"}
         for name in environment.VARIABLES:
             monkeypatch.setenv(name, values.get(name, "1"))
         assert call("info", "x.mcap").code == 1

@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from mcaptrack import __version__, log
+from mcaptrack import __version__
 from mcaptrack.api.declared import Argument, declared
 from mcaptrack.environment import THREADS, cache_folder, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
@@ -29,6 +29,8 @@ _REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([
 
 def temporary_folder() -> tuple[Path | None, str]:
     """Return the folder for temporary files, and why a log can't be written to it and read back ("" if it can)."""
+    from mcaptrack import log
+
     folder = None
     try:
         folder = Path(tempfile.gettempdir())

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 from mcaptrack.api.common import as_path, detail, locations_of
 from mcaptrack.api.declared import PYTHON_ONLY, Argument, Option, checked, declared
 from mcaptrack.api.options import PathLike
-from mcaptrack.tables import RECORDING, TABLES
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -183,6 +182,8 @@ def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, 
     ('frames', ('log',))
 
     """
+    from mcaptrack.tables import RECORDING, TABLES
+
     tables = tuple(
         TableInfo(
             table.name,

@@ -54,8 +54,6 @@ def _main(
         ),
     ] = "text",
 ) -> None:
-    """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results
-    into the log.
-
-    Start with `mcaptrack demo`, or with `mcaptrack ingest video.mp4` and `mcaptrack run video.mcap`.
+    """Detect and track people in a video or a log, repair the tracks, and predict where people go. Start with
+    `mcaptrack demo`, or with `mcaptrack ingest video.mp4` and `mcaptrack run video.mcap`.
     """

@@ -230,9 +230,9 @@ class Group(TyperGroup):
             panels.setdefault(entry.panel, []).append((entry.name, entry.summary))
         for panel, rows in panels.items():
             write_section(formatter, panel, rows)
-        options = [option for option in self.get_params(ctx) if "completion" not in option.name]
-        rows = [(f"{', '.join(option.opts)} {option.metavar or ''}".strip(), option.help) for option in options]
-        write_section(formatter, "Options", rows)
+        own = [option for option in self.get_params(ctx) if option.opts[0] in PROGRAM_OPTIONS]
+        rows = [(f"{option.opts[0]} {option.metavar}", option.help) for option in own]
+        write_section(formatter, "Options", [*rows, ("-h, --help, --version", "Show this page, or the version.")])
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
         """Complete the name of a command."""
