@@ -117,7 +117,7 @@ def tune(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> TuneResult:
-    """Find the settings of a stage that score best against ground truth.
+    """Find the settings of a stage that score best.
 
     Reads detections and ground truth from logs, or from files with ``truth``. The command writes the best settings to
     mcaptrack.toml, which every command reads; other settings in it stay. A search that was interrupted continues where

@@ -41,7 +41,7 @@ def _main(
             metavar="FILE",
             envvar="MCAPTRACK_CONFIG",
             show_envvar=False,
-            help="Read options from this file, not from mcaptrack.toml.",
+            help="Read options from this file.",
         ),
     ] = None,
     log_format: Annotated[
