@@ -18,10 +18,6 @@ _PARTS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd", ".bag")
 _SPLIT: Final = re.compile(r"(.+?)_(\d{1,9})(\.(?:mcap|db3)(?:\.zstd)?)")
 
 
-#: Endings of the names of label files.
-_TEXTS: Final = (".txt", ".csv", ".json", ".xml")
-
-
 def refuse_non_mcap(path: Path) -> None:
     """Raise McaptrackError for a recording in another format, with the command that converts it to a log.
 
@@ -78,5 +74,4 @@ def _file(path: Path) -> str:
         return "a compressed file of rosbag2"
     if head[4:8] == b"ftyp" or head.startswith(_MATROSKA) or (head[:4], head[8:12]) == (b"RIFF", b"AVI "):
         return "a video"
-    text = "a text file" if path.suffix.lower() in _TEXTS and head else ""
-    return next((what for begin, what in _BEGIN.items() if head.startswith(begin)), text)
+    return next((what for begin, what in _BEGIN.items() if head.startswith(begin)), "")
