@@ -132,7 +132,10 @@ def test_a_layout_from_a_file_is_served_alone(finished, tmp_path):
     for name, words in (
         (mine, "is no layout: it is not JSON"),
         (tmp_path / "none.json", "does not exist"),
-        ("trackin", "has no layout trackin; did you mean tracking? it has tracking, comparing, predictions. A file of a layout ends"),
+        (
+            "trackin",
+            "has no layout trackin; did you mean tracking? it has tracking, comparing, predictions. A file of a layout ends",
+        ),
     ):
         with pytest.raises(McaptrackError) as refused:
             mcaptrack.view(finished, layout=name)

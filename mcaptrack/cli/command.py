@@ -14,7 +14,7 @@ from typer.core import TyperCommand, TyperOption
 from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.help import ALL, HELP, LAST_PANELS, write_page
-from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather, nearest
+from mcaptrack.cli.settings import SWITCH, Given, Setting, declared_settings, found_of, gather, nearest
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.errors import similar
 from mcaptrack.notices import warn
@@ -267,7 +267,6 @@ Set = Annotated[
         help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
     ),
 ]
-_SWITCH: Final = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false", "no", "off", "0"), False)
 _KIND_WORDS: Final = {bool: "true or false", int: "a whole number", float: "a number"}
 
 
@@ -290,7 +289,7 @@ class Settable(NamedTuple):
 
     def _one(self, value: str) -> Any:
         if self.kind is bool:
-            return _SWITCH[value.lower()]
+            return SWITCH[value.lower()]
         return self.kind(value) if self.kind in (int, float) else value
 
 

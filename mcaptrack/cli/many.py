@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
-import sys
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from time import monotonic
@@ -21,7 +19,7 @@ from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Called, parameters_of
 from mcaptrack.cli.help import LAST_PANELS
-from mcaptrack.cli.text import is_json, printable, say, stdout_to_stderr
+from mcaptrack.cli.text import is_json, say, stdout_to_stderr
 from mcaptrack.environment import variable
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
@@ -149,12 +147,17 @@ class EachLog(Called[T]):
         return output if is_folder else None
 
     def run(self, names: Mapping[str, str]) -> None:
-        """Call the function with each log and its ``arguments``, and print what it returns."""
-        with common.Talk(self.values["quiet"], self.values["verbose"]).open() as talk:
-            self.inputs = self.logs()
-            arguments = self.arguments(names)
-            results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
-        self.print_result(results, totals)
+        """Call the function with each log and its ``arguments``, and print what it returns; to a file, if one is named.
+
+        That is for commands that print their results: for others it is what the function writes.
+        """
+        file = self.values["output"] if self.prints_results else None
+        with common.printed_to(file, self.values.get("force", False)):
+            with common.Talk(self.values["quiet"], self.values["verbose"]).open() as talk:
+                self.inputs = self.logs()
+                arguments = self.arguments(names)
+                results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
+            self.print_result(results, totals)
         if code := self.code(results):
             raise typer.Exit(code)
 
@@ -200,21 +203,19 @@ class EachLog(Called[T]):
 
         listener: _Printer[T] = _Printer(self, talk, [log.path for log in logs])
         try:
-            is_hidden = talk.quiet or self.prints_results or is_json()
-            with LiveTable.on_terminal(is_hidden) as table:
-                return run_fleet(
-                    self.function,
-                    logs,
-                    options,
-                    name=self.name,
-                    output_dir=folder,
-                    suffix=self.suffix(),
-                    writes=self.writes,
-                    on_outcome=listener.hear,
-                    on_status=lambda status: listener.watch(status, table),
-                    on_note=talk.say,
-                    **self.many.for_fleet(),
-                )
+            return run_fleet(
+                self.function,
+                logs,
+                options,
+                name=self.name,
+                output_dir=folder,
+                suffix=self.suffix(),
+                writes=self.writes,
+                on_outcome=listener.hear,
+                on_status=listener.watch,
+                on_note=talk.say,
+                **self.many.for_fleet(),
+            )
         except (KeyboardInterrupt, SystemExit) as ended:
             if isinstance(ended, KeyboardInterrupt) or ended.code == 128 + signal.SIGTERM:
                 talk.say(
@@ -255,16 +256,19 @@ class _Printer(Generic[T]):
             summary = self._work.line(outcome.result)
             self._talk.say(f"{outcome.log}: {summary}", "info", "log", **_about(outcome))
 
-    def watch(self, status: FleetStatus, table: LiveTable) -> None:
-        """Show how far the logs are: in a table, or now and then in a line for programs."""
-        table.show(status)
-        if monotonic() - self._shown < common.PROGRESS_S:
-            return
-        self._shown = monotonic()
+    def watch(self, status: FleetStatus) -> None:
+        """Show how far the logs are: in a bar, or now and then in a line for programs."""
         ended = status.logs - status.left
-        running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
-        text = f"{ended} of {status.logs} logs"
-        self._talk.event(text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
+        if not is_json():
+            if not self._work.prints_results:
+                self._talk.progress("logs", ended, status.logs)
+        elif monotonic() - self._shown >= common.PROGRESS_S:
+            self._shown = monotonic()
+            running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
+            text = f"{ended} of {status.logs} logs"
+            self._talk.event(
+                text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running
+            )
 
     def _show_in_order(self, outcome: LogOutcome[T]) -> None:
         self._waiting[outcome.log] = outcome.result
@@ -314,52 +318,3 @@ def _seconds(text: str | None) -> float | None:
     if match is None or not float(match[1]):
         raise McaptrackError(f"--timeout needs a time such as 90s, 10m or 2h, not {text!r:.40}")
     return float(match[1]) * _SECONDS[match[2]]
-
-
-# A table of the logs that workers are busy with, on a terminal.
-
-
-class LiveTable:
-    """The table; without a terminal it shows nothing."""
-
-    def __init__(self, live: Any = None) -> None:
-        self._live = live
-
-    @classmethod
-    @contextmanager
-    def on_terminal(cls, hidden: bool) -> Iterator[LiveTable]:
-        """Show a table within this block, if stderr is a terminal; lines that are printed appear above it."""
-        if hidden or not sys.stderr.isatty():
-            yield cls()
-            return
-        from rich.console import Console
-        from rich.live import Live
-
-        console = Console(stderr=True, markup=False, emoji=False, highlight=False)
-        with Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False) as live:
-            yield cls(live)
-
-    def show(self, status: FleetStatus) -> None:
-        """Show how far the logs are."""
-        if self._live is not None:
-            self._live.update(table_of(status), refresh=True)
-
-
-def table_of(status: FleetStatus) -> Any:
-    """Return the table: a line for each log that runs, below the number of those that ended."""
-    from rich.table import Table
-    from rich.text import Text
-
-    counts = ", ".join(f"{count} {state}" for state, count in sorted(status.ended.items()))
-    title = f"{status.logs - status.left} of {status.logs} logs in {status.seconds:.0f} s" + (
-        f": {counts}" if counts else ""
-    )
-    table = Table(box=None, pad_edge=False, title=Text(title), title_justify="left", title_style="bold")
-    table.add_column("log", overflow="ellipsis", no_wrap=True, ratio=1)
-    for name in ("stage", "done", "seconds", "MB"):
-        table.add_column(name, justify="left" if name == "stage" else "right", no_wrap=True)
-    for log in sorted(status.running, key=lambda running: -running.seconds):
-        done = f"{log.done / log.total:.0%}" if log.total else ""
-        cells = (printable(log.stage), done, f"{log.seconds:.0f}", f"{log.resident_bytes / 1e6:,.0f}")
-        table.add_row(Text(printable(str(log.log))), *cells)
-    return table

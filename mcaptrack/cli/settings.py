@@ -24,8 +24,8 @@ from mcaptrack.environment import PREFIX, VARIABLES
 from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.ranges import limits
 
-_YES: Final = ("1", "true", "yes", "on")
-_NO: Final = ("0", "false", "no", "off")
+#: Words for a switch.
+SWITCH: Final = dict.fromkeys(("1", "true", "yes", "on"), True) | dict.fromkeys(("0", "false", "no", "off"), False)
 _LARGEST: Final = 2**63
 
 
@@ -59,10 +59,9 @@ class Setting:
             return shlex.split(text)
         if self.kind is not bool:
             return text
-        word = text.strip().lower()
-        if word not in _YES + _NO:
+        if text.strip().lower() not in SWITCH:
             raise ValueError(f"needs true or false, not {reprlib.repr(text)}")
-        return word in _YES
+        return SWITCH[text.strip().lower()]
 
     def from_toml(self, value: Any) -> Any:
         """Check a value from a file. Raises ValueError for a value of the wrong type."""

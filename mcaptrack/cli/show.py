@@ -30,11 +30,6 @@ class Info(EachLog["LogInfo"]):
     prints_results = True
     More = Printed
 
-    def run(self, names: Mapping[str, str]) -> None:
-        """Run the command; what it prints goes to a file, if one is named."""
-        with common.printed_to(self.values["output"], self.values["force"]):
-            super().run(names)
-
     def show(self, log: Location, done: LogInfo, talk: common.Talk) -> None:
         """Print the channels."""
         if not self.values["json"]:
