@@ -172,11 +172,16 @@ def test_texts_of_options_are_numbers_and_names_for_the_library(folder, asked):
         assert (given["study"], given["tracker"]) == (Path(study), tracker)
 
 
-def test_options_that_concern_a_single_log_make_it_one_of_many():
-    texts = {"scheduler": "tcp://a:1", "output_dir": Path("out"), "ledger": Path("a"), "timeout": "1h"}
-    for name, value in (texts | {"memory_limit": "1GB", "json_lines": True}).items():
+def test_options_that_concern_a_single_log_make_it_one_of_many(monkeypatch):
+    for name, value in {"ledger": Path("a"), "timeout": "1h"}.items():
         assert ManyOptions(**{name: value}).concern_one
     assert not ManyOptions(jobs=3).concern_one
+    assert ManyOptions().for_fleet()["memory_limit"] is None
+    monkeypatch.setenv("MCAPTRACK_MAX_WORKER_MB", "300")
+    assert ManyOptions().for_fleet()["memory_limit"] == "300MB"
+    monkeypatch.setenv("MCAPTRACK_SCHEDULER", "tcp://a:1")
+    assert ManyOptions(jobs=3).concern_one
+    assert ManyOptions().for_fleet()["scheduler"] == "tcp://a:1"
 
 
 # What commands give to the functions of the same names

@@ -178,6 +178,8 @@ class Scene:
 
 #: By module, function and verb: a scene in which the message comes.
 SCENES: dict[str, Callable[[Scene], str]] = {
+    "cli/group.py:resolve_command:info": lambda s: s.says("LOG"),
+    "cli/files.py:logs:drop": lambda s: s.says("drop", "/camera/video", "LOG"),
     "pipeline/drawing.py:find_views:info": lambda s: s.without("/camera/video", "/camera/*/view/scene").says(
         "render", "LOG"
     ),

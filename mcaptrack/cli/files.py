@@ -133,7 +133,7 @@ class Drop(EachLog["DropResult"]):
 
         log, files = self.values["logs"], [name for name in self.values["topics"] if Path(name).is_file()]
         if files and not log.exists():
-            refuse_usage(f"the log comes before the topics: {command('drop', files[0], str(log))}")
+            refuse_usage(f"the log comes before the topics: {command('drop', Path(files[0]), str(log))}")
         return find_logs([log])
 
     def show(self, log: Location, done: DropResult, talk: common.Talk) -> None:

@@ -269,7 +269,9 @@ class Group(TyperGroup):
         every = self.list_commands(ctx)
         if name not in every and not name.startswith("-"):
             if Path(name).exists():
-                refuse_usage(f"{name} is a file, not a command; commands come first, as in {command('info', name)}")
+                refuse_usage(
+                    f"{name} is a file, not a command; commands come first, as in {command('info', Path(name))}"
+                )
             text = f"there is no command {name}{nearest(name, every)}"
             refuse_usage(f"{text}{'' if text.endswith('?') else ';'} `mcaptrack --help` lists the commands")
         with usage_in_one_line():

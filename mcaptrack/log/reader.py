@@ -233,8 +233,6 @@ def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
         index = read_index(source)
     except Damaged as error:
         hint = f"; {recover_hint(path)}" if _looks_like_mcap(file, signature.size) else ""
-        if not hint and path.suffix.lower() != ".mcap":
-            hint = f"; {call('ingest', path)} makes a log of videos, recordings and labels"
         refusal = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
         if not _is_unchanged(path, file, signature):
             return refusal

@@ -658,7 +658,7 @@ class GroundTracker:
     min_score: float | None = option(None, theme=_DETECTIONS)
     class_id: int | None = setting(None, least=0, most=2**31 - 1, theme=_DETECTIONS)
     across_classes: bool = option(False, theme=_DETECTIONS)
-    class_limits: str = setting("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_ASSOCIATION)
+    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_ASSOCIATION)
     class_names: ClassNames = context(tuple, is_recorded=False)
 
     reads: ClassVar[Schema] = DETECTIONS

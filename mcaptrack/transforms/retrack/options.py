@@ -120,7 +120,7 @@ class RetrackOptions:
     resolve_swaps: bool = setting(True, theme=_OFFLINE)
     track_confidence: float = setting(0.5, least=0.0, most=1.0, theme=_OFFLINE)
     across_classes: bool = option(False, theme=_ASSOCIATION)
-    class_limits: str = setting("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
+    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
     smooth: bool = option(True, theme=_OFFLINE)
     side_view: bool = option(False, theme=_ASSOCIATION)
     rate_hz: float = context(lambda: 2.5)
