@@ -178,7 +178,7 @@ def test_options_that_concern_a_single_log_make_it_one_of_many(monkeypatch):
     assert not ManyOptions(jobs=3).concern_one
     assert ManyOptions().for_fleet()["memory_limit"] is None
     monkeypatch.setenv("MCAPTRACK_MAX_WORKER_MB", "300")
-    assert ManyOptions().for_fleet()["memory_limit"] == "300MB"
+    assert ManyOptions().for_fleet()["memory_limit"] == 300_000_000
     monkeypatch.setenv("MCAPTRACK_SCHEDULER", "tcp://a:1")
     assert ManyOptions(jobs=3).concern_one
     assert ManyOptions().for_fleet()["scheduler"] == "tcp://a:1"

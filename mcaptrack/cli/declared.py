@@ -198,7 +198,9 @@ def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[str, 
     is_needed = default is inspect.Parameter.empty and not about.words
     kind = list[kind] if many else kind  # type: ignore[valid-type]
     usage = f"{about.metavar}{'...' if many else ''}"
-    annotation = Annotated[kind if is_needed else kind | None, typer.Argument(metavar=about.metavar, help=about.text)]
+    annotation: Any = Annotated[
+        kind if is_needed else kind | None, typer.Argument(metavar=about.metavar, help=about.text)
+    ]
     return usage if is_needed else f"[{usage}]", annotation, default if is_needed else None
 
 

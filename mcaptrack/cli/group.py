@@ -230,7 +230,7 @@ class Group(TyperGroup):
             panels.setdefault(entry.panel, []).append((entry.name, entry.summary))
         for panel, rows in panels.items():
             write_section(formatter, panel, rows)
-        own = [option for option in self.get_params(ctx) if option.opts[0] in PROGRAM_OPTIONS]
+        own: list[Any] = [option for option in self.get_params(ctx) if option.opts[0] in PROGRAM_OPTIONS]
         rows = [(f"{option.opts[0]} {option.metavar}", option.help) for option in own]
         write_section(formatter, "Options", [*rows, ("-h, --help, --version", "Show this page, or the version.")])
 
@@ -269,9 +269,7 @@ class Group(TyperGroup):
         every = self.list_commands(ctx)
         if name not in every and not name.startswith("-"):
             if Path(name).exists():
-                refuse_usage(
-                    f"{name} is a file, not a command; commands come first, as in {command('info', Path(name))}"
-                )
+                refuse_usage(f"{name} is a file; the command comes first, as in {command('info', Path(name))}")
             text = f"there is no command {name}{nearest(name, every)}"
             refuse_usage(f"{text}{'' if text.endswith('?') else ';'} `mcaptrack --help` lists the commands")
         with usage_in_one_line():

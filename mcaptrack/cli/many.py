@@ -20,7 +20,7 @@ from mcaptrack.cli import common
 from mcaptrack.cli.declared import Called, parameters_of
 from mcaptrack.cli.help import LAST_PANELS
 from mcaptrack.cli.text import is_json, say, stdout_to_stderr
-from mcaptrack.environment import variable
+from mcaptrack.environment import variable, whole_number
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -32,6 +32,7 @@ T = TypeVar("T")
 PANEL: Final = LAST_PANELS[1]
 _TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([smh]?)")
 _SECONDS: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
+_MB: Final = 1_000_000
 #: The ending of the names of bags, which are folders.
 BAG: Final = ".rosbag2"
 #: The number of logs from which on the summary repeats why logs failed.
@@ -77,7 +78,7 @@ class ManyOptions:
             "scheduler": variable("MCAPTRACK_SCHEDULER") or None,
             "ledger": self.ledger,
             "timeout_s": _seconds(self.timeout),
-            "memory_limit": f"{size}MB" if (size := variable("MCAPTRACK_MAX_WORKER_MB")) else None,
+            "memory_limit": _MB * whole_number("MCAPTRACK_MAX_WORKER_MB", 0) or None,
         }
 
 
