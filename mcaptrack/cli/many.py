@@ -33,8 +33,6 @@ PANEL: Final = LAST_PANELS[1]
 _TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([smh]?)")
 _SECONDS: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
 _MB: Final = 1_000_000
-#: The ending of the names of bags, which are folders.
-BAG: Final = ".rosbag2"
 #: The number of logs from which on the summary repeats why logs failed.
 _REPEATED: Final = 20
 
@@ -97,6 +95,8 @@ class EachLog(Called[T]):
     prints_results: ClassVar = False
     #: Whether all logs have one output, a folder.
     shares_output = False
+    #: Whether the output of a log is a folder itself.
+    makes_folders = False
     #: Whether each input always has an output of its own, by default in the working folder.
     names_output = False
 
@@ -144,7 +144,7 @@ class EachLog(Called[T]):
         """
         if output is None or self.shares_output:
             return None
-        is_folder = output.is_dir() or not (output.suffix or (self.suffix() == BAG and len(self.inputs) == 1))
+        is_folder = output.is_dir() or not (output.suffix or (self.makes_folders and len(self.inputs) == 1))
         return output if is_folder else None
 
     def run(self, names: Mapping[str, str]) -> None:
@@ -297,7 +297,7 @@ def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
     common.tried(len(done.outcomes))
     counts = [f"{count} {state}" for state, count in done.counts.items()]
     rate = len(done.outcomes) / max(done.seconds, 1e-3)
-    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
+    line = f"{len(done.outcomes)} log{'' if len(done.outcomes) == 1 else 's'} in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
     if done.peak_bytes:
         ran = [outcome for outcome in done.outcomes if outcome.tries]
         used = done.cpu_seconds / max(1, len(ran))

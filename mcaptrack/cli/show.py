@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Printed
-from mcaptrack.cli.many import BAG, EachLog
+from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, print_table, printable, show_left_out
 from mcaptrack.geometry.clocks import FIRST_DATE_NS
 from mcaptrack.location import Location
@@ -59,6 +59,14 @@ class Export(EachLog["ExportResult"]):
             refuse_same_tables([log.path for log in logs], self.values["output"])
         return logs
 
+    @property
+    def makes_folders(self) -> bool:  # type: ignore[override]
+        """Whether a log becomes a folder: a bag, or what a package makes."""
+        from mcaptrack.api.exporting import exporter_of_package
+
+        of_package = exporter_of_package(self.values["form"])
+        return self.values["form"].startswith("rosbag2") or (of_package is not None and of_package.is_folder)
+
     def suffix(self) -> str:
         """Return the end of the names of bags and files."""
         from mcaptrack.api.exporting import exporter_of_package
@@ -68,7 +76,7 @@ class Export(EachLog["ExportResult"]):
         of_package = exporter_of_package(form)
         if of_package is not None:
             return of_package.end
-        return BAG if form.startswith("rosbag2") else ends_with(form)
+        return ".rosbag2" if form.startswith("rosbag2") else ends_with(form)
 
     def show(self, log: Location, done: ExportResult, talk: common.Talk) -> None:
         """Print what was written."""
