@@ -297,7 +297,8 @@ def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
     common.tried(len(done.outcomes))
     counts = [f"{count} {state}" for state, count in done.counts.items()]
     rate = len(done.outcomes) / max(done.seconds, 1e-3)
-    line = f"{len(done.outcomes)} log{'' if len(done.outcomes) == 1 else 's'} in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
+    count = len(done.outcomes)
+    line = f"{count} log{'' if count == 1 else 's'} in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
     if done.peak_bytes:
         ran = [outcome for outcome in done.outcomes if outcome.tries]
         used = done.cpu_seconds / max(1, len(ran))
