@@ -60,7 +60,7 @@ def _plain(name: str) -> str:
 def did_you_mean(name: str, names: Iterable[str]) -> str:
     """A question for a message, about the name that is meant; "" if none is close."""
     meant = similar(name, names)
-    return f"did you mean {meant}? " if meant else ""
+    return f"did you mean {meant}? " if meant and meant != name else ""
 
 
 def offer(name: str, names: Iterable[str], has: str = "it has") -> str:

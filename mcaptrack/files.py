@@ -284,7 +284,7 @@ def missing(path: Path) -> str:
     stems: dict[str, list[str]] = {}
     for name in names:
         stems.setdefault(Path(name).stem, []).append(name)
-    stem = "" if path.stem.startswith(".") else similar(path.stem, stems)
+    stem = "" if path.stem.startswith(".") else similar(path.stem, stems, 0.75)
     of_kind = sorted(name for name in names if path.suffix and name.endswith(path.suffix) and not name.startswith("."))
     if stem:
         return f"{path} does not exist; did you mean {folder / similar(path.name, stems[stem], 0)}?"
