@@ -285,8 +285,8 @@ def of_tuning(to: Transcript) -> None:
         ("--gate-m 1 --min-iou 0.4", "metres"),
         ("--tracker sort --stage sample", "iou"),
         ("--fps 5 --camera c", "iou"),
-        ("--truth t.txt --fps 5 --point foot --camera c --topic /t", "iou"),
-        ("--truth t.txt --point foot --ground-plane p.txt", "iou"),
+        ("--truth t.txt --fps 5 --camera c --topic /t", "iou"),
+        ("--truth t.txt --ground-plane p.txt", "iou"),
     ):
         to.run(f"tune x.mcap -o c.toml -q {words}", shows_answer=False, tune=tuned(best=0, similarity=similarity))
 
