@@ -49,7 +49,10 @@ def _lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], object]
 
     def imported(name: str) -> object:
         if name not in modules:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            from mcaptrack.errors import did_you_mean
+
+            meant = f"; {did_you_mean(name, modules)}".rstrip("; ")
+            raise AttributeError(f"module {package!r} has no attribute {name!r}{meant}")
         from importlib import import_module
 
         return getattr(import_module(modules[name]), name)

@@ -26,12 +26,16 @@ THREADS: Final = (
 #: Names and descriptions.
 VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
     {
+        "MCAPTRACK_CONFIG": "the file of options, as `--config` names it",
+        "MCAPTRACK_LOG_FORMAT": "`text` or `json`, as `--log-format` says",
         "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log with a larger stated size are refused, in MiB",
         "MCAPTRACK_MAX_MEGAPIXELS": "pictures with a larger stated size are refused, in millions of pixels",
         "MCAPTRACK_MAX_NETWORK_MB": "a predictor in ONNX format that takes more memory is ended, in MB",
         "MCAPTRACK_MAX_NETWORK_S": "a network in ONNX format that takes longer for one call is ended, in seconds",
         "MCAPTRACK_MAX_UNPACKED_MIB": "compressed data that unpacks to more is refused, in MiB",
+        "MCAPTRACK_MAX_WORKER_MB": "a worker for many logs that takes more resident memory is ended, in MB",
         "MCAPTRACK_MODELS": "the folder of fetched weights of detectors",
+        "MCAPTRACK_SCHEDULER": "the address of the scheduler of a Dask cluster that is to process many logs",
         "MCAPTRACK_DATA": "a folder with reference recordings, for the tests",
     }
 )

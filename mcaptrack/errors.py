@@ -6,10 +6,12 @@ shows the option instead, and a command instead of a call.
 
 from __future__ import annotations
 
+import os
+import re
 import shlex
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 
 class McaptrackError(Exception):
@@ -24,13 +26,54 @@ class DamagedError(McaptrackError):
     """A damaged log; `mcaptrack.recover` saves what is intact."""
 
 
+#: From this share of letters on, names are nearly the same.
+_NEARLY: Final = 0.85
+#: The most names that are listed beside the one that is meant.
+_BESIDE: Final = 10
+
+
+def similar(name: str, names: Iterable[str], least: float = 0.6) -> str:
+    """The name that is meant by one that there isn't; "" if none is close. All messages ask here.
+
+    It is the same but for capitals, slashes around it, and dashes for other marks; or nearly the same; or the only one
+    that ends or begins with it, as a topic and an option with a unit do; or the most similar one, if ``least`` of it,
+    as ``difflib`` counts, is the same.
+    """
+    from difflib import SequenceMatcher, get_close_matches
+
+    wanted, plain = _plain(name), {_plain(each): each for each in names}
+    if not wanted or wanted in plain:
+        return plain.get(wanted, "")
+    ends = [each for each in plain if each.endswith(f"/{wanted}") or each.startswith(f"{wanted}-")]
+    nearly, close = (get_close_matches(wanted, list(plain), 1, cutoff) for cutoff in (_NEARLY, least))
+    meant = (nearly or (ends if len(ends) == 1 else close) or [""])[0]
+    # names below one folder are alike by that alone
+    shared = os.path.commonprefix([wanted, meant]).rfind("/") + 1  # noqa: RUF071  # characters are meant
+    is_close = meant in ends or SequenceMatcher(None, wanted[shared:], meant[shared:]).ratio() >= least
+    return plain[meant] if meant and is_close else ""
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[_ ]", "-", name.casefold()).strip("/")
+
+
 def did_you_mean(name: str, names: Iterable[str]) -> str:
     """A question for a message, about the name that is meant; "" if none is close."""
-    from difflib import get_close_matches
+    meant = similar(name, names)
+    return f"did you mean {meant}? " if meant and meant != name else ""
 
-    folded = {each.casefold(): each for each in names}
-    close = get_close_matches(name.casefold(), list(folded), 1)
-    return f"did you mean {folded[close[0]]}? " if close else ""
+
+def offer(name: str, names: Iterable[str], has: str = "it has") -> str:
+    """The end of a message about a name that there isn't: which one may be meant, and what there is.
+
+    Examples
+    --------
+    >>> offer("/lidar/box", ["/lidar/boxes", "/imu"])
+    'did you mean /lidar/boxes? it has /lidar/boxes, /imu'
+    """
+    every = list(names)
+    question = did_you_mean(name, every)
+    return f"{question}{has} {list_names(every, _BESIDE) if question else list_names(every)}"
 
 
 def call(function: str, *values: str | Path, **parameters: Any) -> str:

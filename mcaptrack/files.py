@@ -10,6 +10,7 @@ import secrets
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from shutil import rmtree
 from tempfile import TemporaryDirectory, gettempdir
@@ -17,7 +18,7 @@ from time import time
 from typing import IO, Any, Final
 
 from mcaptrack import notices
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names, similar
 from mcaptrack.location import SCHEMES, Location, Url, hide_secrets, shortened
 from mcaptrack.processes import MARK_DIGITS, has_ended, mark_of
 
@@ -236,7 +237,7 @@ def read_beginning(path: Path, count: int) -> bytes:
         with path.open("rb") as stream:
             return stream.read(count)
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
 
 
 def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], IO[bytes]] | None = None) -> Any:
@@ -252,7 +253,7 @@ def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], I
         with opened(path) if opened else path.open("rb") as stream:
             return json.loads(stream.read().decode("utf-8-sig"))
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     except UnicodeDecodeError:
         raise McaptrackError(f"{path} is not a text file, as {what} is") from None
     except RecursionError:
@@ -261,13 +262,44 @@ def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], I
         raise McaptrackError(f"{path} is not valid JSON: {str(error)[:200]}") from None
 
 
+def unreadable(path: Path, error: OSError | ValueError) -> McaptrackError:
+    """The fault of a file that can't be read: one that isn't there, or why the system refuses it."""
+    if isinstance(error, FileNotFoundError):
+        return McaptrackError(missing(path))
+    return McaptrackError(f"{path} can't be read: {getattr(error, 'strerror', None) or str(error).splitlines()[0]}")
+
+
+#: The most names of a folder that are compared with one that isn't there.
+_MOST_NAMES: Final = 2000
+
+
+def missing(path: Path) -> str:
+    """The message about a file or folder that isn't there: whether its folder is, and which name there is meant."""
+    folder = path.parent
+    try:
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry in islice(entries, _MOST_NAMES)]
+    except OSError:
+        return f"{path} does not exist: there is no folder {folder}"
+    stems: dict[str, list[str]] = {}
+    for name in names:
+        stems.setdefault(Path(name).stem, []).append(name)
+    stem = "" if path.stem.startswith(".") else similar(path.stem, stems, 0.75)
+    of_kind = sorted(name for name in names if path.suffix and name.endswith(path.suffix) and not name.startswith("."))
+    if stem:
+        return f"{path} does not exist; did you mean {folder / similar(path.name, stems[stem], 0)}?"
+    where = "the working folder" if folder == Path() else f"the folder {folder}"
+    has = list_names(of_kind, 5) if of_kind else f"no file that ends with {path.suffix}"
+    return f"{path} does not exist; {where} has {has}" if path.suffix else f"{path} does not exist"
+
+
 def refuse_special(path: Path) -> None:
     """Raise McaptrackError for a pipe, a device or a socket (reading may never end), and an impossible name."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
-            raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
+            raise unreadable(path, error) from None
         return  # opening it reports the reason
     except ValueError:
         raise McaptrackError(f"{path} can't be the name of a file: it has a zero byte") from None
@@ -298,6 +330,6 @@ def refuse_overwrite(path: Path, force: bool) -> None:
     if path.is_dir():
         raise McaptrackError(f"{path} is a folder; give the name of a file")
     if not path.parent.is_dir():
-        raise McaptrackError(f"the folder {path.parent} does not exist")
+        raise McaptrackError(f"the folder {missing(path.parent)}")
     if path.exists() and not force:
         raise McaptrackError(f"{path} exists; give another name with `output=`, or `force=True` to replace it")

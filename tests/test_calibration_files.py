@@ -205,7 +205,7 @@ def test_mistakes_with_calibrations_are_one_line(tmp_path, monkeypatch):
         "cam.yml": "a calibration belongs to a log with pictures or boxes of the camera; name it with --into",
         "cam.yml --into log.mcap --camera left": "log.mcap has no camera left that cam.yml could be of",
         "gt.txt --fps 1 --calibration cam.yml --ground-plane h.txt": "are both a ground plane",
-        "gt.txt --fps 1 --calibration none.yml": "none.yml can't be read: No such file",
+        "gt.txt --fps 1 --calibration none.yml": "none.yml does not exist",
         "m.txt --as motion --into log.mcap --calibration cam.yml": "in a call of its own",
     }.items():
         code, _, err = call("ingest", *words.split())

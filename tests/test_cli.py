@@ -82,7 +82,6 @@ class TestErrors:
         "ingest clip.mp4 --ground-plane text.mp4 -o x.mcap": "is not a homography",
         "ingest clip.mp4 --truth bad.txt -o x.mcap": "bad.txt:2: not MOTChallenge",
         "ingest clip.mp4 -o a.mcap": "a.mcap exists; give another name with -o, or --force",
-        "ingest clip.mp4 -o folder": "folder is a folder; give the name of a file",
         "ingest clip.mp4 -o no/x.mcap": "the folder no does not exist",
         "ingest clip.mp4 -o clip.mp4 --force": "clip.mp4 is both input and output",
         "run a.mcap -o a.mcap --force": "a.mcap is both input and output",
@@ -114,7 +113,7 @@ class TestErrors:
             (["--min_iou", "0.5"], "no such option: --min_iou; did you mean --min-iou?"),
             (["--max-age", "2"], "no such option: --max-age; did you mean --max-age-s?"),
             (["--max-age-s", "2s"], "invalid value for '--max-age-s': '2s' is not a number;"),
-            (["--min-hits-frames", "2.5"], "invalid value for '--min-hits-frames': '2.5' is not a whole number;"),
+            (["--jobs", "2.5"], "invalid value for '--jobs': '2.5' is not a whole number;"),
         ):
             code, out, err = call("track", "a.mcap", *words, folder=place)
             assert (code, out) == (2, "")

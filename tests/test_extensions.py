@@ -476,7 +476,7 @@ def test_an_exporter_does_not_replace_the_log(site, tracked):
 def test_many_logs_are_exported_by_a_package_each_to_its_own_file(site, tracked, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(site))
     Path("c.mcap").write_bytes(tracked.read_bytes())
-    done("export", "a.mcap", "c.mcap", "--format", "speeds", "--output-dir", "out")
+    done("export", "a.mcap", "c.mcap", "--format", "speeds", "-o", "out")
     assert sorted(path.name for path in Path("out").iterdir()) == ["a.speeds.csv", "c.speeds.csv"]
 
 

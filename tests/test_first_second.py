@@ -131,8 +131,11 @@ def test_a_layout_from_a_file_is_served_alone(finished, tmp_path):
     mine.write_text("{")
     for name, words in (
         (mine, "is no layout: it is not JSON"),
-        (tmp_path / "none.json", "can't be read: No such file"),
-        ("trackin", "has no layout trackin; it has tracking, comparing, predictions. A file of a layout ends"),
+        (tmp_path / "none.json", "does not exist"),
+        (
+            "trackin",
+            "has no layout trackin; did you mean tracking? it has tracking, comparing, predictions. A file of a layout ends",
+        ),
     ):
         with pytest.raises(McaptrackError) as refused:
             mcaptrack.view(finished, layout=name)

@@ -159,7 +159,7 @@ def folder(tmp_path_factory) -> Path:
     some_log(place / "a.mcap")
     shutil.copy(place / "a.mcap", place / "b.mcap")
     (place / "b.report.html").write_text("")
-    done("export", place / "a.mcap", place / "b.mcap", "--output-dir", place / "tables")
+    done("export", place / "a.mcap", place / "b.mcap", "-o", place / "tables")
     return place
 
 

@@ -175,7 +175,7 @@ def test_the_command_line_takes_logs_in_their_order(parts, tmp_path, monkeypatch
             ("0.mcap", "1.mcap", "--ledger", "x.jsonl"),
             "--continue doesn't go with --ledger: it judges each log by itself",
         ),
-        (("0.mcap", "1.mcap", "--output-dir", "x"), "--continue doesn't go with --output-dir"),
+        (("0.mcap", "1.mcap", "-o", "x"), "--continue doesn't go with --output"),
     ):
         code, _, err = call("run", *words, "--continue")
         assert code == 1

@@ -512,7 +512,9 @@ def walked(tmp_path_factory) -> Path:
 
 
 def test_evaluate_scores_smoothed_samples_and_draws_the_curves(walked, tmp_path):
-    out, _ = printed("evaluate", walked, "--smoothed", "--curves", tmp_path / "a.svg", "--gate-m", "1", "--json")
+    out, _ = printed(
+        "evaluate", walked, "--set", "smoothed=true", "--curves", tmp_path / "a.svg", "--gate-m", "1", "--json"
+    )
     rows = {one["tracks"]: one["displacement"] for one in json.loads(out)["results"]}
     assert list(rows) == ["/camera/samples", "/camera/retracks/online", "/camera/samples, smoothed"]
     plain, smoothed = rows["/camera/samples"], rows["/camera/samples, smoothed"]

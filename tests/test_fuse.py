@@ -597,7 +597,7 @@ def test_a_later_run_uses_the_same_fuser_if_it_may(path: Path) -> None:
         (("--fuser", "cells_of_a_test:Tracker"), "reads mcaptrack.Detections; a fuser reads mcaptrack.Sightings"),
         (("--fuser", "cells_of_a_test:Broken"), "ValueError: no cells (cells_of_a_test.py, line"),
         (("--fuser", "feets"), "no fuser is called feets; did you mean feet?"),
-        (("--fuser", NAME, "--max-sigma", "2"), "has no parameter max_sigma; there are cell_m"),
+        (("--fuser", NAME, "--set", "max_sigma=2"), "has no parameter max_sigma; there are cell_m"),
     ],
 )
 def test_a_fuser_that_can_not_be_used_is_refused_in_one_line(path: Path, options: tuple[str, ...], words: str) -> None:

@@ -330,9 +330,9 @@ def test_times_of_a_part_and_of_every_third_picture(tmp_path, clip):
 
 def test_options_of_label_files_are_the_same_in_every_command():
     commands = (ingesting.ingest, scoring.evaluate, tuning.tune, training.train)
-    names = ("label_format", "columns", "classes", "class_map", "first_frame", "frames", "size")
-    for name in names:
-        assert len({repr(hints_of(command)[name]) for command in commands}) == 1, name
+    of_all, of_two = ("label_format", "classes"), ("columns", "class_map", "first_frame", "frames", "size")
+    for name, some in (*((name, commands) for name in of_all), *((name, commands[:2]) for name in of_two)):
+        assert len({repr(hints_of(command)[name]) for command in some}) == 1, name
     for command in commands[1:]:
         assert hints_of(command)["fps"] == labels.LabelFps
 

@@ -65,7 +65,7 @@ STREAMS = [
 LINES = [
     "drop a.mcap /camera/predictions",
     "run a.mcap --force --json",
-    "run a.mcap a.mcap clip.mp4 --force --json-lines --log-format json",
+    "run a.mcap a.mcap clip.mp4 --force --json --log-format json",
     "info a.mcap",
     "check a.mcap",
     "query a.mcap 'select * from tracks' --format csv",

@@ -122,7 +122,7 @@ class TestFetching:
         assert re.search(
             "own.onnx is not the file .* it has SHA-256 [0-9a-f]{12}..., not ", refused("--from", tmp_path / "own.onnx")
         )
-        assert "can't be read: No such file" in refused("--from", tmp_path / "none")
+        assert "does not exist" in refused("--from", tmp_path / "none")
 
     def test_a_file_is_read_once_and_no_further_than_it_may_be_long(self, model, tmp_path, monkeypatch):
         with (tmp_path / "own.onnx").open("wb") as file:

@@ -247,7 +247,7 @@ class TestRefused:
 
     def test_no_file_and_no_runtime_say_what_to_do(self, network, tmp_path, monkeypatch):
         assert refused(OnnxDetector()) == "detector onnx needs a file, as in onnx:FILE"
-        assert "there is no file" in refused(OnnxDetector(file=str(tmp_path / "none.onnx")))
+        assert "does not exist" in refused(OnnxDetector(file=str(tmp_path / "none.onnx")))
         monkeypatch.setitem(sys.modules, "onnxruntime", None)
         assert "pip install 'mcaptrack[onnx]'" in refused(OnnxDetector(file=str(network())))
 
@@ -397,7 +397,7 @@ def metadata_of(path: Path, topic: str) -> dict[str, str]:
 class TestInLogs:
     def test_the_channel_says_which_network_made_it_and_how(self, network, log):
         path = network()
-        done("detect", log, "--detector", f"onnx:{path}", "--layout", "yolox", "--min-score", "0.3", "--quiet")
+        done("detect", log, "--detector", f"onnx:{path}", "--set", "layout=yolox", "--min-score", "0.3", "--quiet")
         made = Provenance.from_metadata(metadata_of(log, "/camera/detections"))
         assert made.parameters["detector"] == "onnx"
         assert made.parameters["file"] == str(path)
@@ -427,8 +427,10 @@ class TestInLogs:
     def test_names_and_files_that_do_not_go_together_are_refused(self, log):
         assert "detector knn takes no file" in call("detect", log, "--detector", "knn:file").err
         assert "are two files; give one" in call("detect", log, "--detector", "onnx:a", "--file", "b").err
-        err = call("detect", log, "--layout", "yolox").err
-        assert err == "mcaptrack: --layout is an option of onnx, yolox-nano, yolox-tiny and yolox-s, not of median\n"
+        err = call("detect", log, "--set", "layout=yolox").err
+        assert (
+            err == "mcaptrack: --set layout is an option of onnx, yolox-nano, yolox-tiny and yolox-s, not of median\n"
+        )
 
 
 def test_the_laws_of_transforms_hold(network):

@@ -18,12 +18,11 @@ import pytest
 
 import mcaptrack
 from mcaptrack.api.declared import Option
-from mcaptrack.cli import common, many, text
+from mcaptrack.cli import common, text
 from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.many import ManyOptions
 from mcaptrack.cli.settings import Setting
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import FleetStatus, Running
 from tests.commands import GROUP, Terminal, call, done
 
 
@@ -173,11 +172,16 @@ def test_texts_of_options_are_numbers_and_names_for_the_library(folder, asked):
         assert (given["study"], given["tracker"]) == (Path(study), tracker)
 
 
-def test_options_that_concern_a_single_log_make_it_one_of_many():
-    texts = {"scheduler": "tcp://a:1", "output_dir": Path("out"), "ledger": Path("a"), "timeout": "1h"}
-    for name, value in (texts | {"memory_limit": "1GB", "json_lines": True}).items():
+def test_options_that_concern_a_single_log_make_it_one_of_many(monkeypatch):
+    for name, value in {"ledger": Path("a"), "timeout": "1h"}.items():
         assert ManyOptions(**{name: value}).concern_one
     assert not ManyOptions(jobs=3).concern_one
+    assert ManyOptions().for_fleet()["memory_limit"] is None
+    monkeypatch.setenv("MCAPTRACK_MAX_WORKER_MB", "300")
+    assert ManyOptions().for_fleet()["memory_limit"] == 300_000_000
+    monkeypatch.setenv("MCAPTRACK_SCHEDULER", "tcp://a:1")
+    assert ManyOptions(jobs=3).concern_one
+    assert ManyOptions().for_fleet()["scheduler"] == "tcp://a:1"
 
 
 # What commands give to the functions of the same names
@@ -381,25 +385,3 @@ def test_progress_is_said_now_and_then_as_json(capsys, monkeypatch):
     first, second = (json.loads(line) for line in capsys.readouterr().err.splitlines())
     assert (first["message"], first["stage"], first["done"], first["total"]) == ("detect: 3.5 of 9", "detect", 3.5, 9)
     assert (second["message"], second["total"]) == ("detect: 3.5", None)
-
-
-def test_logs_that_run_are_in_a_table_on_a_terminal(monkeypatch, terminal):
-    """The largest share of the time first; nothing of a name is acted on."""
-    busy = [
-        Running(Path(f"a/\x1b[31m{n}.mcap"), "track", n, 4 * n or None, 10.0 * n, n * 1_500_000_000) for n in range(3)
-    ]
-    status = FleetStatus(9, {"killed": 1, "done": 3}, tuple(busy), 61.4)
-    for hidden, stream in ((True, Terminal()), (False, io.StringIO()), (False, terminal)):
-        monkeypatch.setattr("sys.stderr", stream)
-        with many.LiveTable.on_terminal(hidden) as table:
-            table.show(status)
-        if stream is not terminal:
-            assert stream.getvalue() == ""
-    title, head, *rows = terminal.shown().splitlines()[:5]
-    assert title.strip() == "4 of 9 logs in 61 s: 3 done, 1 killed"
-    assert head.split() == ["log", "stage", "done", "seconds", "MB"]
-    assert [row.split() for row in rows] == [
-        [r"a/\x1b[31m2.mcap", "track", "25%", "20", "3,000"],
-        [r"a/\x1b[31m1.mcap", "track", "25%", "10", "1,500"],
-        [r"a/\x1b[31m0.mcap", "track", "0", "0"],
-    ]

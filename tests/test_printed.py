@@ -285,8 +285,8 @@ def of_tuning(to: Transcript) -> None:
         ("--gate-m 1 --min-iou 0.4", "metres"),
         ("--tracker sort --stage sample", "iou"),
         ("--fps 5 --camera c", "iou"),
-        ("--truth t.txt --fps 5 --point foot --camera c --topic /t", "iou"),
-        ("--truth t.txt --point foot --ground-plane p.txt", "iou"),
+        ("--truth t.txt --fps 5 --camera c --topic /t", "iou"),
+        ("--truth t.txt --ground-plane p.txt", "iou"),
     ):
         to.run(f"tune x.mcap -o c.toml -q {words}", shows_answer=False, tune=tuned(best=0, similarity=similarity))
 
@@ -338,7 +338,6 @@ def of_many_logs(to: Transcript) -> None:
         for line in (
             "run x.mcap y.mcap z.mcap",
             "events x.mcap y.mcap z.mcap",
-            "run x.mcap y.mcap z.mcap --json-lines",
         ):
             to.run(line)
     with fleets_end_with(
@@ -367,7 +366,6 @@ def of_mistakes(to: Transcript) -> None:
         to.run(f"retrack a.mcap --set {words}")
     for time in ("0", "0.0h", "-1", "1d", "m", "''", "1.", "'1 2'"):
         to.run(f"check x.mcap --timeout={time}")
-    to.run("check x.mcap --memory-limit 1")
     to.run("check x.mcap --ledger x.mcap")
     write_clip(Path("clip.mp4"), options={"bf": "0"})
     for words in ("--quality 60", "--image-format jpeg --quality 0", "--image-format png --quality 9",

@@ -178,11 +178,15 @@ class Scene:
 
 #: By module, function and verb: a scene in which the message comes.
 SCENES: dict[str, Callable[[Scene], str]] = {
+    "cli/group.py:resolve_command:info": lambda s: s.says("LOG"),
+    "cli/files.py:logs:drop": lambda s: s.says("drop", "/camera/video", "LOG"),
     "pipeline/drawing.py:find_views:info": lambda s: s.without("/camera/video", "/camera/*/view/scene").says(
         "render", "LOG"
     ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
-    "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says("evaluate", "LOG", "--smoothed"),
+    "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says(
+        "evaluate", "LOG", "--set", "smoothed=true"
+    ),
     "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/following.py:_check_camera:run": Scene.followed,
     "pipeline/fusing.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from mcaptrack import environment
 from mcaptrack.cli.config import MAX_BYTES, edited, user_file, write_settings
-from mcaptrack.cli.settings import CALL_ONLY, Setting
+from mcaptrack.cli.settings import Setting
 from mcaptrack.errors import McaptrackError
 from tests.commands import GROUP, call, toml_value
 from tests.tiers import one_in
@@ -41,13 +41,12 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 def options_of(command: str) -> list[Setting]:
     """Return the options of a command that settings may have."""
-    now = COMMANDS[command].settings.values()
-    return [setting for setting in now if setting.name not in CALL_ONLY]
+    return [*COMMANDS[command].settings.values()]
 
 
-def parsed(command: str, *words: str) -> dict[str, Any]:
+def parsed(command: str, *words: str, config: str = "") -> dict[str, Any]:
     """Return the values that a command gets, with paths as text."""
-    group = GROUP.make_context("mcaptrack", [command])
+    group = GROUP.make_context("mcaptrack", [*(["--config", config] if config else []), command])
     given = [*words, *ARGUMENTS.get(command, ["x.mcap"])]
     return {
         name: as_text(value)
@@ -110,7 +109,7 @@ def test_an_option_has_the_same_value_from_every_source(command, folder, monkeyp
         with monkeypatch.context() as patch:
             patch.setenv(setting.variable, text_for(setting, value))
             ways["environment"] = parsed(command)
-        ways["--config"] = parsed(command, "--config", str(put(folder.parent / "a.toml", table_for(setting, value))))
+        ways["--config"] = parsed(command, config=str(put(folder.parent / "a.toml", table_for(setting, value))))
         put(user_file(), table_for(setting, value))
         ways["config folder"] = parsed(command)
         user_file().unlink()
@@ -121,13 +120,13 @@ def test_an_option_has_the_same_value_from_every_source(command, folder, monkeyp
         for way, params in ways.items():
             got = params[setting.parameter]
             assert got == value, (way, setting.name)
-            rest = {name: was for name, was in usual.items() if name not in (setting.parameter, "config")}
+            rest = {name: was for name, was in usual.items() if name != setting.parameter}
             assert {name: params[name] for name in rest} == rest, (way, setting.name)
 
 
 def test_the_strongest_source_wins(folder, monkeypatch):
-    def value(*words: str) -> Any:
-        return parsed("track", *words)["max_age_s"]
+    def value(*words: str, config: str = "") -> Any:
+        return parsed("track", *words, config=config)["max_age_s"]
 
     assert value() is None
     put(user_file(), "[track]\nmax-age-s = 1\nmin-iou = 0.5\n")
@@ -136,12 +135,12 @@ def test_the_strongest_source_wins(folder, monkeypatch):
     assert value() == 2
     assert parsed("track")["min_iou"] == 0.5  # what the nearer file doesn't say
     named = str(put(folder.parent / "named.toml", "[track]\nmax-age-s = 3\n"))
-    assert value("--config", named) == 3
-    assert parsed("track", "--config", named)["min_iou"] is None  # the file that is named is instead of both
+    assert value(config=named) == 3
+    assert parsed("track", config=named)["min_iou"] is None  # the file that is named is instead of both
     monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE_S", "4")
-    assert value("--config", named) == 4
-    assert value("--config", named, "--max-age-s", "5") == 5
-    monkeypatch.setenv("MCAPTRACK_TRACK_CONFIG", named)
+    assert value(config=named) == 4
+    assert value("--max-age-s", "5", config=named) == 5
+    monkeypatch.setenv("MCAPTRACK_CONFIG", named)
     monkeypatch.delenv("MCAPTRACK_TRACK_MAX_AGE_S")
     assert value() == 3
 
@@ -194,9 +193,10 @@ class TestUnknownNames:
         monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")
         assert refused("run", "x.mcap").endswith("; did you mean MCAPTRACK_TRACK_MAX_AGE_S?\n")
 
-    def test_variables_that_are_not_options_are_in_one_list(self, monkeypatch):
+    def test_variables_that_are_not_options_are_in_one_list(self, folder, monkeypatch):
+        values = {"MCAPTRACK_CONFIG": str(put(folder.parent / "a.toml", "")), "MCAPTRACK_LOG_FORMAT": "text"}
         for name in environment.VARIABLES:
-            monkeypatch.setenv(name, "1")
+            monkeypatch.setenv(name, values.get(name, "1"))
         assert call("info", "x.mcap").code == 1
         package = Path(environment.__file__).parent
         for path in package.rglob("*.py"):
@@ -323,7 +323,7 @@ class TestFiles:
         assert parsed("track")["max_age_s"] == 2
 
     def test_a_named_file_has_to_exist(self):
-        assert "there is no such file" in refused("track", "x.mcap", "--config", "none.toml")
+        assert "--config: none.toml does not exist" in refused("track", "x.mcap", "--config", "none.toml")
 
     @EVERY_COMMAND
     def test_a_variable_of_the_wrong_type_is_refused(self, command, monkeypatch):

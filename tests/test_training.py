@@ -314,7 +314,7 @@ class TestCommand:
                 for step, (x, y) in enumerate(path)
             ]
             (tmp_path / f"s{number}.txt").write_text("\n".join(rows))
-        words = (tmp_path, "-o", tmp_path / "out", "--epochs", 2, "--device", "cpu", "--threads", 1)
+        words = (tmp_path, "-o", tmp_path / "out", "--epochs", 2, "--device", "cpu", "--set", "threads=1")
         result = self.run(*words)
         assert result.exit_code == 0, result.output
         lines = result.stdout.splitlines()
@@ -455,15 +455,19 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "changed", "corrupted"),
     [
-        ("--epochs 3 --batch 9 --rate 0.01", {"epochs": 3, "batch": 9, "rate": 0.01}, {}),
-        ("--patience 4 --seed 6 --consistency-weight 2", {"patience": 4, "seed": 6, "consistency_weight": 2.0}, {}),
-        ("--noise-m 0.2 --gaps 0.1 --scale 0.3", {}, {"noise_m": 0.2, "gaps": 0.1, "scale": 0.3}),
-        ("--noise-m 0 --gaps 0 --scale 0", {}, {"noise_m": 0.0, "gaps": 0.0, "scale": 0.0}),
-        ("--recipe paper --epochs 1 --gaps 0.9", {"epochs": 1}, {"gaps": 0.9}),
+        ("--epochs 3 --set batch=9 --set rate=0.01", {"epochs": 3, "batch": 9, "rate": 0.01}, {}),
+        (
+            "--set patience=4 --seed 6 --set consistency_weight=2",
+            {"patience": 4, "seed": 6, "consistency_weight": 2.0},
+            {},
+        ),
+        ("--set noise_m=0.2 --set gaps=0.1 --set scale=0.3", {}, {"noise_m": 0.2, "gaps": 0.1, "scale": 0.3}),
+        ("--set noise_m=0 --set gaps=0 --set scale=0", {}, {"noise_m": 0.0, "gaps": 0.0, "scale": 0.0}),
+        ("--recipe paper --epochs 1 --set gaps=0.9", {"epochs": 1}, {"gaps": 0.9}),
     ],
 )
 def test_options_change_the_recipe(folder, given, words, changed, corrupted):
-    done("train", "a.txt", "b.txt", *words.split(), "--threads", 3, "--device", "cpu")
+    done("train", "a.txt", "b.txt", *words.split(), "--set", "threads=3", "--device", "cpu")
     recipe = RECIPES["paper" if "paper" in words else "red"]
     assert given[0][0] == recipe.changed({"seed": 1} | changed, corrupted)
     assert given[0][5:7] == ("on cpu", 3)

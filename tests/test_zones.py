@@ -414,7 +414,7 @@ class TestRun:
         (tmp_path / "other.json").write_text(json.dumps(collection(feature("a", "Polygon", [SQUARE], camera="front"))))
         for words, why in (
             (("zones", finished), "was not counted yet; give a file of GeoJSON with --zones"),
-            (("zones", finished, "--zones", tmp_path / "no.json"), "can't be read: No such file"),
+            (("zones", finished, "--zones", tmp_path / "no.json"), "does not exist"),
             (
                 ("zones", finished, "--zones", tmp_path / "other.json"),
                 "all zones are of front, not of camera; --camera",

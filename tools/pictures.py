@@ -99,7 +99,7 @@ def screenshots(log: Path, folder: Path) -> Iterator[tuple[str, Picture]]:
     server = mcaptrack.view(log, port=0).start()
     yield "view", shown(server.address, folder, 1200, 760, "player-0.html")
     server.close()
-    command("evaluate", log, "--smoothed", "--curves", folder / "curves.svg")
+    command("evaluate", log, "--set", "smoothed=true", "--curves", folder / "curves.svg")
     yield "curves", shown((folder / "curves.svg").as_uri(), folder, 560, 300)
 
 

@@ -81,7 +81,7 @@ def commands() -> str:
     from typer.main import get_command
 
     from mcaptrack.cli import app
-    from mcaptrack.cli.command import LAST_PANELS
+    from mcaptrack.cli.help import LAST_PANELS
 
     parts: list[str] = []
     for name, command in get_command(app).commands.items():  # type: ignore[attr-defined]

@@ -132,11 +132,11 @@ def calibrate(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> CalibrateResult:
-    """Correct the ground planes of cameras that disagree with the others, by the people that they see together.
+    """Correct the ground planes of cameras that disagree.
 
-    Each camera is compared with what the others agree on. If its feet stand elsewhere, its plane is corrected by a
-    shift, a rotation, a scale, or more, as far as that also holds at other times than those to which it was fitted;
-    those that agree stay as they are.
+    They are compared by the people that cameras see together. Each camera is compared with what the others agree on. If
+    its feet stand elsewhere, its plane is corrected by a shift, a rotation, a scale, or more, as far as that also holds
+    at other times than those to which it was fitted; those that agree stay as they are.
 
     /CAMERA/ground_plane stays in the log, and the corrected plane in /CAMERA/ground_plane/refined is used instead:
     `run` and `fuse` make again what was made before. `mcaptrack drop log.mcap /CAMERA/ground_plane/refined` takes it

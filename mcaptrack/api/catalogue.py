@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from mcaptrack.api.declared import Argument, checked, declared
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.files import publish_bytes, refuse_special
+from mcaptrack.files import publish_bytes, refuse_special, unreadable
 from mcaptrack.networks import digest_of
 from mcaptrack.notices import warn
 from mcaptrack.transforms.detect.onnx import session
@@ -34,7 +34,7 @@ def models(
         Argument("words", "get NAME", "`get` fetches the weights of NAME.", shown="a list", words=True),
     ] = None,
 ) -> tuple[Model, ...]:
-    """List the learned detectors of the catalogue, or fetch the weights of one, once.
+    """List the learned detectors, or fetch the weights of one.
 
     Only a file with the known SHA-256 is taken. The weights are kept in your folder of caches, or where the environment
     variable MCAPTRACK_MODELS says.
@@ -136,7 +136,7 @@ def _read(model: Model, path: Path) -> bytes:
         with path.open("rb") as file:
             data, size = file.read(model.size_bytes + 1), path.stat().st_size
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     session.check(model, hashlib.sha256(data).hexdigest(), max(size, len(data)), path)
     return data
 

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from math import degrees
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from mcaptrack import log as logs
 from mcaptrack.api.common import as_location, warnings_about
 from mcaptrack.api.declared import declared
 from mcaptrack.api.options import EachLog
-from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.transform_tree import TransformSeries
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
-from mcaptrack.schema.provenance import Provenance, frame_id_of
-from mcaptrack.sources.cameras import names_by_topic
-from mcaptrack.sources.fixed_frame import read_frames
+
+if TYPE_CHECKING:
+    from mcaptrack import log as logs
+    from mcaptrack.geometry.transform_tree import TransformSeries
+    from mcaptrack.schema.provenance import Provenance
 
 
 @dataclass(frozen=True)
@@ -185,7 +184,7 @@ class LogInfo:
 
 @declared()
 def info(log: EachLog, *, frames: bool = False) -> LogInfo:
-    """Show the channels of a log, their number of messages, and what was made from what.
+    """Show the channels of a log, and what was made from what.
 
     Those of each camera are together, if there are several, under its name. Reads the summary only, unless ``frames``
     asks for more. On the command line -v shows also the parameters that channels were made with.
@@ -221,6 +220,9 @@ def info(log: EachLog, *, frames: bool = False) -> LogInfo:
     ()
 
     """
+    from mcaptrack import log as logs
+    from mcaptrack.sources.cameras import names_by_topic
+
     path = as_location(log)
     with warnings_about(path) as warnings, logs.read(path) as opened:
         if logs.clock_jumps(opened):
@@ -246,6 +248,8 @@ def info(log: EachLog, *, frames: bool = False) -> LogInfo:
 
 
 def _channel(opened: logs.Log, part: logs.Log, channel: logs.Channel, camera: str | None) -> ChannelInfo:
+    from mcaptrack.schema.provenance import Provenance, frame_id_of
+
     provenance = Provenance.from_metadata(channel.metadata)
     replaced = opened.part(channel.topic) is not part
     return ChannelInfo(
@@ -282,12 +286,16 @@ def _is_stale(opened: logs.Log, topic: str, provenance: Provenance | None) -> bo
 
 def _rate(opened: logs.Log, messages: int) -> float | None:
     """Return the messages per second of a log, rounded: the summary holds no times of a single channel."""
+    from mcaptrack.geometry.clocks import NS_PER_S
+
     span_ns = opened.end_ns - opened.start_ns
     return round((messages - 1) / (span_ns / NS_PER_S), 3) if messages > 1 and span_ns > 0 else None
 
 
 def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:
     """Return the frames of a log, each after its parent, and warn of transforms that contradict or are missing."""
+    from mcaptrack.sources.fixed_frame import read_frames
+
     read = read_frames(opened)
     for why in read.unread:
         warn(why, "lost")

@@ -36,7 +36,7 @@ from typing import (
     get_type_hints,
 )
 
-from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.errors import McaptrackError, offer
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -63,6 +63,9 @@ class Option:
         Returns the values to complete.
     commas : bool
         Whether several values are one text on the command line, with commas between them.
+    is_set : bool
+        Whether the command has no option of its own for it: ``--set name=value`` sets it. This is for numbers, choices
+        and switches that tune, and that few users can choose a value for.
     help : str
         The meaning of the parameter, where the docstring of a function doesn't say it.
     """
@@ -78,6 +81,7 @@ class Option:
     shown: str | bool | None = None
     names: Callable[[], Sequence[str]] | None = None
     commas: bool = False
+    is_set: bool = False
     help: str = ""
 
     @property
@@ -282,9 +286,14 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     False, where these are declared, an empty name of a file, none of the choices, or out of the range of ``Option``.
     """
     signature = inspect.signature(function)
+    has_more = any(parameter.kind is parameter.VAR_KEYWORD for parameter in signature.parameters.values())
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        for name in () if has_more else kwargs:
+            if name not in signature.parameters:
+                every = offer(name, signature.parameters, "there are")
+                raise TypeError(f"{function.__name__}() has no parameter {name}; {every}")
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if value is signature.parameters[name].default:
                 continue
@@ -434,8 +443,7 @@ def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:
     if not isinstance(value, str) or value not in choices:
         names = list(map(str, choices))
-        meant = did_you_mean(str(value), names)
-        raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {meant}there are {', '.join(names)}")
+        raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {offer(str(value), names, 'there are')}")
 
 
 def _check_range(name: str, value: Any, ends: tuple[float, float], *, is_whole: bool) -> None:

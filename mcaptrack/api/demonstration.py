@@ -67,11 +67,12 @@ def demo(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> DemoResult:
-    """Draw a scene with known ground truth, run everything on it, and compare SORT with re-tracking.
+    """Draw a scene, run everything on it, and compare the trackers.
 
-    The scene has what makes tracking fail: people who cross, meet and part, occlusion behind a kiosk, a tree that
-    sways, a camera that shakes a little. Writes a video, a log, tables and layouts. Scores of one seed are a random
-    sample, so the mean and the range over ten seeds of each scene are printed, too.
+    SORT is compared with re-tracking; the ground truth of a drawn scene is known. The scene has what makes tracking
+    fail: people who cross, meet and part, occlusion behind a kiosk, a tree that sways, a camera that shakes a little.
+    Writes a video, a log, tables and layouts. Scores of one seed are a random sample, so the mean and the range over
+    ten seeds of each scene are printed, too.
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ def events(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> mcaptrack.RunResult:
-    """Write events of tracks (begin, end, identity switches) and errors of predictions into the log.
+    """Write begins, ends and identity switches of tracks into the log.
 
     Events are the begin and end of tracks, and which tracks re-tracking joined or split; if the log has /camera/truth
     also missed people, false tracks and identity switches, matched as in `mcaptrack evaluate`. They go to

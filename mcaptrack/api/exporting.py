@@ -140,12 +140,13 @@ def export(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> ExportResult:
-    """Write a log as tables (Parquet), one row per object and frame, as a ROS 2 bag, or for other programs.
+    """Write a log as tables, as a ROS 2 bag, or for other programs.
 
-    One folder a table (frames, detections, tracks, track_summary, predictions, events, metrics, channels, recordings
-    and others), one file a log in it; several logs can share a folder. Exporting again replaces what has changed.
-    `mcaptrack docs tables` lists all columns. A bag (rosbag2) holds results as ROS messages, for RViz and `ros2 bag`:
-    `vision_msgs/Detection3DArray` or `Detection2DArray`, `nav_msgs/Path`, `visualization_msgs/MarkerArray`, transforms.
+    Tables (Parquet) have one row per object and frame. One folder a table (frames, detections, tracks, track_summary,
+    predictions, events, metrics, channels, recordings and others), one file a log in it; several logs can share a
+    folder. Exporting again replaces what has changed. `mcaptrack docs tables` lists all columns. A bag (rosbag2) holds
+    results as ROS messages, for RViz and `ros2 bag`: `vision_msgs/Detection3DArray` or `Detection2DArray`,
+    `nav_msgs/Path`, `visualization_msgs/MarkerArray`, transforms.
 
     A file (mot, kitti, coco, cvat, boxes-csv) has the boxes of one channel: the re-tracked boxes of the only camera at
     the rate of the video, or else its tracks or detections, or those of ``topic``. `mcaptrack ingest` reads it again;

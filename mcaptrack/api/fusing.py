@@ -41,7 +41,9 @@ def _of_feet(name: str) -> Option:
     """The option for a parameter of the usual fuser, which declares its range and its help."""
     (about,) = (field.metadata for field in fields(FootFuser) if field.name == name)
     text = about["help"]
-    return Option("Joining of boxes", about["least"], about["most"], tuning=True, help=f"{text[:1].upper()}{text[1:]}.")
+    return Option(
+        "", about["least"], about["most"], tuning=True, is_set=not about["flag"], help=f"{text[:1].upper()}{text[1:]}."
+    )
 
 
 @declared(most_used=("to", "cameras", "clock_offset_s", "min_score", "output", "force"))
@@ -63,7 +65,7 @@ def fuse(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> mcaptrack.RunResult:
-    """Fuse the detections of several cameras with one ground to detections of the whole scene.
+    """Fuse the detections of several cameras to those of one scene.
 
     From /CAMERA/detections and /CAMERA/ground_plane to /world/detections: boxes that stand at the same place are
     joined, at most one of each camera, and the score is the probability that a person is there. The ground planes have

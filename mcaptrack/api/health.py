@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from mcaptrack import __version__, log
+from mcaptrack import __version__
 from mcaptrack.api.declared import Argument, declared
 from mcaptrack.environment import THREADS, cache_folder, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
@@ -29,6 +29,8 @@ _REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([
 
 def temporary_folder() -> tuple[Path | None, str]:
     """Return the folder for temporary files, and why a log can't be written to it and read back ("" if it can)."""
+    from mcaptrack import log
+
     folder = None
     try:
         folder = Path(tempfile.gettempdir())
@@ -195,12 +197,12 @@ def doctor(
         str | None, Argument("store", "STORE", "A bucket or prefix to try, such as s3://robots/night.")
     ] = None,
 ) -> DoctorResult:
-    """Print what this installation has: versions, codecs, memory, folders, plug-ins, and what may be done with a store.
+    """Print what this installation, or a store, has and lacks.
 
-    Pictures are encoded and decoded, a table is written, and a log is written to the temporary folder and read back.
-    The network is used for a store only: objects are listed there, and a small hidden one is written, read, replaced
-    and removed. The exit code is 0 if all that a plain run needs is there, and 1 otherwise, with one line for each
-    fault.
+    Versions, codecs, memory, folders and plug-ins are listed. Pictures are encoded and decoded, a table is written, and
+    a log is written to the temporary folder and read back. The network is used for a store only: objects are listed
+    there, and a small hidden one is written, read, replaced and removed. The exit code is 0 if all that a plain run
+    needs is there, and 1 otherwise, with one line for each fault.
 
     Parameters
     ----------

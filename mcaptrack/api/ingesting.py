@@ -147,12 +147,12 @@ def ingest(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> IngestResult:
-    """Make a log of a video, a folder of images, a ROS bag, an MCAP file, or a label file.
+    """Make a log of a video, images, a recording or a label file.
 
-    Writes /camera/video, /camera/ground_plane, /camera/calibration, /camera/detections, /camera/tracks, /camera/truth
-    and /camera/motion, as far as they are given. Streams that viewers can play (H.264, VP9, AV1) are copied without
-    re-encoding; others are re-encoded as H.264, and a note says why. Timestamps are those of the file, exact to the
-    nanosecond.
+    Takes folders of images, ROS bags and MCAP files, too. Writes /camera/video, /camera/ground_plane,
+    /camera/calibration, /camera/detections, /camera/tracks, /camera/truth and /camera/motion, as far as they are given.
+    Streams that viewers can play (H.264, VP9, AV1) are copied without re-encoding; others are re-encoded as H.264, and
+    a note says why. Timestamps are those of the file, exact to the nanosecond.
 
     From a ROS 1 bag, a rosbag2 folder or database, or an MCAP file every message is copied unchanged, with its
     timestamps; labels belong to its only camera, or to the one that ``camera`` names.
@@ -162,7 +162,7 @@ def ingest(
     source : path
         The input.
     output : path, optional
-        Write to this file; the input stays unchanged.
+        Write to this file, of several inputs to this folder; they stay unchanged.
     camera : str, default "camera"
         Name of the camera; its channels begin with /NAME.
     fps : float, str or Fraction, optional

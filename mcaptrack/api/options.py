@@ -98,7 +98,12 @@ Value = float | int | bool | str | None
 
 def output(shown: str | None = None) -> Option:
     """The option of an output; ``shown`` is its default in the help."""
-    return Option(FILES, short="o", shown=shown, help="Write to this file; the log stays unchanged.")
+    return Option(
+        FILES,
+        short="o",
+        shown=shown,
+        help="Write to this file, of several logs to this folder; logs stay unchanged.",
+    )
 
 
 def similarity(shown: str) -> Option:

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from mcaptrack import log as logs
 from mcaptrack.api.common import detail, locations_of, log_location, optional_path, warn_unused
 from mcaptrack.api.declared import Argument, declared
 from mcaptrack.api.options import LOGS, Camera, Force, PathLike, Progress, Reports, no_progress, output
@@ -17,8 +16,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
 from mcaptrack.location import Location, distinct_names, local_name, parse
 from mcaptrack.notices import Notice, collected
-from mcaptrack.tables.catalogue import is_folder_of_tables, read_catalogue
-from mcaptrack.viewing import report as pages
 
 #: The largest page in bytes that notebooks show and keep.
 _MOST_INLINE: Final = 8_000_000
@@ -71,12 +68,12 @@ def report(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> ReportResult:
-    """Write one page about a log, or several: scores, forecasts, tracks over the scene, identity switches, lineage.
+    """Write a page about logs: scores, tracks, identity switches.
 
-    The page needs no network, and runs no script but its own; it contains its numbers as JSON, which --json prints.
-    Scores are those of `mcaptrack evaluate`; without ground truth in the log there are none. Only reads logs;
-    `mcaptrack run` runs stages that are missing. Of a folder with the tables of many logs, the page has totals, trends,
-    the worst logs, outliers and warnings.
+    It has forecasts and the lineage of results, too. The page needs no network, and runs no script but its own; it
+    contains its numbers as JSON, which --json prints. Scores are those of `mcaptrack evaluate`; without ground truth in
+    the log there are none. Only reads logs; `mcaptrack run` runs stages that are missing. Of a folder with the tables
+    of many logs, the page has totals, trends, the worst logs, outliers and warnings.
 
     Parameters
     ----------
@@ -112,6 +109,8 @@ def report(
     'page.html'
 
     """
+    from mcaptrack.tables.catalogue import is_folder_of_tables
+
     places = locations_of(log)
     tables = [place for place in places if is_folder_of_tables(place)]
     if not places:
@@ -147,6 +146,9 @@ def _page_of(logs_: Sequence[Location], output: Path | None) -> Path:
 
 def _about_logs(paths: Sequence[Location], camera: str | None, progress: Progress) -> tuple[str, dict[str, Any]]:
     """Return the page about logs, and its numbers."""
+    from mcaptrack import log as logs
+    from mcaptrack.viewing import report as pages
+
     real = [place_of(path) for path in paths]
     files, names = (distinct_names(some, real) for some in ([p.name for p in paths], [p.stem for p in paths]))
     reports = []
@@ -161,6 +163,9 @@ def _about_logs(paths: Sequence[Location], camera: str | None, progress: Progres
 
 def _about_tables(where: Path, folder: Path) -> tuple[str, dict[str, Any]]:
     """Return the page about all logs in a folder of tables, and its numbers; it links to pages from ``folder``."""
+    from mcaptrack.tables.catalogue import read_catalogue
+    from mcaptrack.viewing import report as pages
+
     rows = read_catalogue(where)
     data = pages.fleet_data(rows)
     return pages.fleet_page(rows, str(where), pages.ELEMENT, data, partial(_page_beside, folder)), data

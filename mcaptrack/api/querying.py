@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 from mcaptrack.api.common import as_path, detail, locations_of
 from mcaptrack.api.declared import PYTHON_ONLY, Argument, Option, checked, declared
 from mcaptrack.api.options import PathLike
-from mcaptrack.tables import RECORDING, TABLES
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -47,7 +46,7 @@ def query(
     ] = None,
     worlds: Annotated[bool, Option(QUERY)] = False,
 ) -> pa.Table:
-    """Query the tables of logs in SQL: where people were, how fast, for how long, and how well they were tracked.
+    """Query the tables of logs in SQL: who was where, and how fast.
 
     The tables are those of `mcaptrack export` (`mcaptrack docs tables`); the column `recording` names the log. They are
     read from the files beside the log if those are up to date, otherwise from the log. Each other channel is a table
@@ -187,6 +186,8 @@ def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, 
     ('frames', ('log',))
 
     """
+    from mcaptrack.tables import RECORDING, TABLES
+
     tables = tuple(
         TableInfo(
             table.name,

@@ -25,7 +25,7 @@ from mcaptrack.api.messages import DecodedMessage, checked_factories, decoded_me
 from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.rows import supervision_of
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, offer
 from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
@@ -254,9 +254,8 @@ class LogReader:
             elif (channel := opened.find(str(name))) in opened.channels:
                 whole = self._contents.messages(channel, part)
             else:
-                raise McaptrackError(
-                    f"{self.path} has no table {name}; there are {', '.join(self.tables)}, and its channels"
-                )
+                every = offer(str(name), [*self.tables, *opened.channels], "there are")
+                raise McaptrackError(f"{self.path} has no table or channel {name}; {every}")
             if topic is not None:
                 topic = opened.channel(opened.find(topic)).topic
                 if "topic" not in whole.schema.names:
@@ -480,7 +479,7 @@ class LogReader:
             boxes = {name: schema for name, schema in schemas.items() if schema in (DETECTIONS, TRACKS)}
             channel = opened.find(topic, among=boxes)
             if channel not in boxes:
-                raise McaptrackError(f"{self.path} has no channels {topic} of boxes; it has {', '.join(sorted(boxes))}")
+                raise McaptrackError(f"{self.path} has no channels {topic} of boxes; {offer(topic, sorted(boxes))}")
             names = class_names(opened.channel(channel).metadata)
             return supervision_of(opened.frames(channel, boxes[channel] or TRACKS), names)
 

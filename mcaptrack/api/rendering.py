@@ -69,10 +69,11 @@ def render(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> RenderResult:
-    """Draw boxes, trails and predictions on the video of a log: LOG.mp4, or a GIF.
+    """Draw boxes, trails and predictions on the video of a log.
 
-    Draws the views that Foxglove and Lichtblick show, in the same colours. Tracks of 3D boxes are drawn on the pictures
-    of a calibrated camera; without one, they are seen from above in their frame of reference, around the robot.
+    Writes LOG.mp4, or a GIF. Draws the views that Foxglove and Lichtblick show, in the same colours. Tracks of 3D boxes
+    are drawn on the pictures of a calibrated camera; without one, they are seen from above in their frame of reference,
+    around the robot.
 
     With ``compare`` SORT's tracks, re-tracked ones and the ground truth stand side by side. With ``heatmap`` it is a
     picture (.png, .jpg) of where people spend their time.
@@ -85,7 +86,8 @@ def render(
     Parameters
     ----------
     output : path, optional
-        Write to this file: a video (.mp4 or .gif), with ``blur`` also a log (.mcap), with ``heatmap`` a picture.
+        Write to this file: a video (.mp4 or .gif), with ``blur`` also a log (.mcap), with ``heatmap`` a picture. Of
+        several logs, to this folder.
 
         By default LOG.mp4 beside the log, LOG.compared.mp4 with ``compare``, LOG.blurred.mp4 with ``blur``,
         LOG.heatmap.png with ``heatmap``.

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 _AFTER: Final = "After the stages"
 _CLASSES: Final = "Classes of objects"
 _SEVERAL: Final = "Several cameras"
-_AGAIN: Final = "Use this {kind}, also where another one was used before"
+_AGAIN: Final = "The {kind}, also where another one was used before"
 
 
 @declared(
@@ -83,14 +83,16 @@ def run(
     follows: Annotated[PathLike | Sequence[PathLike] | None, PYTHON_ONLY] = None,
     progress: Reports = no_progress,
 ) -> mcaptrack.RunResult:
-    """Detect, track, re-track and predict: run all stages that are missing or out of date, then events and tables.
+    """Detect, track, re-track and predict: do what a log still lacks.
 
-    From /camera/video (or the detections, tracks or samples that the log has) to /camera/predictions and
-    /camera/retracks; then events (see `mcaptrack events`), views, and Parquet tables beside the log. ``topic`` starts
-    with the pictures, or the boxes, of that channel. Channels that are up to date are kept; those that are out of date
-    are made again with the options that they had. ``force`` makes all again; on the command line with the parameters
-    that environment and config files set now, otherwise with those they had. Zones of ``zones`` are counted in later
-    runs, too.
+    Runs all stages that are missing or out of date, then events and tables. From /camera/video (or the detections,
+    tracks or samples that the log has) to /camera/predictions and /camera/retracks; then events (see `mcaptrack
+    events`), views, and Parquet tables beside the log. ``topic`` starts with the pictures, or the boxes, of that
+    channel.
+
+    Channels that are up to date are kept; those that are out of date are made again with the options that they had.
+    ``force`` makes all again; on the command line with the parameters that environment and config files set now,
+    otherwise with those they had. Zones of ``zones`` are counted in later runs, too.
 
     All cameras of a log are run, one after the other. Those with a measured ground plane are fused to /world, as
     `mcaptrack fuse` does, and this scene is run, too.

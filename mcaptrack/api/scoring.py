@@ -31,7 +31,7 @@ from mcaptrack.api.options import (
     similarity,
 )
 from mcaptrack.choices import Similarity
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, offer
 from mcaptrack.evaluation import (
     COMBINED,
     DEFAULT_GATES_M,
@@ -305,7 +305,7 @@ def _check_name(name: str, row: Mapping[str, Any]) -> None:
     """Raise McaptrackError if a row has no score of this name."""
     scores = [key for key, value in row.items() if isinstance(value, int | float) and key != "gate"]
     if name not in scores:
-        raise McaptrackError(f"there is no score {name}; there are {', '.join(scores)}")
+        raise McaptrackError(f"there is no score {name}; {offer(name, scores, 'there are')}")
 
 
 #: Several distances are one text on the command line: 0.5,1,2.
@@ -324,8 +324,8 @@ def evaluate(
     similarity: Annotated[Similarity | None, similarity("both, as far as there are boxes and metres")] = None,
     gate_m: _Gates = DEFAULT_GATES_M,
     min_iou: MinIou = 0.5,
-    rules: Annotated[Rules, Option(SCORES, tuning=True)] = "trackeval",
-    smoothed: Annotated[bool, Option(SCORES, tuning=True)] = False,
+    rules: Annotated[Rules, Option(SCORES, tuning=True, is_set=True)] = "trackeval",
+    smoothed: Annotated[bool, Option(SCORES, tuning=True, is_set=True)] = False,
     topic: Annotated[str | Sequence[str] | None, Option(SCORES)] = None,
     label_format: labels.Format = "auto",
     columns: labels.Columns = None,

@@ -59,7 +59,7 @@ def detect(
     progress: Reports = no_progress,
     **options: Value,
 ) -> mcaptrack.RunResult:
-    """Detect people in the video of a log: whoever moves, or what a network finds.
+    """Detect people, or what a network finds, in the video of a log.
 
     Reads /camera/video, writes /camera/detections: one box for each person or object.
 
@@ -184,7 +184,7 @@ def track(
     progress: Reports = no_progress,
     **options: Value,
 ) -> mcaptrack.RunResult:
-    """Track detections: give each person an id that stays the same from frame to frame.
+    """Track detections: give each person an id that stays.
 
     Reads /camera/detections, writes /camera/tracks: one row per frame for each person who is tracked and detected in
     it. Boxes in space (3D) are tracked by ``ground``, unless another tracker is named. Inputs that are missing are made
@@ -297,7 +297,7 @@ def sample(
     return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
 
 
-@declared(most_used=("predictor", "horizon_s", "min_history", "output", "topic", "to", "camera", "force"))
+@declared(most_used=("predictor", "horizon_s", "output", "topic", "to", "camera", "force"))
 def predict(
     log: EachLog,
     *,
@@ -372,11 +372,11 @@ def retrack(
     progress: Reports = no_progress,
     **options: Value,
 ) -> mcaptrack.RunResult:
-    """Repair tracks by prediction: link the parts of one, split mixed ones, and leave out false ones.
+    """Repair tracks by prediction: join parts, split mixed ones.
 
-    Reads /camera/samples, writes /camera/retracks: tracks that use the whole log (offline), tracks that use the past
-    alone (online), predictions from the latter, and what was decided offline, with how likely each decision is right.
-    Inputs that are missing are made first.
+    False tracks are left out. Reads /camera/samples, writes /camera/retracks: tracks that use the whole log (offline),
+    tracks that use the past alone (online), predictions from the latter, and what was decided offline, with how likely
+    each decision is right. Inputs that are missing are made first.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from mcaptrack import __version__
 from mcaptrack.api import labels
 from mcaptrack.api.common import Notes, as_path, paths_of
 from mcaptrack.api.declared import Argument, Option, declared
-from mcaptrack.api.options import FILES, Force, GroundPlane, PathLike, PointOfBox, Reports, Topic, no_progress
+from mcaptrack.api.options import FILES, Force, GroundPlane, PathLike, Reports, Topic, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.training.recipe import RECIPES, Recipe
@@ -46,29 +46,23 @@ def train(
     recipe: Annotated[RecipeName, Option(_TRAINING, tuning=True)] = "red",
     validate: Annotated[PathLike | Sequence[PathLike] | None, Option(FILES)] = None,
     epochs: Annotated[int | None, Option(_TRAINING, 1, 1_000_000, tuning=True)] = None,
-    batch: Annotated[int | None, Option(_TRAINING, 1, 1_000_000, tuning=True)] = None,
-    rate: Annotated[float | None, Option(_TRAINING, 1e-9, 1, tuning=True)] = None,
-    noise_m: Annotated[float | None, Option(_WINDOWS, 0, 10, tuning=True)] = None,
-    gaps: Annotated[float | None, Option(_WINDOWS, 0, 0.9, tuning=True)] = None,
-    scale: Annotated[float | None, Option(_WINDOWS, 0, 1, tuning=True)] = None,
-    consistency_weight: Annotated[float, Option(_TRAINING, 0, 1e6, tuning=True)] = 0.0,
-    patience: Annotated[int, Option(_TRAINING, 0, 1_000_000, tuning=True)] = 0,
+    batch: Annotated[int | None, Option(_TRAINING, 1, 1_000_000, tuning=True, is_set=True)] = None,
+    rate: Annotated[float | None, Option(_TRAINING, 1e-9, 1, tuning=True, is_set=True)] = None,
+    noise_m: Annotated[float | None, Option(_WINDOWS, 0, 10, tuning=True, is_set=True)] = None,
+    gaps: Annotated[float | None, Option(_WINDOWS, 0, 0.9, tuning=True, is_set=True)] = None,
+    scale: Annotated[float | None, Option(_WINDOWS, 0, 1, tuning=True, is_set=True)] = None,
+    consistency_weight: Annotated[float, Option(_TRAINING, 0, 1e6, tuning=True, is_set=True)] = 0.0,
+    patience: Annotated[int, Option(_TRAINING, 0, 1_000_000, tuning=True, is_set=True)] = 0,
     walks: Annotated[int, Option(_WINDOWS, 1000, 100_000_000, tuning=True)] = 60_000,
     seed: Annotated[int, Option(_TRAINING, 0, 2**31 - 1, tuning=True)] = 1,
     device: Annotated[Device, Option(_TRAINING, tuning=True)] = "auto",
-    threads: Annotated[int, Option(_TRAINING, 1, 1024, tuning=True)] = 1,
+    threads: Annotated[int, Option(_TRAINING, 1, 1024, tuning=True, is_set=True)] = 1,
     resume: Annotated[bool, Option(FILES)] = False,
     topic: Topic = None,
     label_format: labels.Format = "auto",
-    columns: labels.Columns = None,
     classes: labels.Classes = None,
-    class_map: labels.ClassNames = None,
-    first_frame: labels.FirstFrame = None,
-    frames: labels.LabelledFrames = None,
     fps: labels.LabelFps = None,
-    size: labels.Size = None,
     ground_plane: GroundPlane = None,
-    point: PointOfBox = "foot",
     force: Force = False,
     progress: Reports = no_progress,
 ) -> TrainResult:
@@ -155,10 +149,7 @@ def train(
     from mcaptrack.training.loop import train as fit
 
     where = find_device(device)  # before anything takes long
-    how = labels.label_options(
-        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
-        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
-    )  # fmt: skip
+    how = labels.label_options(label_format=label_format, classes=classes, fps=fps, ground_plane=ground_plane)
     options = SourceOptions(how, topic)
     with collected() as warnings:
         training, card = _windows(chosen, sources, walks, options, notes)

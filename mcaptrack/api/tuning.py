@@ -22,7 +22,6 @@ from mcaptrack.api.options import (
     GroundPlane,
     MinIou,
     PathLike,
-    PointOfBox,
     Reports,
     Topic,
     chooser,
@@ -32,7 +31,7 @@ from mcaptrack.api.options import (
 )
 from mcaptrack.api.running import transform_of
 from mcaptrack.choices import Similarity
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
 from mcaptrack.evaluation import tuning as searching
 from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
@@ -110,21 +109,15 @@ def tune(
     gate_m: Annotated[float, gate_m()] = 1.0,
     min_iou: MinIou = 0.5,
     label_format: labels.Format = "auto",
-    columns: labels.Columns = None,
     classes: labels.Classes = None,
-    class_map: labels.ClassNames = None,
-    first_frame: labels.FirstFrame = None,
-    frames: labels.LabelledFrames = None,
     fps: labels.LabelFps = None,
-    size: labels.Size = None,
     ground_plane: GroundPlane = None,
-    point: PointOfBox = "foot",
     topic: Topic = None,
     camera: Camera = None,
     force: Force = False,
     progress: Reports = no_progress,
 ) -> TuneResult:
-    """Find the settings of a stage that score best against ground truth.
+    """Find the settings of a stage that score best.
 
     Reads detections and ground truth from logs, or from files with ``truth``. The command writes the best settings to
     mcaptrack.toml, which every command reads; other settings in it stay. A search that was interrupted continues where
@@ -188,10 +181,7 @@ def tune(
     ranges = _ranges(type(base), search, entry)
     chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
-    how = labels.label_options(
-        label_format=label_format, columns=columns, classes=classes, class_map=class_map, first_frame=first_frame,
-        frames=frames, fps=fps, size=size, ground_plane=ground_plane, point=point,
-    )  # fmt: skip
+    how = labels.label_options(label_format=label_format, classes=classes, fps=fps, ground_plane=ground_plane)
     notes, trials_file = Notes(), optional_path(study)
     with collected() as warnings:
         if truth is None:
@@ -240,8 +230,8 @@ def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -
     out = {}
     for name, span in asked.items():
         if name not in declared:
-            text = ", ".join(declared)
-            raise McaptrackError(f"`search=` has {name}, which can't be searched; there are {text}")
+            every = offer(name, declared, "there are")
+            raise McaptrackError(f"`search=` has {name}, which can't be searched; {every}")
         out[name] = declared[name]
         if span is not None:
             low, high = span

@@ -57,10 +57,11 @@ class LogCheck:
 
 @declared()
 def check(log: EachLog, *, progress: Reports = no_progress) -> LogCheck:
-    """Check every byte of a log: structure, checksums, indexes, statistics, order of messages.
+    """Check every byte of a log.
 
-    The exit code is 1 if there are errors; warnings are about what could be better. `mcaptrack recover` saves what is
-    intact. Results that stand beside a log are checked, too.
+    Structure, checksums, indexes, statistics and the order of messages are checked. The exit code is 1 if there are
+    errors; warnings are about what could be better. `mcaptrack recover` saves what is intact. Results that stand beside
+    a log are checked, too.
 
     Returns
     -------
@@ -129,10 +130,10 @@ def recover(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> LogRecovery:
-    """Save what is intact in a damaged log to LOG.recovered.mcap; the damaged log stays unchanged.
+    """Save what is intact in a damaged log.
 
-    Every chunk that can be read and has the right checksum is copied, with new indexes. What is lost is printed, and
-    the exit code is then 3.
+    It goes to LOG.recovered.mcap; the damaged log stays unchanged. Every chunk that can be read and has the right
+    checksum is copied, with new indexes. What is lost is printed, and the exit code is then 3.
 
     Returns
     -------
@@ -201,10 +202,11 @@ def drop(
     in_place: Annotated[bool, Option(FILES)] = False,
     force: Force = False,
 ) -> DropResult:
-    """Remove channels from a log, in place or in a copy; all others stay unchanged, to the byte.
+    """Remove channels from a log.
 
-    Channels that only describe a removed one are removed with it: its `/view/`, `/events`, `/counts`, `/errors` and
-    `/scores`. Results that stand beside the log are part of it, and of a copy.
+    In place, or in a copy; all others stay unchanged, to the byte. Channels that only describe a removed one are
+    removed with it: its `/view/`, `/events`, `/counts`, `/errors` and `/scores`. Results that stand beside the log are
+    part of it, and of a copy.
 
     Parameters
     ----------

@@ -21,7 +21,8 @@ from mcaptrack.api.common import as_path, log_file
 from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.notebook import Choice, arrow_html, show_log
 from mcaptrack.api.options import PathLike, no_progress
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, offer
+from mcaptrack.files import unreadable
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
@@ -293,12 +294,13 @@ def view(
     lichtblick: Annotated[str, Option(_VIEWER)] = LICHTBLICK,
     browser: Annotated[bool, Option(_VIEWER, flag="open/no-open")] = False,
 ) -> LogServer:
-    """Look at a log in the browser: pictures with tracks, events to click, the ground from above, report and tables.
+    """Look at a log in the browser, with its tracks and events.
 
-    Serves one page until Ctrl-C; it needs no connection. Three buttons open the log where it is shown in Lichtblick,
-    Foxglove or Rerun, which read it from this machine. Layout files beside the log are served as they are, also while
-    they are edited; in Foxglove import them (Layouts, Import from file). Only the log and what is made of it is served,
-    and only to this machine; whoever works on it can open the page.
+    The page has pictures, the ground from above, the report and the tables. Serves one page until Ctrl-C; it needs no
+    connection. Three buttons open the log where it is shown in Lichtblick, Foxglove or Rerun, which read it from this
+    machine. Layout files beside the log are served as they are, also while they are edited; in Foxglove import them
+    (Layouts, Import from file). Only the log and what is made of it is served, and only to this machine; whoever works
+    on it can open the page.
 
     Parameters
     ----------
@@ -455,14 +457,14 @@ def _chosen_layouts(
         try:
             json.loads(file.read_bytes())
         except OSError as error:
-            raise McaptrackError(f"the layout {file} can't be read: {error.strerror}") from None
+            raise unreadable(file, error) from None
         except (ValueError, RecursionError):
             raise McaptrackError(f"{file} is no layout: it is not JSON") from None
         return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}
     layouts = _layouts(path, opened, made_layouts, notes)
     if chosen is not None and str(chosen) not in layouts:
-        text = ", ".join(layouts) or "none"
-        raise McaptrackError(f"{path} has no layout {chosen}; it has {text}. A file of a layout ends with .json")
+        every = offer(str(chosen), layouts)
+        raise McaptrackError(f"{path} has no layout {chosen}; {every}. A file of a layout ends with .json")
     return {
         name: (layout_path(path, name).name, content)
         for name, content in layouts.items()

@@ -56,7 +56,7 @@ def zones(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> mcaptrack.RunResult:
-    """Count visits of zones and crossings of lines by the tracks of a log, and write them into the log.
+    """Count visits of zones and crossings of lines by tracks.
 
     Beside each channel of tracks, such as /camera/retracks/full, go .../zones/visits, .../zones/crossings, and counts
     for each frame in .../zones/counts. `mcaptrack run --zones FILE` does this, too, and later runs count again where

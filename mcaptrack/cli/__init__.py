@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import typer
 
@@ -17,7 +18,7 @@ app = typer.Typer(
     name="mcaptrack",
     cls=Group,
     no_args_is_help=True,
-    rich_markup_mode="markdown",
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
@@ -34,9 +35,25 @@ def _main(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_version, show_default=False)
     ] = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            envvar="MCAPTRACK_CONFIG",
+            show_envvar=False,
+            help="Read options from this file.",
+        ),
+    ] = None,
+    log_format: Annotated[
+        Literal["text", "json"],
+        typer.Option(
+            metavar="text|json",
+            envvar="MCAPTRACK_LOG_FORMAT",
+            show_envvar=False,
+            help="Print notes and errors as text or as JSON.",
+        ),
+    ] = "text",
 ) -> None:
-    """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results
-    into the log.
-
-    Start with `mcaptrack demo`, or with `mcaptrack ingest video.mp4` and `mcaptrack run video.mcap`.
+    """Detect and track people in a video or a log, repair the tracks, and predict where people go. Start with
+    `mcaptrack demo`, or with `mcaptrack ingest video.mp4` and `mcaptrack run video.mcap`.
     """

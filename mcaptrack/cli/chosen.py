@@ -2,34 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import Any, Final, get_type_hints
+from typing import Any, get_type_hints
 
-from mcaptrack.cli.command import is_on_command_line, settings_of
-from mcaptrack.cli.settings import found_of, nearest
-from mcaptrack.cli.text import refuse_usage
+from mcaptrack.cli.command import Settable, is_on_command_line, listed, settings_of, values_set
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import bare_type, member_type
-
-_SWITCH: Final = {
-    "true": True,
-    "yes": True,
-    "on": True,
-    "1": True,
-    "false": False,
-    "no": False,
-    "off": False,
-    "0": False,
-}
-_KIND_WORDS: Final = {bool: "true or false", int: "a whole number", float: "a number"}
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return names in words: "a, b and c"."""
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
@@ -37,56 +18,19 @@ def options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
     return {f.name: f for f in fields(kind) if not f.metadata.get("context")}
 
 
+def settable_of(kinds: Mapping[str, type[Transform]]) -> dict[str, Settable]:
+    """Return the parameters of transforms that ``--set`` may set, by name; the first that has one says its type."""
+    out = {}
+    for kind in reversed(list(kinds.values())):
+        hints = get_type_hints(kind)
+        for name in options_of(kind):
+            out[name] = Settable(*member_type(hints[name]), bare_type(hints[name]) is not hints[name])
+    return out
+
+
 def has_flag(field: Field[Any]) -> bool:
     """Return whether a parameter has an option of its own, beside ``--set name=value``."""
     return bool(field.metadata.get("flag", True))
-
-
-def values_set(command: str, texts: Sequence[str] | None, kinds: Mapping[str, type[Transform]]) -> dict[str, Any]:
-    """Return the values of ``--set name=value`` by parameter of the transforms ``kinds``, which have names.
-
-    A text without a value, a parameter that no transform has, or a value that isn't of its type ends the command with
-    exit code 2; the line says where the text was set.
-    """
-    owners = {option: kind for kind in reversed(list(kinds.values())) for option in options_of(kind)}
-    in_file = found_of(command).get("set")
-    where = f"{in_file[1].where}:" if in_file and not is_on_command_line("set") else "--set"
-    values: dict[str, Any] = {}
-    for text in texts or ():
-        written, equals, value = text.partition("=")
-        name = written.strip().lstrip("-").replace("-", "_")
-        if not equals or not name:
-            refuse_usage(f"{where} needs name=value, as in --set {name or 'name'}=0.5, not {text!r}")
-        if name not in owners:
-            hint = nearest(name, owners) or f"; there are {listed(sorted(owners))}"
-            refuse_usage(f"{where} {text}: there is no parameter {name}{hint}")
-        if name in values:
-            refuse_usage(f"{where} gives {name} twice")
-        try:
-            values[name] = _read_value(value.strip(), get_type_hints(owners[name])[name])
-        except ValueError as error:
-            refuse_usage(f"{where} {text}: {value.strip()!r} is not {error}")
-    return values
-
-
-def _read_value(value: str, hint: Any) -> Any:
-    """The value that a text gives a parameter of this type. Raises ValueError that says what it should be."""
-    if value.lower() == "none" and bare_type(hint) is not hint:
-        return None
-    kind, is_tuple = member_type(hint)
-    try:
-        members = [_read_member(member.strip(), kind) for member in (value.split(",") if is_tuple else [value])]
-    except ValueError:
-        raise ValueError(_KIND_WORDS[kind]) from None
-    return tuple(members) if is_tuple else members[0]
-
-
-def _read_member(value: str, kind: Any) -> Any:
-    if kind is bool:
-        if value.lower() not in _SWITCH:
-            raise ValueError
-        return _SWITCH[value.lower()]
-    return kind(value) if kind in (int, float) else value
 
 
 def is_open(stage: Stage, values: Mapping[str, Any]) -> bool:
@@ -177,7 +121,7 @@ def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Tr
         own = {option for kind in stage.built_in().values() for option in options_of(kind)}
         chosen_plugin = settings.get(stage.kind) if stage.kind else None
         kinds = dict(stage.built_in()) | ({chosen_plugin: stage.find(chosen_plugin).cls} if chosen_plugin else {})
-        wanted |= values_set(stage.name, wanted.pop("set", None), kinds)
+        wanted |= values_set(stage.name, wanted.pop("set", None), settable_of(kinds))
         if wanted.keys() & {*own, stage.option, "profile"}:
             out[stage.name] = Maker.of(stage, settings, wanted)()
     return out

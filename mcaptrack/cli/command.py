@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperOption
 
-from mcaptrack.api.declared import Parameter
+from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.flags import RUNNING
-from mcaptrack.cli.settings import Given, Setting, declared_settings, found_of, gather
-from mcaptrack.cli.text import log_format, refuse_usage, say
+from mcaptrack.cli.help import ALL, HELP, LAST_PANELS, write_page
+from mcaptrack.cli.settings import SWITCH, Given, Setting, declared_settings, found_of, gather, nearest
+from mcaptrack.cli.text import refuse_usage, say
+from mcaptrack.errors import similar
 from mcaptrack.notices import warn
 
 #: The exception of Typer for a command line that it can't parse.
@@ -53,69 +53,32 @@ def _message(error: Any) -> str:
         if fault["type"] in _NOT:
             return f"{fault['input']!r} is not {_NOT[fault['type']]}"
     message = str(error.message).replace("Value error, ", "")
+    if choice := re.match(r"'(.+)' is not one of (.+)", message):
+        message = message.rstrip(".") + nearest(choice[1], re.findall(r"'(.+?)'", choice[2]))
     return re.sub(r"Got unexpected extra argument(?:s|\(s\))? \((.*)\)", r"too many arguments: \1", message)
 
 
 def _unknown_option(error: Any) -> str:
-    """Return the message about an unknown option: which commands have it, and which options have similar names."""
+    """Return the message about an unknown option: which commands have it, and which option may be meant."""
     name, context = error.option_name, error.ctx
     text = f"no such option: {name}"
     if context is None or context.parent is None:
-        return text
+        return f"{text}{nearest(name, error.possibilities or ())}"
     theirs = {command: _options_of(command_class) for command, command_class in context.parent.command.commands.items()}
     if having := [command for command, options in theirs.items() if name in options]:
         text += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
-    parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
-    if parameter in getattr(context.command, "settable", ()):
-        return f"{text}; did you mean --set {parameter}=VALUE?"
     own_options = theirs.get(context.info_name, [])
-    stem = name.replace("_", "-")
-    alike = [option for option in own_options if option == stem or option.startswith(f"{stem}-")]
-    alike = alike or difflib.get_close_matches(name, own_options, 1, 0.75)
-    return f"{text}; did you mean {' or '.join(alike)}?" if alike else text
+    begin = f"--{name.removeprefix('--').replace('_', '-')}-"
+    if len(alike := [option for option in own_options if option.startswith(begin)]) > 1:
+        return f"{text}; did you mean {' or '.join(alike)}?"
+    parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
+    is_set = parameter in getattr(context.command, "settable", ())
+    meant = f"--set {parameter}=VALUE" if is_set else similar(name, own_options, 0.75)
+    return f"{text}; did you mean {meant}?" if meant else text
 
 
 def _options_of(command: Any) -> list[str]:
     return [name for option in command.params if not getattr(option, "hidden", False) for name in option.opts]
-
-
-# The headings of options in the help, and the options that come first: those that most people need.
-#
-# The other options of a command stand below their themes, then input and output, many logs, and those of all
-# commands.
-
-
-#: The first heading, that of options without a theme below it, and the last ones.
-FIRST_PANEL: Final = "Most used"
-MORE_PANEL: Final = "More options"
-LAST_PANELS: Final = ("Input and output", "Many logs", "Options of all commands")
-#: The option that shows all options; ``--help`` shows those that most people need.
-ALL: Final = "--help-all"
-
-#: The heading of a theme that not all detectors, trackers or predictors have: the names of those that have it.
-_THOSE: Final = re.compile(r"\((.+)\)$|^Options of (.+)$")
-
-
-def arrange(first: Sequence[str], parameters: list[Any]) -> None:
-    """Put the parameters of a command into the order of its help, below its headings; ``first`` come first."""
-    for parameter in parameters:
-        if parameter.param_type_name != "option":
-            continue
-        if parameter.name in first:
-            those = _THOSE.search(parameter.rich_help_panel or "")
-            if those:
-                parameter.help = f"{parameter.help.rstrip('.')} ({those[1] or those[2]})."
-            parameter.rich_help_panel = FIRST_PANEL
-        elif first and not parameter.rich_help_panel:
-            parameter.rich_help_panel = MORE_PANEL
-
-    def place(parameter: Any) -> tuple[int, int]:
-        panel = getattr(parameter, "rich_help_panel", None)
-        if panel == FIRST_PANEL:
-            return -1, first.index(parameter.name)
-        return (1 + LAST_PANELS.index(panel), 0) if panel in LAST_PANELS else (0, 0)
-
-    parameters.sort(key=place)
 
 
 class Command(TyperCommand):
@@ -128,70 +91,53 @@ class Command(TyperCommand):
         self.settings = declared_settings(name, self.parameters)
         self.most_used: tuple[str, ...] = function.most_used
         self.settable: tuple[str, ...] = function.settable
-        arrange(self.most_used, self.params)
-        self._is_short = False
+        self.set_parameters: list[Parameter] = function.set_parameters
+        self._function = function
         self._help_all: Any = None
-        parameters: dict[str, Any] = {parameter.name or "": parameter for parameter in self.params}
-        for parameter in parameters.values():
-            parameter.process_value = _refusing_empty(parameter.process_value)
-        config = parameters["config"]
-        config.envvar = self.settings["config"].variable  # the others are read with the files, once this is known
+        for parameter in self.params:
+            every: Any = parameter
+            every.process_value = _refusing_empty(every.process_value)
 
     def get_help_option(self, ctx: Any) -> Any:
         """Put ``--help`` below the heading of the options that all commands have."""
         option = super().get_help_option(ctx)
         if option is not None:
             option.rich_help_panel = LAST_PANELS[-1]
-            option.help = "Show the options that most people need, and exit."
         return option
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the parameters, with ``--help-all``; while the short help is printed, only those that stand in it."""
+        """Return the parameters, with ``--help-all``."""
         if self._help_all is None:
             self._help_all = copy(self.get_help_option(ctx))
             self._help_all.name, self._help_all.opts, self._help_all.callback = "help_all", [ALL], _show_all
-            self._help_all.help = "Show all options, by theme, and exit."
-        parameters = [*super().get_params(ctx), self._help_all]
-        return list(filter(self._is_in_short_help, parameters)) if self._is_short else parameters
+        return [*super().get_params(ctx), self._help_all]
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help: with ``--help-all`` of all options, otherwise of those that most people need."""
-        left_out = [] if ctx.meta.get(ALL) else [o for o in self.get_params(ctx) if not self._is_in_short_help(o)]
-        if left_out:
-            panels = dict.fromkeys(re.sub(r" \(.*", "", option.rich_help_panel) for option in left_out)
-            self._is_short, self.epilog = True, f"`{ALL}` shows all options, also: {', '.join(panels)}."
-        try:
-            super().format_help(ctx, formatter)
-        finally:
-            self._is_short, self.epilog = False, None
-
-    def _is_in_short_help(self, parameter: Any) -> bool:
-        if parameter.param_type_name != "option":
-            return True
-        panel = parameter.rich_help_panel
-        return panel == FIRST_PANEL if self.most_used else panel not in LAST_PANELS[1:]
+        """Print the help: with ``--help-all`` all of it."""
+        write_page(formatter, ctx.command_path, self._function, bool(ctx.meta.get(ALL)))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line; whatever is wrong with it ends the command in one line."""
-        with log_format(next(_values_of(args, "--log-format"), ""), self.name or ""):
-            return self._parse(ctx, args)
+        """Parse the command line; whatever is wrong with it ends the command in one line.
 
-    def _parse(self, ctx: Any, args: list[str]) -> list[str]:
+        The values of environment and files are the defaults.
+        """
         args_before = list(args)  # parsing may take words away
+        if ctx.parent is not None and not ctx.resilient_parsing and not {*args} & {*HELP}:
+            gather(ctx.parent.command.commands, ctx.parent.params["config"])
+            ctx.default_map = converted(ctx, ctx.info_name or "")
         with usage_in_one_line(self.name or ""):
             left = super().parse_args(ctx, args)
         for option in self.params:
             if isinstance(option, TyperOption) and not option.multiple and not option.is_flag:
-                _refuse_several(args_before, option.opts)
+                refuse_several(args_before, option.opts)
         return left
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command; with --verbose first list the options that differ from the defaults, and their sources."""
         RUNNING.set(ctx)
-        with log_format(ctx.params.get("log_format", "text"), self.name or ""):
-            if ctx.params.get("verbose") and not ctx.params.get("quiet"):
-                say(self._options_in_use(ctx))
-            return super().invoke(ctx)
+        if ctx.params.get("verbose") and not ctx.params.get("quiet"):
+            say(self._options_in_use(ctx))
+        return super().invoke(ctx)
 
     def _options_in_use(self, ctx: Any) -> str:
         set_values = found_of(self.name or "")
@@ -223,14 +169,14 @@ def _refusing_empty(process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], 
     return processed
 
 
-def _refuse_several(args: Sequence[str], options: Sequence[str]) -> None:
+def refuse_several(args: Sequence[str], options: Sequence[str]) -> None:
     """Refuse several values of an option that takes one: the last would count, and the others be ignored."""
-    names = {value: None for option in options for value in _values_of(args, option)}
+    names = {value: None for option in options for value in values_of(args, option)}
     if len(names) > 1:
         refuse_usage(f"{options[0]} is given as {' and as '.join(names)}; give one")
 
 
-def _values_of(args: Sequence[str], option: str) -> Iterator[str]:
+def values_of(args: Sequence[str], option: str) -> Iterator[str]:
     """Yield the values of an option on a command line that may be wrong."""
     for number, word in enumerate(args):
         if word == "--":
@@ -254,20 +200,6 @@ def _rank(ctx: Any, parameter: str, set_values: Mapping[str, tuple[Setting, Give
     if source.name == "DEFAULT_MAP":
         return set_values[parameter][1].rank, set_values[parameter][1].where
     return (1, "the environment") if source.name == "ENVIRONMENT" else (0, "")
-
-
-def read_config(context: typer.Context, path: Path | None) -> Path | None:
-    """Use the values of environment and files as defaults of this command's options.
-
-    This is the callback of ``--config``, which Typer parses first.
-    """
-    if context.resilient_parsing or context.parent is None:
-        return path
-    group: Any = context.parent.command
-    commands: Mapping[str, Command] = group.commands
-    gather(commands, path)
-    context.default_map = converted(context, context.info_name or "")
-    return path
 
 
 def converted(context: Any, command: str) -> dict[str, Any]:
@@ -321,3 +253,72 @@ def warn_unused(reason: str, *parameters: str) -> None:
     for setting in command.settings.values():
         if setting.parameter in parameters and is_on_command_line(setting.parameter):
             warn(f"--{setting.name} changes nothing here: {reason}", "option-not-used")
+
+
+# Parameters without an option of their own.
+
+
+Set = Annotated[
+    Sequence[str] | None,
+    Option(
+        tuning=r"[A-Za-z0-9_-]+=[A-Za-z0-9_.,+ -]*",
+        metavar="NAME=VALUE",
+        shown=False,
+        help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
+    ),
+]
+_KIND_WORDS: Final = {bool: "true or false", int: "a whole number", float: "a number"}
+
+
+class Settable(NamedTuple):
+    """A parameter that ``--set`` sets: the type of one value, and whether it may have several, and be None."""
+
+    kind: Any
+    many: bool = False
+    may_be_none: bool = True
+
+    def read(self, value: str) -> Any:
+        """The value that a text gives. Raises ValueError that says what it should be."""
+        if self.may_be_none and value.lower() == "none":
+            return None
+        try:
+            members = [self._one(member.strip()) for member in (value.split(",") if self.many else [value])]
+        except (KeyError, ValueError):
+            raise ValueError(_KIND_WORDS[self.kind]) from None
+        return tuple(members) if self.many else members[0]
+
+    def _one(self, value: str) -> Any:
+        if self.kind is bool:
+            return SWITCH[value.lower()]
+        return self.kind(value) if self.kind in (int, float) else value
+
+
+def values_set(command: str, texts: Sequence[str] | None, parameters: Mapping[str, Settable]) -> dict[str, Any]:
+    """Return the values of ``--set name=value`` by parameter.
+
+    A text without a value, an unknown parameter, or a value that isn't of its type ends the command with exit code 2;
+    the line says where the text was set.
+    """
+    in_file = found_of(command).get("set")
+    where = f"{in_file[1].where}:" if in_file and not is_on_command_line("set") else "--set"
+    values: dict[str, Any] = {}
+    for text in texts or ():
+        written, equals, value = text.partition("=")
+        name = written.strip().lstrip("-").replace("-", "_")
+        if not equals or not name:
+            refuse_usage(f"{where} needs name=value, as in --set {name or 'name'}=0.5, not {text!r}")
+        if name not in parameters:
+            hint = nearest(name, parameters) or f"; there are {listed(sorted(parameters))}"
+            refuse_usage(f"{where} {text}: there is no parameter {name}{hint}")
+        if name in values:
+            refuse_usage(f"{where} gives {name} twice")
+        try:
+            values[name] = parameters[name].read(value.strip())
+        except ValueError as error:
+            refuse_usage(f"{where} {text}: {value.strip()!r} is not {error}")
+    return values
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names in words: "a, b and c"."""
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

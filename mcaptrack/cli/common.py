@@ -190,7 +190,7 @@ def only_one_output(paths: Sequence[Location], output: Path | None) -> None:
     """Raise McaptrackError if several inputs would be written to one output."""
     if output is not None and len(paths) > 1:
         raise McaptrackError(
-            f"{len(paths)} inputs can't all be written to {output}; give one input, or no name for the output"
+            f"{len(paths)} inputs can't all be written to {output}; name a folder for their results, or leave it out"
         )
 
 

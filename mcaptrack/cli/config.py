@@ -18,7 +18,7 @@ import typer
 
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish_bytes
+from mcaptrack.files import missing, publish_bytes, unreadable
 
 NAME: Final = "mcaptrack.toml"
 #: A larger file is refused before it is read.
@@ -48,7 +48,7 @@ def read_files(named: Path | None) -> list[ConfigFile]:
     if named is not None:
         tables = _read(named)
         if tables is None:
-            refuse_usage(f"--config {named}: there is no such file")
+            refuse_usage(f"--config: {missing(named)}")
         return [ConfigFile(named, tables, trusted=True)]
     own = user_file()
     candidates = [(Path(NAME), _is_same(Path(NAME), own)), (own, True)]
@@ -91,7 +91,7 @@ def read_toml(path: Path) -> Toml | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        raise McaptrackError(f"{path} can't be read: {getattr(error, 'strerror', None) or error}") from None
+        raise unreadable(path, error) from None
     try:
         about = os.fstat(handle)
         if not stat.S_ISREG(about.st_mode):
@@ -99,7 +99,7 @@ def read_toml(path: Path) -> Toml | None:
         with open(handle, "rb", closefd=False) as stream:
             data = stream.read(MAX_BYTES + 1)
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     finally:
         os.close(handle)
     if len(data) > MAX_BYTES:

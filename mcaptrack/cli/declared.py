@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
-from typing import Annotated, Any, ClassVar, Final, Generic, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, Final, Generic, TypeVar, get_type_hints
 
 import typer
 
@@ -30,15 +30,14 @@ from mcaptrack.api.declared import (
 )
 from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import LAST_PANELS, read_config
+from mcaptrack.cli.command import Set, Settable, values_set
+from mcaptrack.cli.help import LAST_PANELS, arranged
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 
 T = TypeVar("T")
 #: Heading of the options of all commands.
 COMMON: Final = LAST_PANELS[-1]
-_CONFIG = "Read options from this file, not mcaptrack.toml in the working folder (tuning only) and your config folder."
-_LOG_FORMAT = "Print notes, progress and errors as lines of text, or as objects of JSON with their times."
 
 
 class OfAll:
@@ -47,8 +46,6 @@ class OfAll:
     json: Annotated[bool, Option(COMMON, help="Print JSON for programs.")] = False
     quiet: Annotated[bool, Option(COMMON, short="q", help="Say nothing but errors and warnings.")] = False
     verbose: Annotated[bool, Option(COMMON, short="v", help="Print more, such as where each option was set.")] = False
-    config: Annotated[PathLike | None, Option(COMMON, help=_CONFIG)] = None
-    log_format: Annotated[Literal["text", "json"], Option(COMMON, help=_LOG_FORMAT)] = "text"
 
 
 class Printed:
@@ -154,14 +151,23 @@ def command(
     ``more`` are options that the function lacks. ``run`` gets the values of all.
     """
     hints, signature = hints_of(declared), inspect.signature(declared).parameters
-    parameters = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OfAll))}
-    annotations = {
-        about.name: argument_annotation(about, hints[parameter], signature[parameter].default)
+    every = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OfAll))}
+    settable = {name: Settable(each.kind, each.many) for name, each in every.items() if each.option.is_set}
+    parameters = {name: option for name, option in every.items() if name not in settable}
+    if settable:
+        parameters["set"] = parameter_of("set", Set, None)
+    most_used = most_used or getattr(declared, "most_used", ())
+    options = arranged(most_used, parameters.values())
+    arguments = [
+        (about, *argument_annotation(about, hints[parameter], signature[parameter].default))
         for parameter, about in arguments_of(declared).items()
-    } | {option.name: (annotation_of(option), option.default) for option in parameters.values()}
+    ]
+    annotations = {about.name: (hint, default) for about, _, hint, default in arguments}
+    annotations |= {option.name: (annotation_of(option), option.default) for option in options}
 
     def call(**values: Any) -> None:
-        run(values)
+        defaults = {parameter: every[parameter].default for parameter in settable}
+        run(values | defaults | (values_set(name, values["set"], settable) if settable else {}))
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     function: Any = common.one_line(call)
@@ -169,8 +175,10 @@ def command(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
     function.__name__, function.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    function.parameters, function.settable = tuple(parameters.values()), ()
-    function.help, function.most_used = help_of(declared), most_used or getattr(declared, "most_used", ())
+    function.parameters, function.settable = tuple(options), tuple(settable)
+    function.set_parameters = [every[parameter] for parameter in settable]
+    function.help, function.most_used = help_of(declared), most_used
+    function.places = [(usage, about.metavar, about.text) for about, usage, *_ in arguments]
     return function  # type: ignore[no-any-return]
 
 
@@ -180,36 +188,36 @@ def parameters_of(options: type) -> list[Parameter]:
     return [parameter_of(name, hint, getattr(options, name)) for name, hint in hints.items()]
 
 
-def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[Any, Any]:
-    """Return the annotation and the default of an argument, as Typer takes them; ``hint`` is its type in Python."""
+def argument_annotation(about: Argument, hint: Any, default: Any) -> tuple[str, Any, Any]:
+    """Return how the usage shows an argument, and its annotation and default, as Typer takes them.
+
+    ``hint`` is its type in Python.
+    """
     kind, many = (str, True) if about.words else on_command_line(bare(hint))
     many = many or (isinstance(about, OneOfMany) and not about.is_one)
     is_needed = default is inspect.Parameter.empty and not about.words
     kind = list[kind] if many else kind  # type: ignore[valid-type]
-    argument = typer.Argument(metavar=about.metavar, help=about.text, show_default=about.shown)
-    return Annotated[kind if is_needed else kind | None, argument], default if is_needed else None
+    usage = f"{about.metavar}{'...' if many else ''}"
+    annotation: Any = Annotated[
+        kind if is_needed else kind | None, typer.Argument(metavar=about.metavar, help=about.text)
+    ]
+    return usage if is_needed else f"[{usage}]", annotation, default if is_needed else None
 
 
 def annotation_of(parameter: Parameter) -> Any:
-    """Return the annotation of an option, as Typer takes it. The help names the range.
-
-    Options of all commands, and of input and output, show no defaults unless they are declared to.
-    """
+    """Return the annotation of an option, as Typer takes it. The help names the range."""
     about, text = parameter.option, parameter.help
     if ends := limits(about.least, about.most):
         text += f" {ends[0].upper()}{ends[1:]}."
-    shown = about.panel not in (COMMON, FILES) if parameter.shown is None else parameter.shown
     info = typer.Option(
         *parameter.flags,
         help=text,
         metavar=about.metavar,
-        show_default=shown,
+        show_default=parameter.shown if parameter.shown is not None else True,
         show_envvar=False,
         rich_help_panel=about.panel or None,
         case_sensitive=False,
         autocompletion=about.names,
-        is_eager=parameter.name == "config",  # the file has the defaults of the others
-        callback=read_config if parameter.name == "config" else None,
     )
     kind: Any = list[parameter.kind] if parameter.many else parameter.kind  # type: ignore[name-defined]
     return Annotated[kind | None if parameter.default is None else kind, info]

@@ -13,7 +13,7 @@ from mcaptrack.cli import common
 from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import print_table, printable, say, show, show_left_out
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, offer
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -133,7 +133,7 @@ def _limit(text: str) -> tuple[str, float]:
         return names[name.strip().lower()], float(value)
     except (KeyError, ValueError):
         raise McaptrackError(
-            f"--fail-under needs one of {', '.join(names)} and a number, as in idf1=0.7, not {text!r}"
+            f"--fail-under needs a score and a number, as in idf1=0.7, not {text!r}; {offer(name, names, 'there are')}"
         ) from None
 
 

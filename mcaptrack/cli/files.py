@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Printed
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import print_table, show
+from mcaptrack.cli.text import print_table, refuse_usage, show
+from mcaptrack.errors import command
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -46,7 +48,7 @@ class Check(EachLog["LogCheck"]):
         with common.printed_to(self.values["output"], self.values["force"]):
             if self.values["json"]:
                 common.print_json({"results": [_as_json(file) for file in files], **totals})
-            elif not self.many.json_lines:
+            else:
                 for file in files:
                     _print_check(file, self.values["quiet"])
 
@@ -129,7 +131,10 @@ class Drop(EachLog["DropResult"]):
         """Return the logs: the command takes one name, since those of channels follow."""
         from mcaptrack.fleet import find_logs
 
-        return find_logs([self.values["logs"]])
+        log, files = self.values["logs"], [name for name in self.values["topics"] if Path(name).is_file()]
+        if files and not log.exists():
+            refuse_usage(f"the log comes before the topics: {command('drop', Path(files[0]), str(log))}")
+        return find_logs([log])
 
     def show(self, log: Location, done: DropResult, talk: common.Talk) -> None:
         """Print what was removed."""

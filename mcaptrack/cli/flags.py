@@ -52,6 +52,8 @@ def _option(match: re.Match[str]) -> str:
     except (SyntaxError, ValueError):
         return match[0]
     flag = flag_of(parameter, value)
+    if flag.startswith("--set "):
+        return f"{flag}={value}"
     return flag if isinstance(value, bool) else f"{flag} {value}"
 
 
@@ -64,4 +66,5 @@ def flag_of(parameter: str, value: object = None, name: str = "") -> str:
         if option.name == parameter and option.param_type_name == "option":
             names = option.secondary_opts if value is False and option.secondary_opts else option.opts
             return str(min(names, key=len))
-    return f"--{parameter.replace('_', '-')}"
+    is_set = parameter in getattr(running, "settable", ())
+    return f"--set {parameter}" if is_set else f"--{parameter.replace('_', '-')}"

@@ -78,6 +78,7 @@ def other_numbers() -> str:
     for name, command in Commands().items():
         numbers = [option for option in command.parameters if option.kind in (int, float)]
         rows = [_row(option) for option in numbers if name == "run" or option.name not in NAMES]
+        rows += [_row(option, f"--set {option.name}=") for option in command.set_parameters]
         if rows and name not in STAGES:
             sections.append("\n".join([f"### {name}", "", _HEAD, *rows]))
     return "\n\n".join(sections)

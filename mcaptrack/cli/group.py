@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -15,12 +16,17 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from mcaptrack import _MODULES
-from mcaptrack.cli.command import Command, usage_in_one_line
-from mcaptrack.cli.settings import may_be_set
+from mcaptrack.cli.command import Command, refuse_several, usage_in_one_line, values_of
+from mcaptrack.cli.help import ALL, HELP, write_page, write_paragraph, write_section
+from mcaptrack.cli.settings import may_be_set, nearest
+from mcaptrack.cli.text import log_format, refuse_usage
+from mcaptrack.environment import variable
+from mcaptrack.errors import command
 
-_MAKE, _RUN, _LOOK = "Make a log", "Detect, track, predict", "Look at results"
-_MEASURE, _KEEP = "Measure and improve", "Check and repair logs"
+_FIRST, _STEP, _RESULTS, _IMPROVE = "Start here", "One step alone", "Results", "Improve and repair"
 _OF_PACKAGES = "Of installed packages"
+#: The options of the program, which may stand before the command or after it.
+PROGRAM_OPTIONS: Final = ("--config", "--log-format")
 
 
 class Listed(NamedTuple):
@@ -59,34 +65,34 @@ def _source_of(module: str) -> str:
 
 
 _LISTED: Final = (
-    Listed("ingest", _MAKE, "ingest:Ingest"),
-    Listed("demo", _MAKE, "demo:Demo"),
-    Listed("run", _RUN, "running:Run"),
-    Listed("detect", _RUN, "stages:StageCommand"),
-    Listed("motion", _RUN, "stages:StageCommand"),
-    Listed("track", _RUN, "stages:StageCommand"),
-    Listed("sample", _RUN, "stages:StageCommand"),
-    Listed("predict", _RUN, "stages:StageCommand"),
-    Listed("retrack", _RUN, "stages:StageCommand"),
-    Listed("fuse", _RUN, "running:Fuse"),
-    Listed("models", _RUN, "models:Models"),
-    Listed("info", _LOOK, "show:Info"),
-    Listed("view", _LOOK, "view:ViewCommand"),
-    Listed("render", _LOOK, "render:Render"),
-    Listed("report", _LOOK, "report:ReportCommand"),
-    Listed("query", _LOOK, "query:Query"),
-    Listed("export", _LOOK, "show:Export"),
-    Listed("docs", _LOOK, "docs:Docs"),
-    Listed("evaluate", _MEASURE, "evaluate:Evaluate"),
-    Listed("events", _MEASURE, "running:Events"),
-    Listed("zones", _MEASURE, "zones:Zones"),
-    Listed("calibrate", _MEASURE, "calibrate:Calibrate"),
-    Listed("tune", _MEASURE, "tune:Tune"),
-    Listed("train", _MEASURE, "train:Train"),
-    Listed("check", _KEEP, "files:Check"),
-    Listed("recover", _KEEP, "files:Recover"),
-    Listed("drop", _KEEP, "files:Drop"),
-    Listed("doctor", _KEEP, "doctor:Doctor"),
+    Listed("demo", _FIRST, "demo:Demo"),
+    Listed("ingest", _FIRST, "ingest:Ingest"),
+    Listed("run", _FIRST, "running:Run"),
+    Listed("view", _FIRST, "view:ViewCommand"),
+    Listed("info", _FIRST, "show:Info"),
+    Listed("report", _FIRST, "report:ReportCommand"),
+    Listed("detect", _STEP, "stages:StageCommand"),
+    Listed("motion", _STEP, "stages:StageCommand"),
+    Listed("track", _STEP, "stages:StageCommand"),
+    Listed("sample", _STEP, "stages:StageCommand"),
+    Listed("predict", _STEP, "stages:StageCommand"),
+    Listed("retrack", _STEP, "stages:StageCommand"),
+    Listed("fuse", _STEP, "running:Fuse"),
+    Listed("models", _STEP, "models:Models"),
+    Listed("render", _RESULTS, "render:Render"),
+    Listed("query", _RESULTS, "query:Query"),
+    Listed("export", _RESULTS, "show:Export"),
+    Listed("evaluate", _RESULTS, "evaluate:Evaluate"),
+    Listed("events", _RESULTS, "running:Events"),
+    Listed("zones", _RESULTS, "zones:Zones"),
+    Listed("tune", _IMPROVE, "tune:Tune"),
+    Listed("train", _IMPROVE, "train:Train"),
+    Listed("calibrate", _IMPROVE, "calibrate:Calibrate"),
+    Listed("check", _IMPROVE, "files:Check"),
+    Listed("recover", _IMPROVE, "files:Recover"),
+    Listed("drop", _IMPROVE, "files:Drop"),
+    Listed("doctor", _IMPROVE, "doctor:Doctor"),
+    Listed("docs", _IMPROVE, "docs:Docs"),
 )
 #: The commands by name.
 ENTRIES: Final = {entry.name: entry for entry in _LISTED}
@@ -97,7 +103,7 @@ _WITH_PLUGINS: Final = ("run", *(entry.name for entry in _LISTED if entry.place 
 def make(entry: Listed, function: Any = None) -> Any:
     """Make a command of Typer of an entry; ``function`` is its function, if it is not the usual one."""
     function = function or entry.command.function_of(entry.name)
-    app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+    app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     app.command(
         entry.name,
         cls=Command,
@@ -216,12 +222,17 @@ class Group(TyperGroup):
         return line
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help."""
-        self._lists = True
-        try:
-            super().format_help(ctx, formatter)
-        finally:
-            self._lists = False
+        """Print the help: all commands with their lines, without making them."""
+        formatter.write_usage(ctx.command_path, "[OPTIONS] COMMAND ...")
+        write_paragraph(formatter, self.help or "")
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for entry in {**ENTRIES, **of_packages()}.values():
+            panels.setdefault(entry.panel, []).append((entry.name, entry.summary))
+        for panel, rows in panels.items():
+            write_section(formatter, panel, rows)
+        own: list[Any] = [option for option in self.get_params(ctx) if option.opts[0] in PROGRAM_OPTIONS]
+        rows = [(f"{option.opts[0]} {option.metavar}", option.help) for option in own]
+        write_section(formatter, "Options", [*rows, ("-h, --help, --version", "Show this page, or the version.")])
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
         """Complete the name of a command."""
@@ -235,13 +246,32 @@ class Group(TyperGroup):
         """Parse the options before the command; refuse an unknown one in one line."""
         if not args:
             return super().parse_args(ctx, args)  # which prints the help
-        functions = _with_plugins(self._own, args)
+        own, rest = _split(args)
+        config = Path(named) if (named := next(values_of(own, "--config"), variable("MCAPTRACK_CONFIG"))) else None
+        said = next(values_of(own, "--log-format"), variable("MCAPTRACK_LOG_FORMAT"))
+        ctx.with_resource(log_format(said, next((word for word in rest if not word.startswith("-")), "")))
+        if len(rest) == 2 and rest[1] in HELP and rest[0] in self._own:
+            formatter = ctx.make_formatter()
+            path, function = f"{ctx.command_path} {rest[0]}", ENTRIES[rest[0]].command.function_of(rest[0])
+            write_page(formatter, path, function, rest[1] == ALL)
+            typer.echo(formatter.getvalue().rstrip("\n"))
+            ctx.exit()
+        functions = _with_plugins(self._own, rest, config)
         self.commands = self._own.changed({name: make(ENTRIES[name], functions[name]) for name in functions})
         with usage_in_one_line():
-            return super().parse_args(ctx, args)
+            for option in PROGRAM_OPTIONS:
+                refuse_several(own, [option])
+            return super().parse_args(ctx, [*own, *rest])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command; refuse an unknown one in one line."""
+        name = args[0]
+        every = self.list_commands(ctx)
+        if name not in every and not name.startswith("-"):
+            if Path(name).exists():
+                refuse_usage(f"{name} is a file; the command comes first, as in {command('info', Path(name))}")
+            text = f"there is no command {name}{nearest(name, every)}"
+            refuse_usage(f"{text}{'' if text.endswith('?') else ';'} `mcaptrack --help` lists the commands")
         with usage_in_one_line():
             return super().resolve_command(ctx, args)
 
@@ -261,10 +291,28 @@ def _made_of_package(entry: Listed) -> Any:
         raise typer.Exit(REFUSED) from None
 
 
-def _with_plugins(commands: Commands, arguments: list[str]) -> dict[str, Any]:
+def _split(args: list[str]) -> tuple[list[str], list[str]]:
+    """The words of the options of the program, which may stand anywhere, and the others."""
+    own: list[str] = []
+    others: list[str] = []
+    words = iter(args)
+    for word in words:
+        if word == "--":
+            others += [word, *words]
+        elif word in PROGRAM_OPTIONS:
+            value = [*islice(words, 1)]
+            if not value:
+                return [word], []  # which is refused: it has no value
+            own += [word, *value]
+        else:
+            (own if word.partition("=")[0] in PROGRAM_OPTIONS else others).append(word)
+    return own, others
+
+
+def _with_plugins(commands: Commands, arguments: list[str], config: Path | None) -> dict[str, Any]:
     """The functions of commands with options of plug-ins in this call. Where there can be none, nothing is loaded."""
-    if not set(arguments) & set(_WITH_PLUGINS) and not may_be_set(arguments):
+    if not (set(arguments) & set(_WITH_PLUGINS) or config or may_be_set()):
         return {}
     from mcaptrack.cli.plugins import commands_with_plugins
 
-    return commands_with_plugins(commands, arguments)
+    return commands_with_plugins(commands, arguments, config)

@@ -11,7 +11,6 @@ from mcaptrack.cli import common
 from mcaptrack.cli.common import expand, only_one_output
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
-from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -31,9 +30,7 @@ class Ingest(EachLog["IngestResult"]):
         from mcaptrack.fleet import NamedLog
 
         sources = expand(self.values["inputs"], each=True)
-        only_one_output(sources, self.values["output"] or self.values["into"])
-        if self.values["into"] is not None and self.many.output_dir is not None:
-            raise McaptrackError("--into and --output-dir are two places for the same results; give one")
+        only_one_output(sources, self.values["into"])
         return [NamedLog(source, default_log(Path(source))) for source in dict.fromkeys(sources)]
 
     def show(self, log: Location, done: IngestResult, talk: common.Talk) -> None:

@@ -81,11 +81,6 @@ class EachLogOfPackage(FromPackage, EachLog[Any]):
     writes = False
     prints_results = True
 
-    def run(self, names: Mapping[str, str]) -> None:
-        """Run the command; what it prints goes to a file, if one is named."""
-        with common.printed_to(self.values["output"], self.values["force"]):
-            super().run(names)
-
     def show(self, log: Location, done: Any, talk: common.Talk) -> None:
         """Print the result of a log for people, below its name if there are several."""
         if not self.values["json"]:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
-import sys
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from time import monotonic
@@ -15,14 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Type
 
 import typer
 
-from mcaptrack import SCHEMA_VERSION, notices
+from mcaptrack import notices
 from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import LAST_PANELS
 from mcaptrack.cli.declared import Called, parameters_of
-from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.text import is_json, print_line_of_json, printable, say, stdout_to_stderr
+from mcaptrack.cli.help import LAST_PANELS
+from mcaptrack.cli.text import is_json, say, stdout_to_stderr
+from mcaptrack.environment import variable, whole_number
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -34,6 +32,7 @@ T = TypeVar("T")
 PANEL: Final = LAST_PANELS[1]
 _TIME: Final = re.compile(r"([0-9]+(?:\.[0-9]+)?)\s*([smh]?)")
 _SECONDS: Final = {"": 1, "s": 1, "m": 60, "h": 3600}
+_MB: Final = 1_000_000
 #: The number of logs from which on the summary repeats why logs failed.
 _REPEATED: Final = 20
 
@@ -48,25 +47,7 @@ class ManyOptions:
             PANEL,
             1,
             1024,
-            help="Number of logs to process at the same time; by default 1, or one for each thread of the cluster.",
-        ),
-    ] = None
-    scheduler: Annotated[
-        str | None,
-        Option(
-            PANEL,
-            metavar="ADDRESS",
-            help="Let the workers of a Dask cluster process the logs, by the address of its scheduler; by default "
-            "processes on this machine.",
-        ),
-    ] = None
-    keep_going: Annotated[bool, Option(PANEL, help="Go on after a log that failed.")] = True
-    output_dir: Annotated[
-        PathLike | None,
-        Option(
-            PANEL,
-            metavar="FOLDER",
-            help="Write the results for each log to this folder, under its name; by default in or beside each log.",
+            help="Number of logs to process at the same time; by default 1, or one for each thread of a cluster.",
         ),
     ] = None
     ledger: Annotated[
@@ -82,36 +63,20 @@ class ManyOptions:
         str | None,
         Option(PANEL, metavar="TIME", help="Give a log up after this time, such as 90s, 10m or 2h; by default none."),
     ] = None
-    memory_limit: Annotated[
-        str | None,
-        Option(
-            PANEL,
-            metavar="SIZE",
-            help="End a worker if its resident memory exceeds this size, such as 2GB; by default none.",
-        ),
-    ] = None
-    tries: Annotated[
-        int, Option(PANEL, 1, 100, help="How often a log is tried that kills its worker or exceeds a limit.")
-    ] = 2
-    json_lines: Annotated[bool, Option(PANEL, help="Print a line of JSON for each log as soon as it has ended.")] = (
-        False
-    )
 
     @property
     def concern_one(self) -> bool:
         """Whether an option is set for which a single log, too, has to be processed by workers."""
-        return any((self.scheduler, self.output_dir, self.ledger, self.timeout, self.memory_limit, self.json_lines))
+        return any((variable("MCAPTRACK_SCHEDULER"), self.ledger, self.timeout))
 
     def for_fleet(self) -> dict[str, Any]:
         """Return the arguments of ``mcaptrack.fleet.run``. Raises McaptrackError for a time that is none."""
         return {
             "jobs": self.jobs,
-            "scheduler": self.scheduler,
-            "keep_going": self.keep_going,
+            "scheduler": variable("MCAPTRACK_SCHEDULER") or None,
             "ledger": self.ledger,
             "timeout_s": _seconds(self.timeout),
-            "memory_limit": self.memory_limit,
-            "tries": self.tries,
+            "memory_limit": _MB * whole_number("MCAPTRACK_MAX_WORKER_MB", 0) or None,
         }
 
 
@@ -130,6 +95,8 @@ class EachLog(Called[T]):
     prints_results: ClassVar = False
     #: Whether all logs have one output, a folder.
     shares_output = False
+    #: Whether the output of a log is a folder itself.
+    makes_folders = False
     #: Whether each input always has an output of its own, by default in the working folder.
     names_output = False
 
@@ -141,8 +108,7 @@ class EachLog(Called[T]):
     @classmethod
     def options(cls) -> list[Parameter]:
         """Return the options that the function has no use for: also those for many logs."""
-        many = [option for option in parameters_of(ManyOptions) if cls.writes or option.name != "output_dir"]
-        return [*super().options(), *many]
+        return [*super().options(), *parameters_of(ManyOptions)]
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs."""
@@ -151,7 +117,7 @@ class EachLog(Called[T]):
         return find_logs(self.values["logs"])
 
     def suffix(self) -> str:
-        """Return the end of the names of outputs in ``--output-dir``."""
+        """Return the end of the names of outputs in a folder."""
         return ".mcap"
 
     def line(self, done: T) -> str:
@@ -171,13 +137,28 @@ class EachLog(Called[T]):
         """Return the exit code."""
         return common.DONE
 
+    def folder(self, output: Path | None) -> Path | None:
+        """Return an output that is a folder, in which the result of each log gets the name of the log; None for a file.
+
+        A name without an ending is one of a folder, but for what is a folder itself.
+        """
+        if output is None or self.shares_output:
+            return None
+        is_folder = output.is_dir() or not (output.suffix or (self.makes_folders and len(self.inputs) == 1))
+        return output if is_folder else None
+
     def run(self, names: Mapping[str, str]) -> None:
-        """Call the function with each log and its ``arguments``, and print what it returns."""
-        with common.Talk(self.values["quiet"], self.values["verbose"]).open() as talk:
-            self.inputs = self.logs()
-            arguments = self.arguments(names)
-            results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
-        self.print_result(results, totals)
+        """Call the function with each log and its ``arguments``, and print what it returns; to a file, if one is named.
+
+        That is for commands that print their results: for others it is what the function writes.
+        """
+        file = self.values["output"] if self.prints_results else None
+        with common.printed_to(file, self.values.get("force", False)):
+            with common.Talk(self.values["quiet"], self.values["verbose"]).open() as talk:
+                self.inputs = self.logs()
+                arguments = self.arguments(names)
+                results, totals = self._process(self.inputs, arguments, arguments.pop("output", None), talk)
+            self.print_result(results, totals)
         if code := self.code(results):
             raise typer.Exit(code)
 
@@ -189,24 +170,20 @@ class EachLog(Called[T]):
         ``output`` is that of a single log. An error in one of several logs is printed and does not stop the others; the
         command ends with exit code 3 then.
         """
-        many, options = self.many, dict(arguments)
+        options = dict(arguments)
         if not logs:
             talk.say("the list of logs is empty; there is nothing to do")
             return [], {}
-        if many.output_dir is not None and output is not None:
-            raise McaptrackError("--output and --output-dir are two places for the same results; give one")
-        if many.json_lines and self.values["json"]:
-            raise McaptrackError("--json prints one object, and --json-lines one for each log; give one")
-        if output is not None:
+        folder = self.folder(output)
+        if output is not None and folder is None:
             options["output"] = output
-        folder = many.output_dir or (Path() if self.names_output and output is None else None)
-        if not self.shares_output:
-            common.only_one_output([log.path for log in logs], output)
-        elif folder is not None:
-            options["output"], folder = folder, None
-        if len(logs) == 1 and not many.concern_one:
+            if not self.shares_output:
+                common.only_one_output([log.path for log in logs], output)
+        if len(logs) == 1 and folder is None and not self.many.concern_one:
             with notices.about(output or logs[0].path):
                 return [self._process_here(logs[0].path, options, talk)], {}
+        if folder is None and output is None and self.names_output:
+            folder = Path()
         done = self._process_in_workers(logs, options, folder, talk)
         _summarise(done, talk)
         return [done.results[log.path] for log in logs if log.path in done.results], {"fleet": done.to_json()}
@@ -227,21 +204,19 @@ class EachLog(Called[T]):
 
         listener: _Printer[T] = _Printer(self, talk, [log.path for log in logs])
         try:
-            is_hidden = talk.quiet or self.prints_results or self.many.json_lines or is_json()
-            with LiveTable.on_terminal(is_hidden) as table:
-                return run_fleet(
-                    self.function,
-                    logs,
-                    options,
-                    name=self.name,
-                    output_dir=folder,
-                    suffix=self.suffix(),
-                    writes=self.writes,
-                    on_outcome=listener.hear,
-                    on_status=lambda status: listener.watch(status, table),
-                    on_note=talk.say,
-                    **self.many.for_fleet(),
-                )
+            return run_fleet(
+                self.function,
+                logs,
+                options,
+                name=self.name,
+                output_dir=folder,
+                suffix=self.suffix(),
+                writes=self.writes,
+                on_outcome=listener.hear,
+                on_status=listener.watch,
+                on_note=talk.say,
+                **self.many.for_fleet(),
+            )
         except (KeyboardInterrupt, SystemExit) as ended:
             if isinstance(ended, KeyboardInterrupt) or ended.code == 128 + signal.SIGTERM:
                 talk.say(
@@ -255,7 +230,6 @@ class _Printer(Generic[T]):
 
     def __init__(self, work: EachLog[T], talk: common.Talk, logs: Sequence[Location]) -> None:
         self._work, self._talk = work, talk
-        self._has_lines = work.many.json_lines
         self._shown = monotonic()
         self.ended = 0
         self._next = deque(logs)
@@ -275,41 +249,27 @@ class _Printer(Generic[T]):
             for line in outcome.detail.splitlines():
                 self._talk.detail(line)
             common.record_failure(outcome.log, outcome.error, **_about(outcome))
-        if self._has_lines:
-            self._print_line(outcome)
         if self._work.prints_results:
-            if not self._has_lines:
-                self._show_in_order(outcome)
+            self._show_in_order(outcome)
         elif outcome.result is not None and self._talk.verbose:
             self._work.show(outcome.log, outcome.result, self._talk)
         elif outcome.result is not None:
             summary = self._work.line(outcome.result)
             self._talk.say(f"{outcome.log}: {summary}", "info", "log", **_about(outcome))
 
-    def watch(self, status: FleetStatus, table: LiveTable) -> None:
-        """Show how far the logs are: in a table, or now and then in a line for programs."""
-        table.show(status)
-        if monotonic() - self._shown < common.PROGRESS_S:
-            return
-        self._shown = monotonic()
+    def watch(self, status: FleetStatus) -> None:
+        """Show how far the logs are: in a bar, or now and then in a line for programs."""
         ended = status.logs - status.left
-        running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
-        text = f"{ended} of {status.logs} logs"
-        self._talk.event(text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running)
-
-    def _print_line(self, outcome: LogOutcome[T]) -> None:
-        """Print the outcome as a line of JSON to stdout."""
-        result = None if outcome.result is None else self._work.data(outcome.result)
-        line = {
-            "schema_version": SCHEMA_VERSION,
-            **_about(outcome),
-            "error": with_flags(outcome.error) or None,
-            "warnings": [
-                {"code": warning.code, "message": with_flags(warning.message)} for warning in outcome.warnings
-            ],
-            "result": result,
-        }
-        print_line_of_json(line, sys.stdout)
+        if not is_json():
+            if not self._work.prints_results:
+                self._talk.progress("logs", ended, status.logs)
+        elif monotonic() - self._shown >= common.PROGRESS_S:
+            self._shown = monotonic()
+            running = [{**asdict(log), "log": str(log.log), "seconds": round(log.seconds, 1)} for log in status.running]
+            text = f"{ended} of {status.logs} logs"
+            self._talk.event(
+                text, "progress", done=ended, total=status.logs, states=dict(status.ended), running=running
+            )
 
     def _show_in_order(self, outcome: LogOutcome[T]) -> None:
         self._waiting[outcome.log] = outcome.result
@@ -337,7 +297,8 @@ def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
     common.tried(len(done.outcomes))
     counts = [f"{count} {state}" for state, count in done.counts.items()]
     rate = len(done.outcomes) / max(done.seconds, 1e-3)
-    line = f"{len(done.outcomes)} logs in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
+    count = len(done.outcomes)
+    line = f"{count} log{'' if count == 1 else 's'} in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
     if done.peak_bytes:
         ran = [outcome for outcome in done.outcomes if outcome.tries]
         used = done.cpu_seconds / max(1, len(ran))
@@ -359,52 +320,3 @@ def _seconds(text: str | None) -> float | None:
     if match is None or not float(match[1]):
         raise McaptrackError(f"--timeout needs a time such as 90s, 10m or 2h, not {text!r:.40}")
     return float(match[1]) * _SECONDS[match[2]]
-
-
-# A table of the logs that workers are busy with, on a terminal.
-
-
-class LiveTable:
-    """The table; without a terminal it shows nothing."""
-
-    def __init__(self, live: Any = None) -> None:
-        self._live = live
-
-    @classmethod
-    @contextmanager
-    def on_terminal(cls, hidden: bool) -> Iterator[LiveTable]:
-        """Show a table within this block, if stderr is a terminal; lines that are printed appear above it."""
-        if hidden or not sys.stderr.isatty():
-            yield cls()
-            return
-        from rich.console import Console
-        from rich.live import Live
-
-        console = Console(stderr=True, markup=False, emoji=False, highlight=False)
-        with Live(console=console, auto_refresh=False, transient=True, redirect_stdout=False) as live:
-            yield cls(live)
-
-    def show(self, status: FleetStatus) -> None:
-        """Show how far the logs are."""
-        if self._live is not None:
-            self._live.update(table_of(status), refresh=True)
-
-
-def table_of(status: FleetStatus) -> Any:
-    """Return the table: a line for each log that runs, below the number of those that ended."""
-    from rich.table import Table
-    from rich.text import Text
-
-    counts = ", ".join(f"{count} {state}" for state, count in sorted(status.ended.items()))
-    title = f"{status.logs - status.left} of {status.logs} logs in {status.seconds:.0f} s" + (
-        f": {counts}" if counts else ""
-    )
-    table = Table(box=None, pad_edge=False, title=Text(title), title_justify="left", title_style="bold")
-    table.add_column("log", overflow="ellipsis", no_wrap=True, ratio=1)
-    for name in ("stage", "done", "seconds", "MB"):
-        table.add_column(name, justify="left" if name == "stage" else "right", no_wrap=True)
-    for log in sorted(status.running, key=lambda running: -running.seconds):
-        done = f"{log.done / log.total:.0%}" if log.total else ""
-        cells = (printable(log.stage), done, f"{log.seconds:.0f}", f"{log.resident_bytes / 1e6:,.0f}")
-        table.add_row(Text(printable(str(log.log))), *cells)
-    return table

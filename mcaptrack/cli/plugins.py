@@ -10,15 +10,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import typer
 
 from mcaptrack.cli import common
-from mcaptrack.cli.command import ALL
+from mcaptrack.cli.command import values_of
 from mcaptrack.cli.config import ConfigFile, read_files
+from mcaptrack.cli.help import HELP
 from mcaptrack.cli.stages import StageCommand
 from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.environment import PREFIX
@@ -27,10 +27,8 @@ from mcaptrack.notices import listening
 from mcaptrack.registry import BUILT_IN, names
 from mcaptrack.transforms import STAGES, Stage, Transform
 
-_HELP: Final = ("--help", "-h", ALL)
 
-
-def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str]) -> dict[str, Any]:
+def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str], config: Path | None) -> dict[str, Any]:
     """Return the commands of stages that have options of plug-ins which this call chooses for them.
 
     A plug-in on the command line that can't be loaded ends the command with exit code 1.
@@ -38,7 +36,7 @@ def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str])
     called = next((word for word in arguments if not word.startswith("-")), "")
     if called not in commands:
         return {}
-    files = [] if set(arguments) & set(_HELP) else _files(called, arguments)
+    files = [] if set(arguments) & set(HELP) else read_files(config)
     functions: dict[str, Any] = {}
     for stage in STAGES.values():
         if not stage.option:
@@ -56,19 +54,8 @@ def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str])
     return functions
 
 
-def _files(called: str, arguments: Sequence[str]) -> list[ConfigFile]:
-    paths = [*_values(arguments, "config"), os.environ.get(f"{PREFIX}{called.upper()}_CONFIG", "")]
-    return read_files(Path(paths[0]) if paths[0] else None)
-
-
-def _values(arguments: Sequence[str], option: str) -> list[str]:
-    """Return the values of an option among the words of a command line."""
-    after = [value for word, value in pairwise(arguments) if word == f"--{option}"]
-    return after + [word.partition("=")[2] for word in arguments if word.startswith(f"--{option}=")]
-
-
 def _of_words(stage: Stage, arguments: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
-    for name in filter(None, _values(arguments, stage.option)):  # the parser refuses an empty one
+    for name in filter(None, values_of(arguments, f"--{stage.option}")):  # the parser refuses an empty one
         if stage.split(name)[0] in BUILT_IN[stage.option]:
             continue
         with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error

@@ -18,7 +18,7 @@ from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, print_table, printable, show
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url
+from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url, unreadable
 from mcaptrack.location import is_remote, parse
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def _read(file: Path | None) -> str:
     try:
         return file.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise McaptrackError(f"{file} can't be read: {error.strerror or error}") from None
+        raise unreadable(file, error) from None
     except UnicodeDecodeError:
         raise McaptrackError(f"{file} is not text in UTF-8") from None
 

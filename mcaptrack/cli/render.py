@@ -18,9 +18,9 @@ class Render(EachLog["RenderResult"]):
     """Draw the annotated video."""
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
-        """Return the arguments; in ``--output-dir`` the name of the output says what is written."""
+        """Return the arguments; in a folder the name of the output says what is written."""
         arguments = super().arguments(names)
-        return arguments | {"gif": arguments["gif"] and self.many.output_dir is None}
+        return arguments | {"gif": arguments["gif"] and self.folder(arguments["output"]) is None}
 
     def suffix(self) -> str:
         """Return the end of the names of outputs."""

@@ -108,12 +108,10 @@ class Run(RunsStages):
         order, place = "one log is done after the other", "ids go on in the logs themselves"
         refused: dict[str, tuple[object, str]] = {
             "--jobs": ((many.jobs or 1) > 1, order),
-            "--scheduler": (many.scheduler, order),
             "--ledger": (
                 many.ledger,
                 "it judges each log by itself, and a second run does only what is missing",
             ),
-            "--output-dir": (many.output_dir, place),
             "--output": (self.values["output"], place),
         }
         for name, (is_given, why) in refused.items():

@@ -11,7 +11,7 @@ import re
 import reprlib
 import shlex
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,10 +24,8 @@ from mcaptrack.environment import PREFIX, VARIABLES
 from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.ranges import limits
 
-#: Options that only the command line can set.
-CALL_ONLY: Final = ("config", "help")
-_YES: Final = ("1", "true", "yes", "on")
-_NO: Final = ("0", "false", "no", "off")
+#: Words for a switch.
+SWITCH: Final = dict.fromkeys(("1", "true", "yes", "on"), True) | dict.fromkeys(("0", "false", "no", "off"), False)
 _LARGEST: Final = 2**63
 
 
@@ -61,10 +59,9 @@ class Setting:
             return shlex.split(text)
         if self.kind is not bool:
             return text
-        word = text.strip().lower()
-        if word not in _YES + _NO:
+        if text.strip().lower() not in SWITCH:
             raise ValueError(f"needs true or false, not {reprlib.repr(text)}")
-        return word in _YES
+        return SWITCH[text.strip().lower()]
 
     def from_toml(self, value: Any) -> Any:
         """Check a value from a file. Raises ValueError for a value of the wrong type."""
@@ -124,12 +121,9 @@ def declared_settings(command: str, parameters: Iterable[Parameter]) -> dict[str
     return {name: Setting(command, name, each.name, each.kind, each.many, each.option) for name, each in names}
 
 
-def may_be_set(arguments: Sequence[str]) -> bool:
-    """Whether the environment or a file may set options in a call with these words; quick, and never wrongly False."""
-    is_named = any(word.startswith("--config") for word in arguments)
-    return (
-        is_named or any(name.startswith(PREFIX) for name in os.environ) or Path(NAME).exists() or user_file().exists()
-    )
+def may_be_set() -> bool:
+    """Whether the environment or a usual file may set options; quick, and never wrongly False."""
+    return any(name.startswith(PREFIX) for name in os.environ) or Path(NAME).exists() or user_file().exists()
 
 
 def gather(commands: Commands, config: Path | None) -> dict[str, dict[str, Given]]:
@@ -159,7 +153,7 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
         if setting is None:
             variables = [each.variable for command in commands for each in commands[command].settings.values()]
             refuse_usage(f"the environment variable {name} names no option{nearest(name, [*variables, *VARIABLES])}")
-        if not text or setting.name in CALL_ONLY:
+        if not text:
             continue
         try:
             value = setting.from_text(text)
@@ -176,7 +170,7 @@ def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Sett
             refuse_usage(f"{file.path}: there is no command {command}{nearest(command, commands)}")
         if not isinstance(values, dict):
             refuse_usage(f"{file.path}: {command} is a command; write its options below [{command}]")
-        own = {name: setting for name, setting in commands[command].settings.items() if name not in CALL_ONLY}
+        own = commands[command].settings
         for key, value in values.items():
             name = key.replace("_", "-")
             if name not in own:

@@ -30,11 +30,6 @@ class Info(EachLog["LogInfo"]):
     prints_results = True
     More = Printed
 
-    def run(self, names: Mapping[str, str]) -> None:
-        """Run the command; what it prints goes to a file, if one is named."""
-        with common.printed_to(self.values["output"], self.values["force"]):
-            super().run(names)
-
     def show(self, log: Location, done: LogInfo, talk: common.Talk) -> None:
         """Print the channels."""
         if not self.values["json"]:
@@ -61,13 +56,16 @@ class Export(EachLog["ExportResult"]):
 
         logs = super().logs()
         if self.shares_output:
-            refuse_same_tables([log.path for log in logs], self._folder)
+            refuse_same_tables([log.path for log in logs], self.values["output"])
         return logs
 
     @property
-    def _folder(self) -> Path | None:
-        folder: Path | None = self.values["output"] or self.values["output_dir"]
-        return folder
+    def makes_folders(self) -> bool:  # type: ignore[override]
+        """Whether a log becomes a folder: a bag, or what a package makes."""
+        from mcaptrack.api.exporting import exporter_of_package
+
+        of_package = exporter_of_package(self.values["form"])
+        return self.values["form"].startswith("rosbag2") or (of_package is not None and of_package.is_folder)
 
     def suffix(self) -> str:
         """Return the end of the names of bags and files."""
@@ -98,8 +96,9 @@ class Export(EachLog["ExportResult"]):
         """Print the results; bring the catalogue of several logs in one folder up to date."""
         from mcaptrack.tables.catalogue import refresh
 
-        if self._folder is not None and self.values["form"] == "parquet" and len(self.values["logs"]) > 1:
-            refresh(self._folder)
+        folder: Path | None = self.values["output"]
+        if folder is not None and self.values["form"] == "parquet" and len(self.values["logs"]) > 1:
+            refresh(folder)
         super().print_result(results, totals)
 
 

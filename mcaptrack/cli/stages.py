@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
 from mcaptrack.api.options import PLUGIN
-from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, listed, options_of, values_set
-from mcaptrack.cli.command import is_on_command_line
+from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, options_of, settable_of
+from mcaptrack.cli.command import Set, is_on_command_line, listed, values_set
 from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
 from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
@@ -27,16 +27,6 @@ from mcaptrack.transforms.protocol import choices, member_type
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
-
-Set = Annotated[
-    Sequence[str] | None,
-    Option(
-        tuning=r"[A-Za-z0-9_-]+=[A-Za-z0-9_.,+ -]*",
-        metavar="NAME=VALUE",
-        shown=False,
-        help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
-    ),
-]
 
 
 class StageCommand(RunsStages):
@@ -70,7 +60,7 @@ class StageCommand(RunsStages):
         """Return the arguments of the function, and make the transform, unless the boxes of a log decide which."""
         stage, owners = STAGES[self.name], _owners(self.kinds)
         wanted = {option: self.values[option] for option in owners if self.values.get(option) is not None}
-        for option, value in values_set(self.name, self.values.get("set"), self.kinds).items():
+        for option, value in values_set(self.name, self.values.get("set"), settable_of(self.kinds)).items():
             if option in wanted and is_on_command_line(option):
                 raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
             wanted[option] = value

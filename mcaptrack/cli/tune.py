@@ -63,10 +63,8 @@ class Tune(Once["TuneResult"]):
         given, output, metric = self.values, self.values["output"], done.metric
         if given["truth"]:
             warn_unused("files of detections are of no camera", "camera", "topic")
-            if given["ground_plane"] is None:
-                warn_unused("there is no ground plane", "point")
         else:
-            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "point", "fps")
+            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "fps")
         if not self._has_tracker:
             warn_unused(f"{given['stage']} has no trackers", "tracker")
         by_overlap = done.similarity == "iou"

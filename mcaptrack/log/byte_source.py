@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple, Protocol, overload
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import unreadable
 from mcaptrack.location import Location, Url
 from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.recording_files import refuse_non_mcap
@@ -103,7 +104,7 @@ class OpenFile:
             if not kind:
                 file = cls(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
         except OSError as error:
-            raise McaptrackError(f"{path} can't be opened: {error.strerror}") from None
+            raise unreadable(path, error) from None
         kind = kind or file_type(os.fstat(file.handle).st_mode)  # the path may have been replaced since
         if kind:
             hint = "; give the logs in it, as in 'FOLDER/*.mcap'" if path.is_dir() else ""

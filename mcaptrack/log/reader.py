@@ -21,7 +21,7 @@ from mcap.well_known import SchemaEncoding
 from numpy.typing import NDArray
 
 from mcaptrack import notices
-from mcaptrack.errors import DamagedError, McaptrackError, call, list_names
+from mcaptrack.errors import DamagedError, McaptrackError, call, list_names, offer
 from mcaptrack.files import place_of
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.location import Location, Url, is_remote
@@ -414,7 +414,7 @@ class Log:
         if topic not in self.channels:
             topics = [name for name in sorted(self.channels) if "/view/" not in name]
             more = call("info", self.path)
-            raise McaptrackError(f"{self.path} has no channel {topic}; it has {list_names(topics)}. {more} shows more")
+            raise McaptrackError(f"{self.path} has no channel {topic}; {offer(topic, topics)}. {more} shows more")
         return self.channels[topic]
 
     def _channel(self, record: ChannelRecord) -> Channel:

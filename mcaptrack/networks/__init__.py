@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import unreadable
 from mcaptrack.networks.child import NetworkProcess
 from mcaptrack.networks.session import Device, Facts, Resize, Session, SessionError, Value, is_installed, providers
 from mcaptrack.notices import warn
@@ -105,7 +106,7 @@ def digest_of(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
 
 
 def read_file(path: Path, limits: NetworkLimits) -> NetworkFile:
@@ -118,7 +119,7 @@ def read_file(path: Path, limits: NetworkLimits) -> NetworkFile:
             )
         data = path.read_bytes()
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     return NetworkFile(path, data, hashlib.sha256(data).hexdigest())
 
 

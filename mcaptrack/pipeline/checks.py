@@ -10,7 +10,7 @@ from dataclasses import is_dataclass
 from typing import Final, NamedTuple
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, call, list_names
+from mcaptrack.errors import McaptrackError, call, list_names, offer
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
 from mcaptrack.schema.classes import class_names
@@ -65,7 +65,7 @@ def cameras_named(opened: log.Log, names: Sequence[str], among: Sequence[Camera]
     by_name = {name.strip("/"): camera for camera in among for name in camera.names}
     for name in names:
         if name.strip("/") not in by_name:
-            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(by_name)) or 'none'}")
+            raise McaptrackError(f"{opened.path} has no camera {name}; {offer(name, sorted(by_name))}")
     return list(dict.fromkeys(by_name[name.strip("/")] for name in names))
 
 
@@ -145,11 +145,11 @@ def read_named_frames(
 def _lacks(opened: log.Log, prefix: str, job: Job) -> str:
     """Return the message for a missing input: what is missing, what the log has, and what to do."""
     topics = [topic for topic in sorted(opened.channels) if "/view/" not in topic]
-    has, hint = f"it has {list_names(topics)}", f"{call('info', opened.path)} shows more"
+    has, hint = offer(job.source, topics), f"{call('info', opened.path)} shows more"
     if job.transform.reads is VIDEO and job.source == f"{prefix}/{STAGES[job.stage].input_topic}":
         pictures = [topic for topic in topics if foreign.holds_pictures(opened.channels[topic])]
         if pictures:
-            has, hint = f"it has pictures in {list_names(pictures)}", "choose one with `topic=`"
+            has, hint = offer(job.source, pictures, "it has pictures in"), "choose one with `topic=`"
         else:
             add = call("ingest", "VIDEO", into=opened.path)
             hint = f"add pictures with {add}, or name what to begin with by `topic=`"

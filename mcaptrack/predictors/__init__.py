@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import missing
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.notices import warn
 from mcaptrack.predictors.checked import CheckedPredictor
@@ -208,7 +209,7 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
         text = ", ".join(f"{kind}:FILE" for kind in those)
         raise McaptrackError(f"predictor is one of {', '.join(NAMES)}, or {text}, not {name}")
     if not Path(file).is_file():
-        raise McaptrackError(f"predictor {name}: there is no file {file}")
+        raise McaptrackError(f"predictor {name}: {missing(Path(file))}")
     return entry, Path(file)
 
 

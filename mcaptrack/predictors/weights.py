@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats
 
 #: The folder of the weights that come with mcaptrack.
@@ -92,7 +93,7 @@ def load(path: Path) -> Weights:
     try:
         stat = path.stat()
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     return _load(path, stat.st_mtime_ns, stat.st_size)
 
 
@@ -108,7 +109,7 @@ def _load(path: Path, _changed: int, _size: int) -> Weights:
     except (SafetensorError, TypeError, ValueError) as error:
         raise McaptrackError(f"{path} is not a file of weights (safetensors): {error}") from None
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+        raise unreadable(path, error) from None
 
 
 def save(path: Path, tensors: Mapping[str, NDArray[np.floating]], card: Mapping[str, str]) -> None:

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SCHEMAS, TRACKS, Frame, Rows
 from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
@@ -85,7 +85,7 @@ def find_camera(opened: log.Log, name: str | None = None, topic: str | None = No
     if name:
         names = [prefix.strip("/") for camera in cameras(opened) for prefix in camera.names]
         if names and name.strip("/") not in names:
-            raise McaptrackError(f"{opened.path} has no camera {name}; it has {', '.join(sorted(names))}")
+            raise McaptrackError(f"{opened.path} has no camera {name}; {offer(name, sorted(names))}")
         return camera_at(opened, "/" + name.strip("/")).prefix
     # Cameras that are only boxes in space are left out, unless all are.
     others = [camera for camera in cameras(opened) if not camera.in_space or has_own_channels(opened, camera)]

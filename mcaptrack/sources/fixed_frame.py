@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.errors import McaptrackError, list_names, offer
 from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -696,9 +696,9 @@ def _fixed_frame(opened: log.Log, topic: str, boxes: Recorded3d, wanted: str) ->
     frames = set(tree.frames() if tree else ()) | set(boxes.names)
     if wanted:
         if boxes.names and wanted not in frames:
-            listed = list_names(sorted(frames), _LISTED)
             raise McaptrackError(
-                f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; there are {listed}"
+                f"{opened.path}: there is no frame {wanted} for the boxes of {topic}; "
+                f"{offer(wanted, sorted(frames), 'there are')}"
             )
         if tree and (
             moving := [series for series in tree.between(tree.root_of(wanted), wanted) or () if not series.is_static]

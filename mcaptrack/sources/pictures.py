@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.errors import DamagedError, McaptrackError
+from mcaptrack.errors import DamagedError, McaptrackError, offer
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log.journal import recover_command
 from mcaptrack.notices import warn
@@ -71,8 +71,8 @@ def find_pictures(opened: log.Log, topic: str) -> str:
     if name not in topics and topic == VIDEO:  # the name of ingested pictures stands for those of the only camera
         name = only_pictures(opened)
     if name not in topics:
-        has = f"pictures in {', '.join(sorted(topics))}" if topics else "no pictures"
-        raise McaptrackError(f"{opened.path} has no channel {topic} with pictures; it has {has}")
+        has = offer(topic, sorted(topics), "it has pictures in") if topics else "it has no pictures"
+        raise McaptrackError(f"{opened.path} has no channel {topic} with pictures; {has}")
     return name
 
 

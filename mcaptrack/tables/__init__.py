@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish
+from mcaptrack.files import publish, unreadable
 from mcaptrack.geometry.clocks import FIRST_DATE_NS, NS_PER_S
 from mcaptrack.schema import Frame
 from mcaptrack.schema.framing import split_rows
@@ -58,7 +58,7 @@ def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
         with path.open("rb") as stream:  # a single file: the names of its folders are no columns
             table = pq.read_table(stream)
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+        raise unreadable(path, error) from None
     except pa.ArrowException as error:
         raise McaptrackError(f"{path} is no Parquet file that can be read: {str(error).splitlines()[0]}") from None
     missing = [name for name in names if name not in table.column_names]

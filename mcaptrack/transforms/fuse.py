@@ -18,7 +18,7 @@ from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at, runs_of_plan
 from mcaptrack.geometry.ragged import group_index, ragged_range, table_of
 from mcaptrack.schema import BOX_PX, COVARIANCE_M2, DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.transforms.protocol import Suited, context, option, parameters
+from mcaptrack.transforms.protocol import Suited, context, option, parameters, setting
 
 # One camera of a scene: where its boxes stand, and which places it sees. Letters: N boxes, G places.
 
@@ -558,11 +558,11 @@ class FootFuser:
     ([1.03, 9.0], [2, 1], [0, 1, 0])
     """
 
-    max_sigma: float = option(3.0, least=0.0, most=100.0)
-    max_distance_m: float = option(1.2, least=0.0)
+    max_sigma: float = setting(3.0, least=0.0, most=100.0)
+    max_distance_m: float = setting(1.2, least=0.0)
     min_score: float = option(0.5, least=0.0, most=1.0)
-    noise: float = option(0.04, least=0.001, most=1.0)
-    noise_m: float = option(0.1, least=0.001, most=100.0)
+    noise: float = setting(0.04, least=0.001, most=1.0)
+    noise_m: float = setting(0.1, least=0.001, most=100.0)
     views: Views = context(tuple)
 
     reads: ClassVar[Schema] = SIGHTINGS

@@ -16,7 +16,7 @@ from mcaptrack.registry import Entry
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.transforms.forecasts import ADAPT_HELP, Forecaster, PastPositions
 from mcaptrack.transforms.motion_limits import LIMITS_HELP, LIMITS_PATTERN, ClassNames, read_limits
-from mcaptrack.transforms.protocol import check_options, context, is_option_type, option, parameters
+from mcaptrack.transforms.protocol import check_options, context, is_option_type, option, parameters, setting
 
 # The own parameters of predictors of other packages: those beside the number and the length of steps.
 
@@ -95,8 +95,8 @@ class Predict:
 
     predictor: PredictorName = option("blend", kind="predictor")
     horizon_s: float = option(4.8, least=0.1, most=60.0)
-    min_history: int = option(4, least=1, most=100)
-    adapt: bool = option(True, ADAPT_HELP)
+    min_history: int = setting(4, least=1, most=100)
+    adapt: bool = setting(True, ADAPT_HELP)
     class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN)
     rate_hz: float = context(lambda: 2.5)
     class_names: ClassNames = context(tuple, is_recorded=False)

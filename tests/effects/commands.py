@@ -23,9 +23,7 @@ def cases(base: str, **words: str | tuple[str, str]) -> dict[str, Case]:
 
 def common(base: str, **others: str | tuple[str, str]) -> dict[str, Case]:
     """The options that all commands have."""
-    return cases(base, json="--json", quiet=(f"{base} -v", "-q"), verbose="-v", config="--config verbose.toml") | cases(
-        base, **others
-    )
+    return cases(base, json="--json", quiet=(f"{base} -v", "-q"), verbose="-v") | cases(base, **others)
 
 
 def of_boxes(command: str) -> dict[str, Case]:
@@ -58,18 +56,18 @@ TUNED = "tune tall.txt --truth truth.txt --trials 1 --fps 10"
 CASES: dict[str, dict[str, Case]] = {
     "ingest": common(
         "ingest clip.mp4",
+        keyframe_interval_s="--keyframe-interval-s 0.5",
+        calibration_unit=("ingest clip.mp4 --calibration pose.yml", "--calibration-unit cm"),
         output="-o b.mcap",
         camera="--camera left",
         fps="--fps 5",
         start_time="--start-time 2026-05-01T12:00:00Z",
         image_format="--image-format jpeg",
         quality="--quality 40",
-        keyframe_interval_s="--keyframe-interval-s 0.5",
         stream="--stream 0",
         ground_plane="--ground-plane plane.txt",
         calibration="--calibration pose.yml",
         calibration_name=("ingest clip.mp4 --camera cam0 --calibration camchain.yaml", "--calibration-name cam1"),
-        calibration_unit=("ingest clip.mp4 --calibration pose.yml", "--calibration-unit cm"),
         point=("ingest clip.mp4 --ground-plane plane.txt", "--point center"),
         detections="--detections truth.txt",
         tracks="--tracks truth.txt",
@@ -94,7 +92,7 @@ CASES: dict[str, dict[str, Case]] = {
     "motion": stage("motion"),
     "track": stage("track", tracker="--tracker ocsort", set="--set class_id=9"),
     "sample": stage("sample"),
-    "predict": stage("predict"),
+    "predict": stage("predict", set="--set min_history=6"),
     "retrack": stage(
         "retrack",
         retracker="--retracker none",
@@ -104,6 +102,8 @@ CASES: dict[str, dict[str, Case]] = {
     ),
     "run": common(
         "run fresh.mcap --no-tables",
+        fit_plane="--no-fit-plane",
+        person_height_m="--person-height-m 1.5",
         frame="--frame map",
         topic="--topic /none",
         camera="--camera other",
@@ -124,20 +124,15 @@ CASES: dict[str, dict[str, Case]] = {
         camera_motion=("run a.mcap --no-tables", "--camera-motion on"),
         across_classes=("run a.mcap --no-tables", "--across-classes"),
         class_limits=("run a.mcap --no-tables", "--class-limits car=40"),
-        fit_plane="--no-fit-plane",
-        person_height_m="--person-height-m 1.5",
         ground_frame="--ground-frame base_link",
         **{"continue": "--continue"},
     ),
     "fuse": common(
         "fuse two.mcap",
+        set="--set max_sigma=0",
         cameras="--cameras left",
         clock_offset_s="--clock-offset-s left=2",
-        max_sigma="--max-sigma 0",
-        max_distance_m="--max-distance-m 0",
         min_score="--min-score 0.99",
-        noise="--noise 0.2",
-        noise_m="--noise-m 1",
         to="--to plaza",
         fuser="--fuser grid",
         output="-o b.mcap",
@@ -179,13 +174,12 @@ CASES: dict[str, dict[str, Case]] = {
     ),
     "evaluate": common(
         "evaluate a.mcap",
+        set=("evaluate a.mcap --json", "--set rules=motmetrics"),
         truth=("evaluate truth.txt", "--truth truth.txt"),
         similarity="--similarity iou",
         gate_m="--gate-m 0.01",
         min_iou=("evaluate a.mcap --all", "--min-iou 0.99"),
-        rules=("evaluate a.mcap --json", "--rules motmetrics"),
         curves="--curves curves.svg",
-        smoothed="--smoothed",
         topic="--topic /camera/samples",
         classes=("evaluate kinds.csv --truth kinds.csv", "--classes all"),
         format=(SCORED, "--format kitti"),
@@ -218,15 +212,9 @@ CASES: dict[str, dict[str, Case]] = {
         gate_m=("tune a.mcap --trials 1 --similarity metres", "--gate-m 0.01"),
         min_iou=("tune a.mcap --trials 1", "--min-iou 0.99"),
         format=(TUNED, "--format kitti"),
-        columns=("tune table.csv --truth kinds.csv --trials 1 --fps 10", "--columns x=y,y=x"),
         classes=("tune kinds.csv --truth kinds.csv --trials 1 --fps 10", "--classes all"),
-        class_map=("tune kinds.csv --truth kinds.csv --trials 1 --fps 10", "--class-map cart=person"),
-        first_frame=(TUNED, "--first-frame detections=0"),
-        frames=(TUNED, "--frames 2:4"),
-        size=("tune yolo --truth shares --trials 1 --fps 10", "--size 640x480"),
         fps=("tune truth.txt --truth truth.txt --trials 1", "--fps 1"),
         ground_plane=(f"{TUNED} --similarity metres", "--ground-plane plane.txt"),
-        point=(f"{TUNED} --similarity metres --ground-plane plane.txt --gate-m 0.1", "--point center"),
         topic="--topic /none",
         camera="--camera other",
         output="-o b.toml",

@@ -17,7 +17,7 @@ import numpy as np
 
 from mcaptrack import foxglove, log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, refuse_special
+from mcaptrack.files import is_same_file, missing, refuse_special
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
@@ -218,7 +218,7 @@ def ingest(
     if not re.fullmatch(r"[A-Za-z0-9_\-/]+", options.camera) or options.camera.strip("/") == "":
         raise McaptrackError(f"a camera's name is made of letters, digits, _, - and /, not {options.camera!r}")
     if not source.exists():
-        raise McaptrackError(f"{source} does not exist")
+        raise McaptrackError(missing(source))
     refuse_special(source)
     if into is None and is_same_file(output, source):
         raise McaptrackError(f"{source} is both input and output; give another name with `output=`")

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack import __version__, evaluation, log, tables
-from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.evaluation.aligned import GATE_3D_M, GATE_M
 from mcaptrack.files import place_of
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
@@ -357,8 +357,8 @@ class LogTables:
         if column := part.unknown(fields):
             messages = self.typed_messages(topic, WHOLE)
             everything = list(messages.types) if messages else self._inferred(topic, WHOLE).fields
-            names = list_names([".".join(path) for path in everything], _FIELDS_LISTED)
-            raise McaptrackError(f"{self.opened.path}: {topic} has no field {column}; it has {names}")
+            names = [".".join(path) for path in everything]
+            raise McaptrackError(f"{self.opened.path}: {topic} has no field {column}; {offer(column, names)}")
 
     def _source(self, topic: str, part: MessagesPart) -> tables.MessageSource:
         """The messages of a channel of other software that a table holds. Raises McaptrackError for bad times."""

@@ -107,7 +107,7 @@ class RetrackOptions:
     predictor: PredictorName = option("blend", kind="predictor", theme=_PREDICTIONS)
     horizon_s: float = option(4.8, least=0.1, most=60.0, theme=_PREDICTIONS)
     min_history: int = setting(2, least=1, most=100, theme=_PREDICTIONS)
-    noise_m: float | None = option(None, least=0.0, theme=_MOTION)
+    noise_m: float | None = setting(None, least=0.0, theme=_MOTION)
     speed_m_per_s: float = setting(1.75, least=0.0, theme=_MOTION)
     drift_m_per_s: float = setting(0.12, least=0.0, theme=_MOTION)
     drift_ratio: float = setting(0.08, least=0.0, theme=_MOTION)

@@ -353,7 +353,7 @@ class Sort:
     max_age_s: float = option(1.4, least=0.0, search=(0.2, 4.0), theme=_LIFE)
     max_age_frames: int | None = setting(None, least=0, theme=_LIFE)
     min_hits_s: float = option(0.3, least=0.0, search=(0.0, 1.0), theme=_LIFE)
-    min_hits_frames: int | None = option(None, least=0, theme=_LIFE)
+    min_hits_frames: int | None = setting(None, least=0, theme=_LIFE)
     cost: Cost = setting("iou", theme=_ASSOCIATION)
     min_iou: float = option(0.2, least=0.0, most=1.0, search=(0.05, 0.6), theme=_ASSOCIATION)
     max_distance_px: float = setting(60.0, least=0.0, theme=_ASSOCIATION)

@@ -11,7 +11,7 @@ from typing import IO, Any, Final
 
 from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import refuse_special, unreadable
 from mcaptrack.log.recording_files import ZSTD
 
 ENVIRONMENT: Final = "MCAPTRACK_MAX_UNPACKED_MIB"
@@ -73,7 +73,7 @@ def opened(path: Path) -> IO[bytes]:
             data = stream.read()
             return BytesIO(_unpacked(data, magic == ZSTD, limit_of(len(data))))
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     except NotUnpackedError as error:
         raise McaptrackError(f"{path} can't be decompressed: {error}") from None
 
@@ -144,7 +144,7 @@ def copy(path: Path, out: Path) -> None:
     except NotUnpackedError:
         raise McaptrackError(f"{path} grows while it is being read; is it still being recorded?") from None
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+        raise unreadable(path, error) from None
 
 
 def _write(stream: Any, out: Path, expected: int, most: int) -> None:

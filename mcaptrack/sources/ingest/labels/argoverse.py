@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
@@ -120,7 +121,7 @@ def _table(path: Path, columns: tuple[str, ...]) -> dict[str, Any]:
         with path.open("rb") as stream:
             table = feather.read_table(stream)
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror or str(error).splitlines()[0]}") from None
+        raise unreadable(path, error) from None
     except (pa.ArrowException, ValueError) as error:
         raise McaptrackError(f"{path} is no table in Feather format: {str(error).splitlines()[0][:80]}") from None
     missing = [name for name in columns if name not in table.column_names]

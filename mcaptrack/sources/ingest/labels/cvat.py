@@ -23,6 +23,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
@@ -87,7 +88,7 @@ def opened_xml(path: Path) -> Iterator[IO[bytes]]:
     except (zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
         raise McaptrackError(f"{path} is a zip file with an {_MEMBER} that can't be read: {error}") from None
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror or error}") from None
+        raise unreadable(path, error) from None
 
 
 def _member(path: Path, names: list[str]) -> str:

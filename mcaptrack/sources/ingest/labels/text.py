@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID
@@ -60,7 +61,7 @@ def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lin
     except UnicodeError:
         raise McaptrackError(f"{path} is not text in UTF-8 or UTF-16, as labels and homographies are") from None
     except OSError as error:
-        raise McaptrackError(f"{path} can't be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
 
 
 def is_count(text: str, digits: int) -> bool:

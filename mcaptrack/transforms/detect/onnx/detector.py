@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.files import missing
 from mcaptrack.geometry.arrays import Image, taken
 from mcaptrack.geometry.boxes import parse_size
 from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
@@ -181,10 +182,10 @@ class OnnxDetector:
     """
 
     file: str = option("", theme=NETWORK)
-    layout: LayoutChoice = option("auto", theme=NETWORK)
+    layout: LayoutChoice = setting("auto", theme=NETWORK)
     input_size: str = option("", theme=NETWORK)
     device: Device = option("auto", theme=NETWORK)
-    max_memory_mb: int = option(1000, least=10, most=1_000_000, theme=NETWORK)
+    max_memory_mb: int = setting(1000, least=10, most=1_000_000, theme=NETWORK)
     tiles: str = option("1x1", theme=_BOXES)
     overlap: float = setting(0.2, least=0.0, most=0.5, theme=_BOXES)
     classes: str = option("person", theme=_BOXES)
@@ -227,7 +228,7 @@ class OnnxDetector:
         if not self.file:
             raise McaptrackError("detector onnx needs a file, as in onnx:FILE")
         if not Path(self.file).is_file():
-            raise McaptrackError(f"detector onnx: there is no file {self.file}")
+            raise McaptrackError(f"detector onnx: {missing(Path(self.file))}")
         return Path(self.file)
 
     def weights_sha256(self) -> str:
@@ -582,7 +583,7 @@ class CataloguedDetector(OnnxDetector):
         Width and height of the network's input, as in 416x416, or `picture` for about those of the picture.
     """
 
-    layout: LayoutChoice = option("yolox", theme=NETWORK)
+    layout: LayoutChoice = setting("yolox", theme=NETWORK)
     input_size: str = option("picture", theme=NETWORK)
 
     #: False boxes score up to 0.6 and begin no tracks, so that those that begin need no confirmation.
