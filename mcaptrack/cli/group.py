@@ -85,6 +85,7 @@ _LISTED: Final = (
     Listed("train", _MEASURE, "train:Train"),
     Listed("check", _KEEP, "files:Check"),
     Listed("recover", _KEEP, "files:Recover"),
+    Listed("cut", _KEEP, "files:Cut"),
     Listed("drop", _KEEP, "files:Drop"),
     Listed("doctor", _KEEP, "doctor:Doctor"),
 )

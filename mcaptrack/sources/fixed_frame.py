@@ -464,7 +464,7 @@ TRANSFORMS_READ: Final = (
     "foxglove.FrameTransforms",
 )
 #: The end of topics where a transform holds until the next one.
-_LATCHED: Final = "tf_static"
+LATCHED: Final = "tf_static"
 
 
 class _Transform(NamedTuple):
@@ -545,10 +545,10 @@ def _read(opened: log.Log) -> FramesRead:
     topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
     unread: list[str] = []
     for topic in topics:
-        is_latched = topic.endswith(_LATCHED)
+        is_latched = topic.endswith(LATCHED)
         bad, why = 0, ""
         try:
-            decode = decoder_with_errors(message_type_of(opened, topic), lambda message: list(_transforms(message)))
+            decode = decoder_with_errors(message_type_of(opened, topic), lambda message: list(transforms_in(message)))
             for message in opened.timed(topic):
                 try:
                     for transform in decode(message.payload):
@@ -575,11 +575,11 @@ def _samples(those: list[tuple[_Transform, int]]) -> PoseSamples:
     )
 
 
-def _transforms(message: Any) -> Iterator[_Transform]:
+def transforms_in(message: Any) -> Iterator[_Transform]:
     """Yield the transforms of a message of any of the schemas."""
     if hasattr(message, "transforms"):
         for transform in message.transforms:
-            yield from _transforms(transform)
+            yield from transforms_in(transform)
         return
     if hasattr(message, "parent_frame_id"):
         parent, inner = message.parent_frame_id, message
