@@ -27,7 +27,7 @@ from mcaptrack.log.chunks import (
 )
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import MAGIC, Bytes, Damaged, walk
-from mcaptrack.log.writer import LogWriter
+from mcaptrack.log.writer import ChunkKind, LogWriter
 
 Progress = Callable[[str, int, int], None]
 #: Messages outside of chunks become chunks of so many.
@@ -147,7 +147,7 @@ class _Copy:
         if not isinstance(content, memoryview):  # it is too large for memory
             self._one_by_one(content, channel[order], offset[order])
             return
-        heads = message_heads_at(content, channel, t_ns, offset)
+        heads = message_heads_at(content, channel.astype(np.uint16), t_ns, offset)
         head, span = records.read_chunk(self._source, record), (int(t_ns.min()), int(t_ns.max()))
         is_whole = wanted.all() and len(those) == len(listed.message_index_offsets)
         if is_whole and (head.start_ns, head.end_ns) == span and self._describes_the_same(content, heads):
@@ -155,7 +155,7 @@ class _Copy:
             self._writer.copy_chunk(whole, listed, {number: entries.tobytes() for number, entries in those.items()})
             return
         heads = MessageHeads(heads.head[order], heads.start[order], heads.end[order])
-        kind = "rows" if listed.compression else "media"
+        kind: ChunkKind = "rows" if listed.compression else "media"
         self._writer.copy_messages(kind, content, heads, self._ids[channel[order]])
 
     def _describes_the_same(self, content: Bytes, heads: MessageHeads) -> bool:

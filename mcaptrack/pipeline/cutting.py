@@ -18,9 +18,6 @@ from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from mcap.records import Channel as ChannelRecord
-from mcap.records import Message as MessageRecord
-
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.clocks import parse_ns
@@ -66,11 +63,11 @@ class CutReport:
 
 
 class _Member(NamedTuple):
-    """A channel of a log: the number of the log, the file of it, and the record there."""
+    """A channel of a log: the number of the log, and its file."""
 
     number: int
     part: log.Log
-    channel: ChannelRecord
+    channel: log.Channel
 
 
 class _Piece(NamedTuple):
@@ -156,10 +153,10 @@ class _Cut:
         for number, opened in enumerate(logs):
             repeats: Counter[tuple[Any, ...]] = Counter()
             for part in opened.parts:
-                for channel in part.index.channels.values():
+                for channel in part.recorded:
                     if channel.topic not in topics or opened.part(channel.topic) is not part:
                         continue
-                    schema = part.index.schemas.get(channel.schema_id)
+                    schema = part.index.schemas.get(part.index.channels[channel.id].schema_id)
                     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
                     key = (channel.topic, fields, channel.message_encoding)
                     repeats[key] += 1  # each publisher may have a channel
@@ -175,11 +172,11 @@ class _Cut:
         report = CutReport(topics=tuple(sorted(self._logs_of)))
         ids: dict[log.Log, dict[int, int]] = {part: {} for opened in self._logs for part in opened.parts}
         since: dict[log.Log, dict[int, int]] = {part: {} for part in ids}
-        earlier: list[tuple[int, MessageRecord]] = []
+        earlier: list[tuple[int, log.Message]] = []
         for (topic, schema, encoding, _), members in self._channels.items():
-            first = members[0].channel
+            first = members[0].channel.id
             metadata = self._metadata(topic, members)
-            wanted = (first.id, first.schema_id)
+            wanted = (first, members[0].part.index.channels[first].schema_id)
             new = writer.add_channel(topic, schema, encoding, metadata, another=True, ids=wanted)
             start_ns, before = self._from_before(topic, members)
             earlier += ((new, message) for message in before)
@@ -201,9 +198,9 @@ class _Cut:
             log.copy_attachments_and_metadata(part, writer, without=[CUT], copied=copied)
         if (whole := _joined(self._pieces)) and whole.texts:
             writer.add_metadata(CUT, whole.texts)
-        for new, message in sorted(earlier, key=lambda pair: pair[1].log_time):
+        for new, message in sorted(earlier, key=lambda pair: pair[1].t_ns):
             at_ns = (self._span[0] or 1) - 1
-            writer.add_message(new, at_ns, message.sequence, message.data, message.publish_time)
+            writer.add_message(new, at_ns, message.sequence, message.payload, message.publish_ns)
         writer.close_chunks()
         parts = [log.Part(part, ids[part], since[part]) for part in ids if ids[part]]
         report.lost = self._lost + log.copy_messages(writer, parts, self._span[1], progress)
@@ -286,13 +283,13 @@ class _Cut:
 
     # From before the start
 
-    def _from_before(self, topic: str, members: Sequence[_Member]) -> tuple[int, list[MessageRecord]]:
+    def _from_before(self, topic: str, members: Sequence[_Member]) -> tuple[int, list[log.Message]]:
         """The time of the first message of a channel to take, and messages from before the start that hold there."""
         start_ns = self._span[0]
         if start_ns is None:
             return 0, []
         opened = self._logs[members[0].number]
-        channel, latest = opened.channel(topic), dict[object, MessageRecord]()
+        channel, latest = opened.channel(topic), dict[object, log.Message]()
         kind = plain_name(channel.schema_name)
         before = self._before(members, start_ns)
         if foreign.holds_pictures(channel):
@@ -305,39 +302,39 @@ class _Cut:
         elif kind in (*_HELD, _SCENE):
             searched = searched or 1
         for message in islice(before, searched):
-            latest.setdefault(key(message.data), message)
+            latest.setdefault(key(message.payload), message)
         if kind == _SCENE:
             is_lasting = _decoder(opened, topic, lambda message: any(map(_is_lasting, message.entities)))
-            latest = {at: message for at, message in latest.items() if is_lasting(message.data)}
+            latest = {at: message for at, message in latest.items() if is_lasting(message.payload)}
         return start_ns, [*latest.values()][::-1]
 
-    def _before(self, members: Sequence[_Member], start_ns: int) -> Iterator[MessageRecord]:
+    def _before(self, members: Sequence[_Member], start_ns: int) -> Iterator[log.Message]:
         """The messages of a channel before a time, the latest first."""
 
-        def of(member: _Member) -> Iterator[MessageRecord]:
+        def of(member: _Member) -> Iterator[log.Message]:
             own_start = self._own_start(member, members)
             try:
                 for message in member.part.snapshot.messages.before(member.channel.id, start_ns):
-                    if message.log_time >= own_start:
+                    if message.t_ns >= own_start:
                         yield message
             except Damaged as error:
                 where = f"{member.part.path}: {error}"
                 self._lost.append(f"{where}; messages of {member.channel.topic} from before the start are left out")
 
-        return heapq.merge(*map(of, members), key=lambda message: message.log_time, reverse=True)
+        return heapq.merge(*map(of, members), key=lambda message: message.t_ns, reverse=True)
 
     def _first_picture_ns(self, opened: log.Log, topic: str, members: Sequence[_Member], start_ns: int) -> int:
         """The time of the picture that decoding of the first one after the start begins with."""
         try:
             read = foreign.picture_reader(opened, topic)
-            streams = (m.part.snapshot.messages.records([m.channel.id], (start_ns, self._span[1])) for m in members)
-            first = [*islice(heapq.merge(*streams, key=lambda message: message.log_time), 1)]
+            streams = (m.part.snapshot.messages.by_time([m.channel.id], (start_ns, self._span[1])) for m in members)
+            first = [*islice(heapq.merge(*streams, key=lambda message: message.t_ns), 1)]
         except McaptrackError:  # copying says so, or viewers
             return start_ns
         is_key = False
         for message in islice(chain(first, self._before(members, start_ns)), _SEARCHED if first else 0):
             try:
-                picture = read(log.Message(message.log_time, message.sequence, message.publish_time, message.data))
+                picture = read(message)
             except McaptrackError:
                 continue
             if not is_video_codec(picture.format):
@@ -345,7 +342,7 @@ class _Cut:
             head = read_head(picture.format, picture.data)
             is_key |= head.is_key
             if is_key and head.has_parameter_sets:
-                return min(message.log_time, start_ns)
+                return min(message.t_ns, start_ns)
         if first:
             text = "there is no key picture before the start: the first pictures can't be decoded"
             warn(f"{opened.path}: {topic}: {text}", "pictures")
