@@ -189,12 +189,12 @@ class _Cut:
         writer.write_description(*writer.channels)
         copied: set[bytes] = set()
         for part in ids:
-            unknown = [writer.write(record) for record in log.private_records(part)]
+            unknown = [*log.private_records(part)]
+            for record in unknown:
+                writer.write(record)
             if unknown:
-                warn(
-                    f"{part.path}: {len(unknown)} records of kinds that MCAP doesn't define are copied as they are",
-                    "other",
-                )
+                text = f"{len(unknown)} records of kinds that MCAP doesn't define are copied as they are"
+                warn(f"{part.path}: {text}", "other")
             log.copy_attachments_and_metadata(part, writer, without=[CUT], copied=copied)
         if (whole := _joined(self._pieces)) and whole.texts:
             writer.add_metadata(CUT, whole.texts)
@@ -243,11 +243,11 @@ class _Cut:
 
     def _digest(self, topic: str) -> tuple[str, dict[str, str]]:
         """The digest of what is left of a channel of results, and ``Provenance.cut``."""
-        pieces = []
-        for number in sorted(self._logs_of[topic]):
-            how = provenance_of(self._logs[number], topic)
-            assert how is not None
-            pieces.append(_Piece.of(how.cut, self._spans[number], how.digest))
+        pieces = [
+            _Piece.of(how.cut, self._spans[number], how.digest)
+            for number in sorted(self._logs_of[topic])
+            if (how := provenance_of(self._logs[number], topic))  # None: its messages have another schema
+        ]
         whole = _joined(pieces)
         if whole is None:
             return sha256("".join(piece.described()[0] for piece in pieces).encode()).hexdigest(), {}
