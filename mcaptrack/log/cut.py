@@ -20,10 +20,12 @@ from mcaptrack.log.chunks import (
     Entries,
     MessageHeads,
     chunk_record,
+    contents_of,
     message_head,
     message_heads_at,
     open_chunk,
     read_index_entries,
+    records_between,
 )
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import MAGIC, Bytes, Damaged, walk
@@ -116,10 +118,7 @@ class _Copy:
         """The messages of a place that is lost, as text."""
         if place < 0:
             return f"{len(self._loose[-1 - place][0])} messages outside of chunks are left out"
-        listed = self._index.chunks[place]
-        topics = sorted({self._index.channels[number].topic for number in listed.message_index_offsets})
-        first, last = (t_ns / 1e9 for t_ns in (listed.message_start_time, listed.message_end_time))
-        return f"its messages of {', '.join(topics)} from {first:.3f} to {last:.3f} s are left out"
+        return f"its {contents_of(self._index.chunks[place], self._index.channels)} are left out"
 
     def copy(self, place: int) -> None:
         """Copy the wanted messages of a place."""
@@ -162,16 +161,13 @@ class _Copy:
         """Whether a chunk may stay as it is: all that it describes, the new log describes by the same ids."""
         if not self._same.issuperset(np.unique(heads.head["channel"]).tolist()):
             return False
-        low = np.append(0, np.sort(heads.end))
-        high = np.append(np.sort(heads.start) - HEAD.itemsize, len(content))
-        for start, end in zip(low[low < high].tolist(), high[low < high].tolist(), strict=True):
-            for inner in walk(content, start, end):
-                if inner.opcode == Opcode.CHANNEL:
-                    is_same = records.read_channel(content, inner).id in self._same
-                else:
-                    is_same = inner.opcode == Opcode.SCHEMA and records.read_schema(content, inner).id in self._schemas
-                if not is_same:
-                    return False
+        for inner in records_between(content, heads.start - HEAD.itemsize, heads.end):
+            if inner.opcode == Opcode.CHANNEL:
+                is_same = records.read_channel(content, inner).id in self._same
+            else:
+                is_same = inner.opcode == Opcode.SCHEMA and records.read_schema(content, inner).id in self._schemas
+            if not is_same:
+                return False
         return True
 
     def _one_by_one(self, buffer: Bytes, channel: Ints, offset: Ints) -> None:
