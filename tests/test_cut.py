@@ -375,3 +375,13 @@ def test_no_log_is_lost(tmp_path):
     assert "b.mcap exists" in call("cut", path, "-o", tmp_path / "b.mcap").err
     assert (path.read_bytes(), (tmp_path / "b.mcap").read_bytes()) == (before, b"old")
     assert "needs a name" in call("cut", path, tmp_path / "b.mcap").err
+
+
+def test_of_a_log_in_a_store_little_more_than_that_time_is_read(store, tmp_path):
+    messages = [("abc"[n % 3], n * 10**7, n, bytes([n]) * 50_000) for n in range(200)]
+    write_stock(path := tmp_path / "a.mcap", messages, compression=CompressionType.NONE, chunk_size=200_000)
+    url = store.put("a.mcap", path)
+    with store.counted() as asked:
+        done("cut", url, "-o", tmp_path / "b.mcap", "--start-s", "1", "--end-s", "1.1")
+    assert sorted(stock_messages(tmp_path / "b.mcap")) == within(messages, (10**9, 11 * 10**8))
+    assert sum(request.bytes for request in asked) < path.stat().st_size / 5
