@@ -1,8 +1,8 @@
 """Cut logs: which channels the new log has, what it needs from before its start, and what holds for cut results.
 
 A moment of a log is not complete by its messages alone. A viewer that opens the whole log there has maps, transforms
-and calibrations that were published once, long before: the last of each is written again one nanosecond before the
-start. It also decodes video from the key picture before: pictures from that one on are kept, at their own times.
+and calibrations that were published once, long before: the last of each is written again just before all others.
+It also decodes video from the key picture before: pictures from that one on are kept, at their own times.
 """
 
 from __future__ import annotations
@@ -138,6 +138,7 @@ class _Cut:
 
     def __init__(self, logs: Sequence[log.Log], topics: Collection[str], span: Span) -> None:
         self._logs, self._span, self._lost = logs, span, list[str]()
+        self._held_ns = 0  # the time at which messages from before the start are written
         #: The part that is taken of each log, without limits that leave nothing out.
         self._spans: list[Span] = []
         for opened in logs:
@@ -173,12 +174,15 @@ class _Cut:
         ids: dict[log.Log, dict[int, int]] = {part: {} for opened in self._logs for part in opened.parts}
         since: dict[log.Log, dict[int, int]] = {part: {} for part in ids}
         earlier: list[tuple[int, log.Message]] = []
-        for (topic, schema, encoding, _), members in self._channels.items():
+        held = [self._from_before(key[0], members) for key, members in self._channels.items()]
+        self._held_ns = max(min((since_ns for since_ns, _ in held), default=0) - 1, 0)
+        for ((topic, schema, encoding, _), members), (start_ns, before) in zip(
+            self._channels.items(), held, strict=True
+        ):
             first = members[0].channel.id
             metadata = self._metadata(topic, members)
             wanted = (first, members[0].part.index.channels[first].schema_id)
             new = writer.add_channel(topic, schema, encoding, metadata, another=True, ids=wanted)
-            start_ns, before = self._from_before(topic, members)
             earlier += ((new, message) for message in before)
             report.earlier[topic] = report.earlier.get(topic, 0) + len(before)
             for member in members:
@@ -199,8 +203,7 @@ class _Cut:
         if (whole := _joined(self._pieces)) and whole.texts:
             writer.add_metadata(CUT, whole.texts)
         for new, message in sorted(earlier, key=lambda pair: pair[1].t_ns):
-            at_ns = (self._span[0] or 1) - 1
-            writer.add_message(new, at_ns, message.sequence, message.payload, message.publish_ns)
+            writer.add_message(new, self._held_ns, message.sequence, message.payload, message.publish_ns)
         writer.close_chunks()
         parts = [log.Part(part, ids[part], since[part]) for part in ids if ids[part]]
         report.lost = self._lost + log.copy_messages(writer, parts, self._span[1], progress)
@@ -279,7 +282,7 @@ class _Cut:
         earlier = [plane for t_ns, plane in sorted(planes.items()) if start_ns is not None and t_ns < start_ns][-1:]
         piece = _Piece("", start_ns, end_ns)
         kept = [(t_ns, plane) for t_ns, plane in sorted(planes.items()) if piece.holds(t_ns)]
-        return planes_to_json([((start_ns or 1) - 1, plane) for plane in earlier] + kept)
+        return planes_to_json([(self._held_ns, plane) for plane in earlier] + kept)
 
     # From before the start
 
