@@ -26,7 +26,7 @@ _MOMENT: Final = "Moment"
 
 @dataclass(frozen=True)
 class CutResult:
-    """What was written to a new log.
+    """The new log that ``cut`` wrote.
 
     Attributes
     ----------

@@ -54,7 +54,7 @@ _DEPTH: Final = re.compile(r"depth:\s*(\d{1,6})")
 
 @dataclass
 class CutReport:
-    """What was written: messages, topics, how many messages of each are from before the start; and what is lost."""
+    """The result of ``cut``: messages, topics, how many messages of each are from before the start; and losses."""
 
     messages: int = 0
     topics: tuple[str, ...] = ()
@@ -71,7 +71,7 @@ class _Member(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """What is left of a channel: the digest of the whole, and from when and before when it is, if that is shorter."""
+    """A part of a channel: the digest of the whole, and from when and before when it is, if that is shorter."""
 
     digest: str
     start_ns: int | None = None
@@ -79,7 +79,7 @@ class _Piece(NamedTuple):
 
     @classmethod
     def of(cls, cut: Mapping[str, str], span: Span, digest: str = "") -> _Piece:
-        """What a span leaves of an earlier cut."""
+        """The part of an earlier cut within a span."""
         before = (parse_ns(cut.get("start_ns", "")), parse_ns(cut.get("end_ns", "")))
         starts, ends = ([t for t in pair if t is not None] for pair in zip(before, span, strict=True))
         return cls(cut.get("digest", digest), max(starts, default=None), min(ends, default=None))
@@ -441,7 +441,7 @@ def _is_lasting(entity: Any) -> bool:
 
 
 def _latched(metadata: Mapping[str, str]) -> int:
-    """How many of the last messages those get who subscribe late, at most; 0 if the channel isn't latched."""
+    """The most messages that a late subscriber gets: the last ones; 0 if the channel isn't latched."""
     profiles = metadata.get("offered_qos_profiles", "")
     publishers = len(_LATCHING.findall(profiles)) + (metadata.get("latching") == "1")
     if publishers > 1 or "keep_all" in profiles:
