@@ -201,7 +201,7 @@ def _chosen(opened: Sequence[Log], patterns: Sequence[str], excluded: Sequence[s
     from mcaptrack.pipeline.cutting import needed
 
     every = {topic for each in opened for topic in each.channels}
-    chosen = fitting_topics(opened, patterns) if patterns else every
+    chosen = fitting_topics(opened, patterns) if patterns else {*every}
     for each in opened if patterns else ():
         chosen |= needed(each, chosen)
     chosen -= fitting_topics(opened, excluded)

@@ -263,7 +263,7 @@ class _Cut:
             return before
         for member, origin in zip(members, origins, strict=True):
             how = provenance_of(self._logs[member.number], name)
-            if how is None or how.digest != origin.made_from()[name]:
+            if how is None or how.digest != origin.made_from().get(name):
                 return before
         return self._digest(name)[0]
 
