@@ -10,6 +10,7 @@ _PARTS = {
     "calibrating": ["CalibrateResult", "CameraCorrection", "calibrate"],
     "catalogue": ["Model", "get_model", "models"],
     "contents": ["ChannelInfo", "FrameInfo", "LogInfo", "info"],
+    "cutting": ["CutResult", "cut"],
     "demonstration": ["DemoResult", "demo"],
     "events": ["events"],
     "exporting": ["ExportResult", "export"],

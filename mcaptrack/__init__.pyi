@@ -10,6 +10,8 @@ from mcaptrack.api.contents import ChannelInfo as ChannelInfo
 from mcaptrack.api.contents import FrameInfo as FrameInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
+from mcaptrack.api.cutting import CutResult as CutResult
+from mcaptrack.api.cutting import cut as cut
 from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.events import events as events
@@ -74,6 +76,7 @@ __all__ = [
     "CameraCorrection",
     "ChannelInfo",
     "ColumnInfo",
+    "CutResult",
     "DecodedMessage",
     "DemoResult",
     "DoctorResult",
@@ -102,6 +105,7 @@ __all__ = [
     "TuneResult",
     "calibrate",
     "check",
+    "cut",
     "demo",
     "detect",
     "detections",

@@ -145,6 +145,7 @@ def some_log(path, **more):
 #: How each command is run so that it only reads the log; nothing comes into the log's folder.
 READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "check": lambda log, out: [log],
+    "cut": lambda log, out: [log, "-o", out / "cut.mcap"],
     "drop": lambda log, out: [log, "/camera/truth", "-o", out / "dropped.mcap"],
     "evaluate": lambda log, out: [log],
     "export": lambda log, out: [log, "-o", out / "tables"],

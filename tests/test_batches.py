@@ -13,7 +13,7 @@ from tests.commands import GROUP, call, zones_file
 from tests.tiers import one_in
 
 #: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
-COMBINING = {"report", "query", "evaluate", "tune", "train"}
+COMBINING = {"cut", "report", "query", "evaluate", "tune", "train"}
 SEVERAL = {name for name, command in GROUP.commands.items() if any(one.nargs == -1 for one in command.params)} - {
     "drop"
 }

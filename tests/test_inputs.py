@@ -64,7 +64,20 @@ LOGS = {
     (name, "logs")
     for name in (
         *STAGES,
-        *["run", "fuse", "calibrate", "events", "zones", "recover", "render", "info", "check", "export", "report"],
+        *[
+            "run",
+            "fuse",
+            "calibrate",
+            "events",
+            "zones",
+            "recover",
+            "cut",
+            "render",
+            "info",
+            "check",
+            "export",
+            "report",
+        ],
     )
 }
 LOGS |= {("query", "words"), ("evaluate", "inputs")}

@@ -244,7 +244,7 @@ def drop(
         raise McaptrackError("`in_place=True` and `output=` are two places for the same result; give one")
     with warnings_about(path) as warnings:
         with logs.read(path) as opened:
-            dropped = _with_descriptions(opened, _chosen(opened, patterns))
+            dropped = _with_descriptions(opened, fitting_topics([opened], patterns))
             parts, before = [Path(part.path) for part in opened.parts], sum(part.size for part in opened.parts)
             if copy is None and not in_place:
                 _refuse_for_ros_tools(opened, dropped)
@@ -287,15 +287,17 @@ def _remove(topics: set[str], part: Path, target: Path) -> int:
     return sum(channel.messages for channel in channels)
 
 
-def _chosen(opened: logs.Log, patterns: Sequence[str]) -> set[str]:
-    """Return the topics that fit any of the patterns. Raises McaptrackError for a pattern that fits none."""
+def fitting_topics(opened: Sequence[logs.Log], patterns: Sequence[str]) -> set[str]:
+    """Return the topics of logs that fit any of the patterns. Raises McaptrackError for a pattern that fits none."""
     chosen: set[str] = set()
     for pattern in patterns:
-        fitting = {opened.find(pattern)} & opened.channels.keys()
-        if not {*"*?["}.isdisjoint(pattern):  # most are names, and there may be thousands
-            fitting |= {topic for topic in opened.channels if fnmatchcase(topic, pattern)}
+        is_name = {*"*?["}.isdisjoint(pattern)  # most are, and there may be thousands
+        fitting: set[str] = set()
+        for each in opened:
+            fitting |= {each.find(pattern)} & each.channels.keys()
+            fitting |= set() if is_name else {topic for topic in each.channels if fnmatchcase(topic, pattern)}
         if not fitting:
-            opened.channel(pattern)  # raises, with the channels that there are
+            opened[0].channel(pattern)  # raises, with the channels that there are
         chosen |= fitting
     return chosen
 

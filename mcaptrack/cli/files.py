@@ -1,20 +1,21 @@
-"""``mcaptrack check``, ``recover`` and ``drop``: what they print about a log's bytes, and what was saved or removed."""
+"""``mcaptrack check``, ``recover``, ``drop`` and ``cut``: what they print about a log's bytes, and what was saved."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import Printed
+from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import print_table, refuse_usage, show
-from mcaptrack.errors import command
+from mcaptrack.errors import command, list_names
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
-    from mcaptrack import DropResult, LogCheck, LogRecovery
+    from mcaptrack import CutResult, DropResult, LogCheck, LogRecovery
     from mcaptrack.fleet import NamedLog
     from mcaptrack.log import CheckResult
 
@@ -102,10 +103,7 @@ class Recover(EachLog["LogRecovery"]):
     def show(self, log: Location, done: LogRecovery, talk: common.Talk) -> None:
         """Print what was saved and what was lost."""
         talk.say(f"{done.output}: {done.messages} messages in {done.chunks} chunks are saved")
-        for loss in done.lost if self.values["verbose"] else done.lost[:_SHOWN]:
-            talk.say(f"lost: {loss}")
-        if len(done.lost) > _SHOWN and not self.values["verbose"]:
-            talk.say(f"lost: {len(done.lost) - _SHOWN} more; -v shows them")
+        _say_lost(done.lost, talk)
         if not done.lost:
             talk.say("nothing was lost")
 
@@ -122,6 +120,40 @@ class Recover(EachLog["LogRecovery"]):
     def code(self, results: Sequence[LogRecovery]) -> int:
         """Return the exit code: 3 if anything was lost."""
         return common.LOST if any(done.lost for done in results) else common.DONE
+
+
+def _say_lost(lost: Sequence[str], talk: common.Talk) -> None:
+    shown = lost if talk.verbose else lost[:_SHOWN]
+    for loss in shown:
+        talk.say(f"lost: {loss}")
+    if len(lost) > len(shown):
+        talk.say(f"lost: {len(lost) - len(shown)} more; -v shows them")
+
+
+class Cut(Once["CutResult"]):
+    """Write parts of logs to a new log."""
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function: patterns and folders become logs."""
+        return super().arguments(names) | {"log": common.expand(self.values["logs"], folders=True)}
+
+    def show(self, done: CutResult, talk: common.Talk) -> None:
+        """Print what was written, what is there from before the start, and what was lost."""
+        since, until = (None if s is None else f"{s:.3f} s" for s in (done.start_s, done.end_s))
+        span = "".join(f" {word} {s}" for word, s in (("from", since), ("to", until)) if s)
+        talk.say(f"{done.output}: {done.messages} messages in {len(done.topics)} topics{span}; {done.bytes} bytes")
+        if done.earlier:
+            count = sum(done.earlier.values())
+            talk.say(f"with {count} from before the start that hold there, of {list_names(sorted(done.earlier))}")
+        _say_lost(done.lost, talk)
+
+    def data(self, done: CutResult) -> dict[str, Any]:
+        """Return the result as values of JSON."""
+        return asdict(done) | {"logs": [str(path) for path in done.logs], "output": str(done.output)}
+
+    def code(self, done: CutResult) -> int:
+        """Return the exit code: 3 if anything was lost."""
+        return common.LOST if done.lost else common.DONE
 
 
 class Drop(EachLog["DropResult"]):

@@ -82,6 +82,7 @@ _LISTED: Final = (
     Listed("render", _RESULTS, "render:Render"),
     Listed("query", _RESULTS, "query:Query"),
     Listed("export", _RESULTS, "show:Export"),
+    Listed("cut", _RESULTS, "files:Cut"),
     Listed("evaluate", _RESULTS, "evaluate:Evaluate"),
     Listed("events", _RESULTS, "running:Events"),
     Listed("zones", _RESULTS, "zones:Zones"),

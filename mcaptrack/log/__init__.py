@@ -8,6 +8,7 @@ recover(path, output)                   write what is intact to a new log
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from hashlib import sha256
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -19,6 +20,7 @@ from mcaptrack.log import records
 from mcaptrack.log.check import CheckResult, check, clock_jumps, jumps_text
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.log.chunks import message_head, open_chunk
+from mcaptrack.log.cut import Part, copy_messages, private_records
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
 from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Channel, Log, find_topic
@@ -158,11 +160,24 @@ def header(log: Log) -> tuple[str, str]:
         return about.profile, about.library
 
 
-def copy_attachments_and_metadata(log: Log, writer: LogWriter, *, without: Collection[str] = ()) -> None:
-    """Copy the attachments of a log, and its metadata records except those named in ``without``."""
+def copy_attachments_and_metadata(
+    log: Log, writer: LogWriter, *, without: Collection[str] = (), copied: set[bytes] | None = None
+) -> None:
+    """Copy the attachments of a log, and its metadata records except those named in ``without``.
+
+    ``copied`` are digests of records that are there already, and are left out; those of new ones are added.
+    """
+    copied = set() if copied is None else copied
     with log.snapshot.reporting_damage():
-        for listed in log.index.metadata:
-            if listed.name not in without:
-                writer.copy_metadata(bytes(log.snapshot.record(listed.offset)))
-        for listed in log.index.attachments:
-            writer.copy_attachment(bytes(log.snapshot.record(listed.offset)))
+        for entries, copy in (
+            (log.index.metadata, writer.copy_metadata),
+            (log.index.attachments, writer.copy_attachment),
+        ):
+            before = frozenset(copied)
+            for listed in entries:
+                record = bytes(log.snapshot.record(listed.offset))
+                digest = sha256(record).digest()
+                if (entries is log.index.metadata and listed.name in without) or digest in before:
+                    continue
+                copied.add(digest)
+                copy(record)

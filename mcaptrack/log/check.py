@@ -30,6 +30,7 @@ from mcaptrack.log.chunks import (
     message_heads_at,
     open_chunk,
     read_index_entries,
+    records_between,
     scan_entries,
 )
 from mcaptrack.log.index import (
@@ -417,21 +418,14 @@ class _Checker:
             entries[channel] = listed[np.argsort(listed[:, 1], kind="stable")]
             starts.append(heads.start - HEAD.itemsize)
             ends.append(heads.end)
-        start, end = np.sort(np.concatenate(starts)), np.sort(np.concatenate(ends))
-        # The gaps between listed messages hold schemas, channels, and messages that are not listed.
-        gap_from = np.concatenate([[0], end])
-        gap_to = np.concatenate([start, [len(content)]])
-        for low, high in zip(*(edge[gap_from != gap_to].tolist() for edge in (gap_from, gap_to)), strict=True):
-            for inner in walk(content, low, high):
-                if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._describe(content, inner, record.start)
-                elif inner.opcode == Opcode.MESSAGE:
-                    channel, _, t_ns, _ = message_head(content, inner)
-                    self._find(
-                        "not-listed", record.start, f"a message of channel {channel} that no message index lists"
-                    )
-                    entry = np.array([[t_ns, inner.start]], "<u8")
-                    entries[channel] = np.concatenate([entries.get(channel, entry[:0]), entry])
+        for inner in records_between(content, np.concatenate(starts), np.concatenate(ends)):
+            if inner.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._describe(content, inner, record.start)
+            elif inner.opcode == Opcode.MESSAGE:
+                channel, _, t_ns, _ = message_head(content, inner)
+                self._find("not-listed", record.start, f"a message of channel {channel} that no message index lists")
+                entry = np.array([[t_ns, inner.start]], "<u8")
+                entries[channel] = np.concatenate([entries.get(channel, entry[:0]), entry])
         return entries
 
     def _count(self, entries: Mapping[int, Entries], where: int) -> None:

@@ -5,10 +5,12 @@ Letters: M messages.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex
 from numpy.typing import NDArray
 
@@ -190,6 +192,20 @@ def scan_entries(content: Bytes) -> dict[int, Entries]:
             channel, _, t_ns, _ = message_head(content, record)
             entries_of.setdefault(channel, []).append((t_ns, record.start))
     return {channel: np.array(entries, "<u8") for channel, entries in entries_of.items()}
+
+
+def records_between(content: Bytes, start: Ints, end: Ints) -> Iterator[Record]:
+    """The records of a chunk beside messages that start and end there, (M,)."""
+    low, high = np.append(0, np.sort(end)), np.append(np.sort(start), len(content))
+    for first, last in zip(low[low < high].tolist(), high[low < high].tolist(), strict=True):
+        yield from walk(content, first, last)
+
+
+def contents_of(listed: ChunkIndex, channels: Mapping[int, ChannelRecord]) -> str:
+    """The topics and the times of the messages of a chunk, as text."""
+    topics = sorted({channels[number].topic for number in listed.message_index_offsets if number in channels})
+    span = f"{listed.message_start_time / 1e9:.3f} to {listed.message_end_time / 1e9:.3f} s"
+    return f"messages of {', '.join(topics) or 'no topic'} from {span}"
 
 
 def message_heads_at(content: Bytes, channel_id: int | NDArray[np.uint16], t_ns: Times, offset: Ints) -> MessageHeads:

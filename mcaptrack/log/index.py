@@ -193,6 +193,21 @@ class ChunkList:
         return self._column(_OFFSET)
 
     @property
+    def ends(self) -> NDArray[np.uint64]:
+        """The offsets behind all chunks and their message indexes, (C,)."""
+        return self.offsets + self._column(_LENGTH) + self._column(_INDEX_LENGTH)
+
+    @property
+    def start_ns(self) -> NDArray[np.uint64]:
+        """The time of the first message of each chunk, (C,)."""
+        return self._column(_START)
+
+    @property
+    def end_ns(self) -> NDArray[np.uint64]:
+        """The time of the last message of each chunk, (C,)."""
+        return self._column(_END)
+
+    @property
     def channels(self) -> set[int]:
         """The channels of all messages."""
         return set(self._channels)

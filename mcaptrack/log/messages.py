@@ -588,6 +588,17 @@ class Messages:
         for numbers in reversed(groups) if reverse else groups:
             yield from self._interleaved(*joined_by_chunk([batches[n] for n in numbers], reverse=reverse), read)
 
+    def before(self, channel_id: int, t_ns: int) -> Iterator[Message]:
+        """The messages of a channel before a time, the latest first. Little more is read than what is taken."""
+        starts = np.unique(self.index.chunks.start_ns[self.index.chunks.rows_with([channel_id])]).tolist()
+        starts = [0, *(start for start in starts if 0 < start < t_ns)]
+        until, step = t_ns, 1
+        while until > 0:
+            since = starts[-min(step, len(starts))]
+            for message in self.records([channel_id], (since, until), reverse=True):
+                yield Message(message.log_time, message.sequence, message.publish_time, message.data)
+            until, step = since, 2 * step
+
     def _interleaved(
         self,
         batches: MessageBatches | Sequence[MessageBatch],

@@ -24,6 +24,8 @@ BLOCK: Final = 8 * 2**20
 _HEAD: Final = struct.Struct("<BQ")
 MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 RECORD_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+#: Where the id of its channel stands in a message record.
+MESSAGE_ID_AT: Final = _HEAD.size
 FOOTER_BODY: Final = struct.Struct("<QQI")
 #: The head of a chunk, by compression: times, size, checksum, length of the name, the name, size of the records.
 _CHUNK_HEADS: Final = {name: struct.Struct(f"<QQQII{len(name)}xQ") for name in (b"zstd", b"", b"lz4")}

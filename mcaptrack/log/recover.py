@@ -29,7 +29,7 @@ from mcaptrack.log.byte_source import ByteSource, RunningChecksum
 from mcaptrack.log.check import content_to_recover, open_bytes
 from mcaptrack.log.check_summary import record_name
 from mcaptrack.log.checksums import attachment_is_whole, crc_of
-from mcaptrack.log.chunks import Entries, message_head, open_chunk, scan_entries
+from mcaptrack.log.chunks import Entries, contents_of, message_head, open_chunk, scan_entries
 from mcaptrack.log.index import Index, read_intact_summary, starts_with_magic, summary_start
 from mcaptrack.log.records import BLOCK, DATA_OPCODES, MAGIC, Bytes, Damaged, Reader, Record, walk
 from mcaptrack.log.writer import LogWriter, create
@@ -360,13 +360,7 @@ class _Recovery:
         listed = self._summary_index.chunks.at(at)
         if listed is None or not self._known_offsets:
             return why
-        topics = [
-            self._summary_index.channels[n].topic
-            for n in listed.message_index_offsets
-            if n in self._summary_index.channels
-        ]
-        span = f"{listed.message_start_time / 1e9:.3f} to {listed.message_end_time / 1e9:.3f} s"
-        return f"{why}; it held messages of {', '.join(sorted(topics)) or 'no topic'} from {span}"
+        return f"{why}; it held {contents_of(listed, self._summary_index.channels)}"
 
     def _report_lost(self, start: int, end: int, reason: str) -> None:
         self._report.lost.append(f"byte {start} to {end}: {reason.removeprefix(f'byte {start}: ')}")

@@ -26,10 +26,12 @@ from mcap.records import Schema as SchemaRecord
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_stream
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.ragged import gather_bytes
 from mcaptrack.log import journal, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
 from mcaptrack.log.checksums import crc_of
-from mcaptrack.log.chunks import LOG_MAX_NS
+from mcaptrack.log.chunks import HEAD, LOG_MAX_NS, MessageHeads
 from mcaptrack.log.index import ChunkList, Index, SummaryEntry, attachment_entry, metadata_entry, read_index
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, results_path
 from mcaptrack.log.records import MAGIC, Damaged
@@ -85,6 +87,7 @@ class LogWriter:
         self._metadata: list[SummaryEntry] = index.metadata
         self._times = index.chunks.times()
         self._groups: dict[int, tuple[ChunkKind, str]] = {}
+        self._described: set[int] = set()  # outside of chunks
         self._open: dict[tuple[ChunkKind, str], _OpenChunk] = {}
         self._topics = {channel.topic for channel in self.channels.values()}
         self._schema_ids = {(s.name, s.encoding, bytes(s.data)): s.id for s in reversed(self.schemas.values())}
@@ -111,20 +114,22 @@ class LogWriter:
         group: str = "",
         *,
         another: bool = False,
+        ids: tuple[int, int] = (0, 0),
     ) -> int:
         """Add a channel and return its id. ``schema`` is name, encoding and data; ("", "", b"") is no schema.
 
-        Channels with the same ``group`` share chunks. Raises McaptrackError if the topic exists already, unless
-        ``another`` channel with it is wanted, and if there are 65 535 channels.
+        Channels with the same ``group`` share chunks. ``ids`` are those of the channel and a new schema if they are
+        free. Raises McaptrackError if the topic exists already, unless ``another`` channel with it is wanted, and if
+        there are 65 535 channels.
         """
         if topic in self._topics and not another:
             raise McaptrackError(f"there is a channel {topic} already")
         schema_id = 0
         if schema != ("", "", b""):
-            schema_id = self._schema_ids.get(schema, 0) or _free_id(self.schemas, self._last[0], "schemas")
+            schema_id = self._schema_ids.get(schema, 0) or _free_id(self.schemas, self._last[0], "schemas", ids[1])
             self._schema_ids[schema] = schema_id
             self.schemas[schema_id] = SchemaRecord(schema_id, name=schema[0], encoding=schema[1], data=schema[2])
-        channel_id = _free_id(self.channels, self._last[1], "channels")
+        channel_id = _free_id(self.channels, self._last[1], "channels", ids[0])
         self._last = max(schema_id, self._last[0]), max(channel_id, self._last[1])
         self.channels[channel_id] = ChannelRecord(
             id=channel_id,
@@ -172,9 +177,10 @@ class LogWriter:
 
     # Copying records of another log
 
-    def write_description(self, channel_id: int) -> None:
-        """Write the schema and channel records of a channel, outside of chunks."""
-        self.write(self._description(channel_id))
+    def write_description(self, *channel_ids: int) -> None:
+        """Write the schema and channel records of channels, outside of chunks."""
+        self.write(self._description(*channel_ids))
+        self._described.update(channel_ids)
 
     def copy_message(self, channel_id: int, t_ns: int, message: memoryview) -> None:
         """Copy a message that was outside of chunks into a chunk, because readers that use the index don't find it
@@ -229,6 +235,24 @@ class LogWriter:
         if chunk.parts:
             self._put(chunk)
 
+    def copy_messages(self, kind: ChunkKind, content: memoryview, heads: MessageHeads, channels: Ints) -> None:
+        """Copy messages (M,) of a chunk of another log as a new chunk; ``channels`` (M,) are their ids in this log."""
+        ids = np.unique(channels).tolist()
+        description = self._description(*ids)
+        chunk = _OpenChunk(kind, [description], len(description))
+        start = heads.start - HEAD.itemsize
+        sizes = heads.end - start
+        to = np.cumsum(sizes) - sizes
+        data = np.empty(int(sizes.sum()), np.uint8)
+        gather_bytes(np.frombuffer(content, np.uint8), start, sizes, to, data)
+        for byte in range(2):
+            data[to + records.MESSAGE_ID_AT + byte] = channels >> 8 * byte & 0xFF
+        chunk.parts.append(data.tobytes())
+        entries = np.stack([heads.head["t_ns"], (to + chunk.size).astype(np.uint64)], axis=1)
+        for number in ids:
+            chunk.entries[number] = array("Q", entries[channels == number].tobytes())
+        self._put(chunk)
+
     def write(self, data: bytes) -> None:
         """Write bytes of the data section."""
         self._sink.write(data)
@@ -239,9 +263,10 @@ class LogWriter:
 
     def finish(self) -> int:
         """Close the open chunks, write summary and footer. Returns the number of messages in the file."""
-        for group in tuple(self._open):
-            self._close_chunk(group)
-        for channel_id in self._groups.keys() - self.counts.keys():  # without messages, so no chunk describes them
+        self.close_chunks()
+        for channel_id in (
+            self._groups.keys() - self.counts.keys() - self._described
+        ):  # without messages, so no chunk describes them
             self.write_description(channel_id)
         data_crc = self.crc if self._crc_known else 0
         self._sink.write(records.pack(Opcode.DATA_END, records.number(data_crc, 4)))
@@ -290,6 +315,11 @@ class LogWriter:
 
     # Chunks
 
+    def close_chunks(self) -> None:
+        """Write the chunks under construction: what is written next stands behind their messages."""
+        for group in tuple(self._open):
+            self._close_chunk(group)
+
     def _new_chunk(self, group: tuple[ChunkKind, str]) -> _OpenChunk:
         return self._open.setdefault(group, _OpenChunk(group[0]))
 
@@ -300,10 +330,10 @@ class LogWriter:
         chunk.size += len(description)
         return chunk.entries.setdefault(channel_id, array("Q"))
 
-    def _description(self, channel_id: int) -> bytes:
-        channel = self.channels[channel_id]
-        schema = records.pack_schema(self.schemas[channel.schema_id]) if channel.schema_id else b""
-        return schema + records.pack_channel(channel)
+    def _description(self, *channel_ids: int) -> bytes:
+        channels = [self.channels[number] for number in channel_ids]
+        schemas = [self.schemas[number] for number in dict.fromkeys(it.schema_id for it in channels) if number]
+        return b"".join([*map(records.pack_schema, schemas), *map(records.pack_channel, channels)])
 
     def _close_chunk(self, group: tuple[ChunkKind, str]) -> None:
         self._put(self._open.pop(group))
@@ -344,8 +374,10 @@ def _append(chunk: _OpenChunk, channel_id: int, t_ns: int, record: memoryview) -
     chunk.size += len(record)
 
 
-def _free_id(taken: Mapping[int, object], last: int, what: str) -> int:
-    """The first free id after ``last``, else the lowest free one."""
+def _free_id(taken: Mapping[int, object], last: int, what: str, wanted: int = 0) -> int:
+    """The id that is ``wanted`` if it is free, else the first free one after ``last``, else the lowest free one."""
+    if wanted and wanted not in taken:
+        return wanted
     free = (number for number in chain(range(last + 1, _MAX_ID + 1), range(1, last + 1)) if number not in taken)
     free_id = next(free, None)
     if free_id is None:

@@ -58,7 +58,8 @@ class Provenance:
     ``columns`` are those of a schema of a user's own (see ``schema.own``). ``scores`` say what scores of its input were
     taken for where these are no likelihoods: by the name of a class, SCORE:LIKELIHOOD of points with straight lines
     between them. ``boxes`` say how boxes of other software in its input were read: their clock, classes, scale and
-    fields, and what a user chose.
+    fields, and what a user chose. ``cut`` says which part of a longer channel it is: from ``start_ns`` until before
+    ``end_ns``, as far as that is shorter, with the ``digest`` of the whole.
     """
 
     transform: str
@@ -81,6 +82,7 @@ class Provenance:
     columns: str = ""
     boxes: Mapping[str, str] = field(default_factory=dict)
     scores: Mapping[str, str] = field(default_factory=dict)
+    cut: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def written_by(self) -> str:
@@ -124,8 +126,20 @@ class Provenance:
             "continued": json.dumps(dict(self.continued), sort_keys=True),
             "scores": json.dumps(dict(self.scores), ensure_ascii=False),
             "boxes": json.dumps(dict(self.boxes), sort_keys=True),
+            "cut": json.dumps(dict(self.cut), sort_keys=True),
         }
-        names = ("scores", "boxes", "continued", "warnings", "references", "plugins", "classes", "zones", "model")
+        names = (
+            "cut",
+            "scores",
+            "boxes",
+            "continued",
+            "warnings",
+            "references",
+            "plugins",
+            "classes",
+            "zones",
+            "model",
+        )
         for name in names:
             if not getattr(self, name):
                 del values[name]
@@ -138,14 +152,13 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        names = ("classes", "zones", "model", "continued", "scores", "boxes")
-        classes, zones, model, continued, scores, boxes = (read_texts(values.pop(key, "")) for key in names)
+        names = ("classes", "zones", "model", "continued", "scores", "boxes", "cut")
+        texts = {key: read_texts(values.pop(key, "")) for key in names}
         plugins = _plugins(values)
         warnings = [warning for warning in _read(values.pop("warnings", ""), list) if _is_warning(warning)]
         fields: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
-        fields |= {"references": references, "warnings": warnings, "plugins": plugins, "classes": classes}
-        fields |= {"zones": zones, "continued": continued, "scores": scores, "boxes": boxes}
-        return cls(parameters=parameters, model=model, **fields)
+        fields |= {"references": references, "warnings": warnings, "plugins": plugins, **texts}
+        return cls(parameters=parameters, **fields)
 
 
 def input_of(metadata: Mapping[str, str]) -> str:

@@ -460,7 +460,7 @@ TRANSFORMS_READ: Final = (
     "foxglove.FrameTransforms",
 )
 #: The end of topics where a transform holds until the next one.
-_LATCHED: Final = "tf_static"
+LATCHED: Final = "tf_static"
 
 
 class _Transforms(NamedTuple):
@@ -551,7 +551,7 @@ def _read(opened: log.Log) -> FramesRead:
         problems += [str(unread)] if str(unread) else []
         for which, read in parts:
             names = zip(read.parent, read.child, strict=True)
-            of_edge += [edges.setdefault((*pair, topic.endswith(_LATCHED)), len(edges)) for pair in names]
+            of_edge += [edges.setdefault((*pair, topic.endswith(LATCHED)), len(edges)) for pair in names]
             times = log_ns[which[read.message]]
             samples.append(PoseSamples(read.stamp_ns, times, read.translation, read.quaternion))
     if not edges:
@@ -580,6 +580,12 @@ def _transforms(messages: Things) -> _Transforms:
     shift[~each.is_set((*at, "translation"))] = 0.0
     turn[~each.is_set((*at, "rotation"))] = [0.0, 0.0, 0.0, 1.0]
     return _Transforms(owner, parent, each.texts(("child_frame_id",)), stamp_ns, shift, turn)
+
+
+def edges_of(message: Any) -> tuple[tuple[str, str], ...]:
+    """The frames that the transforms of a decoded message lead from and to, sorted."""
+    read = _transforms(Things([message]))
+    return tuple(sorted(zip(read.parent, read.child, strict=True)))
 
 
 def holds_boxes_3d(opened: log.Log, topic: str) -> bool:

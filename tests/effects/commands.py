@@ -276,6 +276,17 @@ CASES: dict[str, dict[str, Case]] = {
     ),
     "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
     "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o fresh.mcap", "--force")),
+    "cut": common(
+        "cut a.mcap -o b.mcap",
+        output=("cut a.mcap", "-o c.mcap"),
+        start_s="--start-s 1",
+        end_s="--end-s 1",
+        around="--around 1",
+        margin_s=("cut a.mcap -o b.mcap --around 1", "--margin-s 0.1"),
+        topic="--topic /camera/video",
+        exclude="--exclude /camera/video",
+        force=("cut a.mcap -o fresh.mcap", "--force"),
+    ),
     "drop": common(
         "drop a.mcap /camera/retracks",
         output="-o b.mcap",
