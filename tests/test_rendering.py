@@ -20,7 +20,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.rendering import RenderOptions, draw, render
+from mcaptrack.viewing.painting import draw
+from mcaptrack.viewing.rendering import RenderOptions, render
 from tests.commands import call, printed
 from tests.robots import write_log
 

@@ -183,7 +183,9 @@ class LogServer:
         self.links = links_to(first, contents.at_ns)
         self.events = tuple(
             event._replace(
-                link=links_to(self.layouts.get(event.layout, first), event.opens_ns(contents.start_ns))["Lichtblick"]
+                link=links_to(self.layouts.get(links.EVENT_LAYOUT, first), event.opens_ns(contents.start_ns))[
+                    "Lichtblick"
+                ]
             )
             for event in contents.events
         )

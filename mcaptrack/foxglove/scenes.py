@@ -29,6 +29,7 @@ from mcaptrack.foxglove.annotations import (
     short,
 )
 from mcaptrack.foxglove.messages import SCENE, message_class
+from mcaptrack.foxglove.palette import legible
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 
@@ -111,15 +112,16 @@ class SceneMessages(StampedMessages):
             self._add(
                 frame[chosen], template, entity_id=texts, label=texts, x=xy[chosen, 0], y=xy[chosen, 1],
                 text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen], a=alpha[chosen],
-                **_shades("", rgb[chosen]), **_shades("text_", rgb[chosen]), **_line(trail[chosen], rgb[chosen], fade),
+                **_shades("", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
+                **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
     def boxes(
-        self, frame: Ints, labels: NDArray[Any], boxes: Cuboids, rgb: Floats, alpha: Floats, label_rgb: Floats,
-        marker: CuboidMarker, trail_m: Floats, fade: Floats, line: PersonMarker,
+        self, frame: Ints, labels: NDArray[Any], boxes: Cuboids, rgb: Floats, alpha: Floats, marker: CuboidMarker,
+        trail_m: Floats, fade: Floats, line: PersonMarker,
     ) -> None:  # fmt: skip
         """Draw boxes of N objects in colours (N, 3), a line that leads ahead from the middle of each top, and labels
-        and trails through points (N, P, 3), as ``people`` does, in colours ``label_rgb`` (N, 3).
+        and trails through points (N, P, 3), as ``people`` does.
         """
         base, (length_m, width_m, height_m) = boxes.base_m(), boxes.size_m.T
         size = _short(np.stack([length_m, width_m, np.maximum((marker.top - marker.bottom) * height_m, _SLAB_M)], -1))
@@ -139,8 +141,8 @@ class SceneMessages(StampedMessages):
             self._add(
                 frame[chosen], template, entity_id=texts, label=texts, a=alpha[chosen], **place, **above, **extent,
                 **front, **_turned(boxes.heading_rad[chosen]), **_shades("", rgb[chosen]),
-                **_shades("ahead_", rgb[chosen]), **_shades("text_", label_rgb[chosen]),
-                **_line(trail[chosen], label_rgb[chosen], fade),
+                **_shades("ahead_", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
+                **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
     def forecasts(
@@ -308,8 +310,7 @@ def _forecast(
         "size": {"x": Slot("wide"), "y": Slot("deep"), "z": 0.01},
         "bottom_scale": 1.0,
         "top_scale": 1.0,
-        # Ellipses are large, those of vehicles more so, and many lie over one another.
-        "color": {**paint(), "a": 0.0625 if is_high else 0.125},
+        "color": {**paint(), "a": 0.125},  # many lie over one another
     }
     lines, discs = _lines(points, thickness_px, is_high=is_high), [disc] if has_ellipse else []
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=discs, lines=lines)

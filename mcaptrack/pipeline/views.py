@@ -38,6 +38,7 @@ from mcaptrack.pipeline.drawing import (
     recorded_drawings,
     recorded_sources,
     robot_frame,
+    robot_topic,
 )
 from mcaptrack.pipeline.motion import path_with
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock, scene_on_pictures
@@ -146,6 +147,9 @@ class _Work:
         self.calibrated = calibrated_cameras(opened, solid_in) if solid_in and self.tree else {}
         self.scene = scene_on_pictures(state)
         self.frames = new_frames(prefix, shown, self.tree.frames() if self.tree else ())
+        inputs = [channel.provenance.input for channel in state.results.values()]
+        self.sources = recorded_sources(opened, [*camera.topics, *inputs])
+        self.robot = robot_frame(opened, self.sources, self.tree, self.frame_id) if self.tree and self.frame_id else ""
         self.seen_on = (*self.calibrated, *(seen.pictures for seen in self.scene.cameras))
         self.start_ns = _start_ns(opened, camera, shown, self.clock)
         of_shown = self._outdated()
@@ -160,7 +164,8 @@ class _Work:
         topics |= {topic + views.SUFFIX + pictures for topic in self.shown for pictures in self.seen_on}
         on_others = tuple(f"{topic}{views.SUFFIX}/" for topic in self.shown)
         topics |= {view for view in self.state.opened.channels if view.startswith(on_others)}
-        return topics | ({frame_topic(self.state.prefix)} if self.frames else set())
+        topics |= {frame_topic(self.state.prefix)} if self.frames else set()
+        return topics | ({robot_topic(self.state.prefix)} if self.robot else set())
 
     def views(self) -> tuple[list[View], list[View]]:
         """Return the views of channels that stay as they are, and of those of this run.
@@ -168,7 +173,7 @@ class _Work:
         The former come first, so that channels that are made again keep their place, and the log its bytes.
         """
         factory = ViewFactory(
-            self.state.prefix, self.clock.t_ns, self.clock.stamp_ns, self.planes, self.path, self.frames,
+            self.state.prefix, self.clock.t_ns, self.clock.stamp_ns, self.planes, self.path, self.frames, self.robot,
             self.calibrated, self.scene,
         )  # fmt: skip
         first, last = (
@@ -184,10 +189,8 @@ class _Work:
         opened, prefix, results, gone = self.state
         current = _Current(self.state, {**self.shown, **{topic: _nothing(opened, topic) for topic in gone}})
         topics = {*opened.channels} - self.outdated - gone | {*results} | drawn.topics
-        inputs = [channel.provenance.input for channel in results.values()]
-        sources = recorded_sources(opened, [*self.camera.topics, *inputs])
-        by_viewers = recorded_drawings(opened, sources) if self.frame_id else {}
-        by_viewers |= {name: True for source in sources if (name := source + views.SCENE_SUFFIX) in topics}
+        by_viewers = recorded_drawings(opened, self.sources) if self.frame_id else {}
+        by_viewers |= {name: True for source in self.sources if (name := source + views.SCENE_SUFFIX) in topics}
         eye = layouts.eye_on(current.positions(), self.planes, self.start_ns)
         return layouts.CameraChannels(
             prefix,
@@ -197,7 +200,7 @@ class _Work:
             eye._replace(z_m=current.floor_m() if self.frame_id else 0.0),
             current.last_step(),
             current.is_truth_known(),
-            robot_frame(opened, sources, self.tree, self.frame_id) if self.tree and self.frame_id else "",
+            self.robot,
             by_viewers,
             self.seen_on,
             highest_values(prefix, current.frames),
