@@ -310,7 +310,7 @@ def _dashed(xy_px: Floats, dashes: int) -> Floats:
     """The ends (N, 2 P dashes, 2) of the dashes of closed lines through points (N, P, 2)."""
     share = np.arange(2 * dashes) / (2 * dashes - 1)
     sides = np.roll(xy_px, -1, axis=1) - xy_px
-    return (xy_px[:, :, None] + share[:, None] * sides[:, :, None]).reshape(len(xy_px), -1, 2)
+    return (xy_px[:, :, None] + share[:, None] * sides[:, :, None]).reshape(len(xy_px), 2 * dashes * xy_px.shape[1], 2)
 
 
 def _template(content: dict[str, Any]) -> Template:

@@ -96,9 +96,10 @@ class SceneMessages(StampedMessages):
 
     def people(
         self, frame: Ints, labels: NDArray[Any], xy_m: Floats, rgb: Floats, alpha: Floats, marker: PersonMarker,
-        trail_m: Floats, fade: Floats, apart_m: Floats,
+        trail_m: Floats, fade: Floats, apart_m: Floats, sign: str = "",
     ) -> None:  # fmt: skip
-        """Draw people at (N, 2) with labels (N,), numbers or texts, and a trail through points (N, P, 2), oldest first.
+        """Draw people at (N, 2) with labels (N,), numbers or texts behind a sign, and a trail through points (N, P, 2),
+        oldest first.
 
         ``apart_m`` (N,) is how much farther from the ground labels stand than usual.
 
@@ -108,17 +109,17 @@ class SceneMessages(StampedMessages):
         xy, trail = _short(xy_m), _short(trail_m)
         text_z = marker.number_m + np.sign(marker.number_m) * _short(apart_m)
         for length, chosen, texts in by_length(labels):
-            template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1])
+            template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1], len(sign))
             self._add(
-                frame[chosen], template, entity_id=texts, label=texts, x=xy[chosen, 0], y=xy[chosen, 1],
-                text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen], a=alpha[chosen],
+                frame[chosen], template, entity_id=texts, label=np.char.add(sign.encode(), texts),
+                x=xy[chosen, 0], y=xy[chosen, 1], text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen], a=alpha[chosen],
                 **_shades("", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
                 **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
     def boxes(
         self, frame: Ints, labels: NDArray[Any], boxes: Cuboids, rgb: Floats, alpha: Floats, marker: CuboidMarker,
-        trail_m: Floats, fade: Floats, line: PersonMarker,
+        trail_m: Floats, fade: Floats, line: PersonMarker, sign: str = "",
     ) -> None:  # fmt: skip
         """Draw boxes of N objects in colours (N, 3), a line that leads ahead from the middle of each top, and labels
         and trails through points (N, P, 3), as ``people`` does.
@@ -133,13 +134,14 @@ class SceneMessages(StampedMessages):
         ahead[:, 1, :2] += _AHEAD * length_m[:, None] * heading
         trail, ahead = _short(trail_m), _short(ahead)
         for length, chosen, texts in by_length(labels):
-            template = _box(self._frame_id, self._lifetime_ns, length, line, trail.shape[1])
+            template = _box(self._frame_id, self._lifetime_ns, length, line, trail.shape[1], len(sign))
             place = {name: middle[chosen, axis] for axis, name in enumerate("xyz")}
             above = {"text_x": place["x"], "text_y": place["y"], "text_z": _short((base + over)[chosen])}
             extent = {name: size[chosen, axis] for axis, name in enumerate(("long", "wide", "high"))}
             front = {f"ahead__{name}": ahead[chosen, :, axis] for axis, name in enumerate("xyz")}
             self._add(
-                frame[chosen], template, entity_id=texts, label=texts, a=alpha[chosen], **place, **above, **extent,
+                frame[chosen], template, entity_id=texts, label=np.char.add(sign.encode(), texts), a=alpha[chosen],
+                **place, **above, **extent,
                 **front, **_turned(boxes.heading_rad[chosen]), **_shades("", rgb[chosen]),
                 **_shades("ahead_", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
                 **_line(trail[chosen], rgb[chosen], fade),
@@ -259,7 +261,7 @@ def _each(name: str, count: int, axes: str) -> Each:
 
 
 @cache
-def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, points: int) -> Template:
+def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, points: int, more: int) -> Template:
     body = {
         "pose": {"position": {"x": Slot("x"), "y": Slot("y"), "z": marker.height_m / 2}, "orientation": _UPRIGHT},
         "size": {"x": marker.width_m, "y": marker.width_m, "z": marker.height_m},
@@ -267,7 +269,7 @@ def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, 
         "top_scale": 1.0,
         "color": paint(),
     }
-    name = _label(length, Slot("text_z"))
+    name = _label(length + more, Slot("text_z"))
     lines = _lines(points, marker.thickness_px, marker.in_pieces)
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=[body], texts=[name], lines=lines)
 
@@ -285,7 +287,7 @@ def _label(length: int, height: float | Slot) -> dict[str, Any]:
 
 
 @cache
-def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, points: int) -> Template:
+def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, points: int, more: int) -> Template:
     turn = {"z": Slot("turn_z"), "w": Slot("turn_w")}
     body = {
         "pose": {"position": {name: Slot(name) for name in "xyz"}, "orientation": turn},
@@ -294,7 +296,7 @@ def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, point
     }
     ahead = _one_line(_LINE_STRIP, 2.0, _each("ahead", 2, "xyz"), {**paint("ahead_"), "a": 1.0})
     lines = [ahead, *_lines(points, line.thickness_px, line.in_pieces, is_high=True)]
-    name = _label(length, Slot("text_z"))
+    name = _label(length + more, Slot("text_z"))
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cubes=[body], texts=[name], lines=lines)
 
 

@@ -22,7 +22,7 @@ _LEAST_PX: Final = 240
 #: The height of text as a part of the width of the strip; the other sizes in heights of text.
 _TEXT: Final = 1 / 45
 _HIGH, _GAP, _SAMPLE = 2.0, 0.6, 1.6
-_FORECAST, _UNSEEN = f"forecast, ellipse of {styles.LIKELY:.0%}", "not seen"
+_FORECAST, _UNSEEN = f"forecast, ellipse of {100 * styles.LIKELY:.0f} %", "not seen"
 #: The id with the colour of samples, and the picture that they are on.
 _ID, _FIRST = np.array([1]), np.zeros(1, np.int64)
 

@@ -92,7 +92,6 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle) -
         longest = lines.row.shape[1] - 1
         rgb, strength = style.colours(people.number), styles.opacity(people.observed)
         alpha, body_alpha = 0.875 * strength, 0.625 * strength
-        labels = people.label if not style.sign else np.strings.add(style.sign, people.label.astype(str))
         places = np.column_stack([people.at_m, people.body.base_m()])
         apart_m = np.zeros(len(people.number))
         apart_m[placed] = label_places.heights(t_ns, people.frame[placed], people.number[placed], people.at_m[placed])
@@ -104,16 +103,17 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle) -
                 opacity = styles.fade(points, longest + 1)
                 if style.marker.in_pieces:
                     trail, opacity = segments(trail, style.trail), np.repeat(opacity[1:], 2)
-                frame, label = people.frame[these] - span.start, labels[these]
+                frame, label = people.frame[these] - span.start, people.label[these]
                 if is_solid:
                     boxes = people.body.chosen(these)
                     scene.boxes(
                         frame, label, boxes, rgb[these], body_alpha[these], style.box, trail, opacity, style.marker,
+                        style.sign,
                     )  # fmt: skip
                 else:
                     scene.people(
                         frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity,
-                        apart_m[these],
+                        apart_m[these], style.sign,
                     )  # fmt: skip
             yield from instants.numbered(span, scene)
 

@@ -234,7 +234,8 @@ def clipped(rings: Floats, size: Floats) -> Iterator[tuple[Ints, Floats]]:
         with np.errstate(divide="ignore", invalid="ignore"):
             cut = points + (depth / (depth - depth_after))[..., None] * (following - points)
         kept = np.stack([is_in, is_in != is_in_after], axis=2) & (slot < count[:, None])[..., None]
-        both, kept = np.stack([points, cut], axis=2).reshape(len(points), -1, 2), kept.reshape(len(points), -1)
+        both = np.stack([points, cut], axis=2).reshape(len(points), 2 * len(slot), 2)
+        kept = kept.reshape(len(points), 2 * len(slot))
         count = kept.sum(axis=1)
         order = np.argsort(~kept, axis=1, kind="stable")[:, : count.max(initial=0)]
         points = np.take_along_axis(both, order[..., None], axis=1)

@@ -51,7 +51,7 @@ _CAMERA: Final = {
 #: Grids have cells of 1 m, or of 10 m if there would be more cells than this.
 _MOST_CELLS: Final = 100
 #: Grids are as wide as this part of the distance of the camera; their lines are faint, so that tracks stand out.
-_GRID_SHARE: Final = 0.8
+_GRID_SHARE: Final = 1.4
 _GRID_COLOUR: Final = "#8080a028"
 #: The width of the legend in px, beside the curves, which it would hide otherwise; thickness of curves of means, and of
 #: those of ends.
