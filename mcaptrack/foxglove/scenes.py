@@ -112,7 +112,8 @@ class SceneMessages(StampedMessages):
             template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1], len(sign))
             self._add(
                 frame[chosen], template, entity_id=texts, label=np.char.add(sign.encode(), texts),
-                x=xy[chosen, 0], y=xy[chosen, 1], text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen], a=alpha[chosen],
+                x=xy[chosen, 0], y=xy[chosen, 1], a=alpha[chosen],
+                text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen],
                 **_shades("", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
                 **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
