@@ -202,7 +202,7 @@ def test_layouts_name_only_what_there_is(text, pictures):
     names = {name for name, *_ in parts} | {f"{name}/view/{kind}" for name, _, kind in parts if kind}
     if pictures is None:
         names = {name for name in names if not name.endswith("/view/image")}
-    made = make(CameraChannels("/c", frozenset(names), pictures, "c/ground", EYE, 12))
+    made = make(CameraChannels("/c", frozenset(names), pictures, "c/ground", EYE))
     assert bool(made) == any(name.endswith(("/view/image", "/view/scene")) for name in names)
     for content in made.values():
         layout = json.loads(content)

@@ -58,7 +58,7 @@ from mcaptrack.schema import (
 )
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.encodings import PROTOBUF
-from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned, unique_values
+from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import tracks_topic
@@ -198,7 +198,6 @@ class _Work:
             self.clock.topic,
             self.frame_id or views.ground.frame_of(prefix),
             eye._replace(z_m=current.floor_m() if self.frame_id else 0.0),
-            current.last_step(),
             current.is_truth_known(),
             self.robot,
             by_viewers,
@@ -324,14 +323,6 @@ class _Current:
     def _each(self, schema: Schema, *names: str) -> Iterator[Sequence[Frame]]:
         """Yield the frames of channels, by the ends of their topics."""
         return (self.frames(f"{self.state.prefix}/{name}", schema) for name in names)
-
-    def last_step(self) -> int:
-        """Return the horizon of forecasts as a number of steps; 0 if there are no forecasts."""
-        for frames in self._each(PREDICTIONS, "retracks/predictions", "predictions"):
-            steps = unique_values(PREDICTIONS, frames, "step")
-            if len(steps):
-                return int(steps[-1])
-        return 0
 
     def is_truth_known(self) -> bool:
         """Return whether any forecast is compared with the ground truth."""

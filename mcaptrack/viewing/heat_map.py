@@ -166,15 +166,7 @@ class Occupancy(NamedTuple):
         return self.low_m[0] + columns * self.cell_m, self.low_m[1] + rows * self.cell_m
 
 
-def occupancy(
-    t_ns: Ints,
-    track_id: NDArray[Any],
-    xy_m: Floats,
-    *,
-    cell_m: float | None = None,
-    span_m: tuple[float, float, float, float] | None = None,
-    max_gap_s: float = MAX_GAP_S,
-) -> Occupancy:
+def occupancy(t_ns: Ints, track_id: NDArray[Any], xy_m: Floats) -> Occupancy:
     """Count the person-seconds in each cell of the ground.
 
     People move evenly from one position of their track to the next. So the sum over all cells, and outside, is the
@@ -187,18 +179,12 @@ def occupancy(
     track_id : (N,) of int
     xy_m : (N, 2) of float64
         Positions; rows that are not finite are left out.
-    cell_m : float, optional
-        The side of a cell; by default 0.5 m, and as much more as large places need.
-    span_m : tuple of float, optional
-        Lowest and highest x, lowest and highest y of the grid, which is extended to whole cells. By default all
-        places but those where less than 0.2 % of the time is spent at either end of an axis.
-    max_gap_s : float
-        Longer gaps of a track count for nothing.
 
     Returns
     -------
     Occupancy
-        An empty grid (0, 0) if no track has two positions.
+        All places but those where less than 0.2 % of the time is spent at either end of an axis; an empty grid (0, 0)
+        if no track has two positions. Cells have 0.5 m, and as much more as large places need.
 
     Examples
     --------
@@ -208,20 +194,14 @@ def occupancy(
     >>> heat.person_s.tolist()
     [[1.25, 0.5, 0.25]]
     """
-    start_m, step_m, seconds = _steps(t_ns, track_id, xy_m, seconds_to_ns(max_gap_s))
-    if span_m is None:
-        if not len(seconds):
-            return Occupancy(np.zeros((0, 0)), (0.0, 0.0), cell_m or _CELL_M, 0.0)
-        ends, weight = np.concatenate([start_m, start_m + step_m]), np.tile(seconds, 2)
-        low, high = (_weighted(ends, weight, share) for share in (_BEYOND, 1 - _BEYOND))
-        cell = cell_m or _cell_of(float((high - low).max()))
-        last = np.floor(high / cell).astype(np.int64)
-    else:
-        low, high = np.array([span_m[0], span_m[2]], np.float64), np.array([span_m[1], span_m[3]], np.float64)
-        cell = cell_m or _cell_of(float((high - low).max()))
-        last = np.ceil(high / cell).astype(np.int64) - 1
+    start_m, step_m, seconds = _steps(t_ns, track_id, xy_m, seconds_to_ns(MAX_GAP_S))
+    if not len(seconds):
+        return Occupancy(np.zeros((0, 0)), (0.0, 0.0), _CELL_M, 0.0)
+    ends, weight = np.concatenate([start_m, start_m + step_m]), np.tile(seconds, 2)
+    low, high = (_weighted(ends, weight, share) for share in (_BEYOND, 1 - _BEYOND))
+    cell = _cell_of(float((high - low).max()))
     first = np.floor(low / cell).astype(np.int64)
-    count = np.maximum(last - first + 1, 1)
+    count = np.floor(high / cell).astype(np.int64) - first + 1
     grid, outside = np.zeros(int(count.prod())), 0.0
     pieces = np.clip(np.ceil(8 * np.abs(step_m).max(axis=1, initial=0.0) / cell), 1, _MOST_PIECES).astype(np.int64)
     for part in _parts(pieces):

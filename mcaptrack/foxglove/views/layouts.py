@@ -225,8 +225,7 @@ def _mosaic(tree: Tree) -> str | dict[str, Any]:
 
 class CameraChannels(NamedTuple):
     """The channels of a camera: the names of its topics below the prefix, the topic of pictures, the coordinate frame
-    and the view of the ground, the number of steps of forecasts, and whether their errors against ground truth are
-    known.
+    and the view of the ground, and whether errors of forecasts against ground truth are known.
 
     ``follow`` is the frame of the robot that recorded 3D boxes; ``recorded`` are topics that viewers draw in 3D
     themselves, and whether they are these boxes; ``seen_by`` are the topics of the pictures that boxes are drawn on.
@@ -238,7 +237,6 @@ class CameraChannels(NamedTuple):
     pictures: str | None
     frame_id: str
     eye: Eye
-    last_step: int
     is_truth_known: bool = False
     follow: str = ""
     recorded: Mapping[str, bool] = {}
@@ -335,28 +333,24 @@ def _predictions(camera: CameraChannels) -> bytes:
     past = "retracks/full" if future.startswith("retracks") else "tracks"
     on = [future, past, "truth"]
     panels: dict[str, Any] = {}
-    panels["Plot!spread"] = _spread(camera, future)
     events = "retracks" if future.startswith("retracks") else "tracks"
     left = [*_pictures(camera, panels, "Forecasts", on), *_errors(camera, panels)]
-    right = [*_ground(camera, panels, "ground", "Forecasts on the ground", on)]
-    beside = _events(camera, panels, "Tracking", (events,))
-    right.append(("row", "Plot!spread", beside[0], 60.0) if beside else "Plot!spread")
+    beside = [*_spread(camera, panels, future), *_events(camera, panels, "Tracking", (events,))]
+    right = _ground(camera, panels, "ground", "Forecasts on the ground", on) + ([split(beside)] if beside else [])
     return layout(panels, _columns(left, right, 50.0))
 
 
-def _spread(camera: CameraChannels, future: str) -> dict[str, Any]:
-    """The spread of forecasts: mean and 90th percentile of each frame, or the variances of all people."""
+def _spread(camera: CameraChannels, panels: dict[str, Any], future: str) -> list[Tree]:
+    """The spread of forecasts: mean and 90th percentile of each frame."""
     source, colour = f"{camera.prefix}/{future}", (RETRACKED if future.startswith("retracks") else TRACKED).curve
-    if SPREAD in camera.highest:
-        paths = {
-            f"{source}/scores.rows[:].spread_mean_m": Curve("mean (m)", colour),
-            f"{source}/scores.rows[:].spread_90_m": Curve("90 % (m)", colour, _THICK),
-        }
-        return plot_panel("Radius that holds 95 %", paths, limit_of(camera.highest[SPREAD]))
-    last = f"{source}.rows[:]{{step=={camera.last_step}}}"
-    axes = (("xx", _THIN), ("yy", _THICK))
-    paths = {f"{last}.cov_{axis}_m2": Curve(f"{axis[0]} variance (m2)", colour, px) for axis, px in axes}
-    return plot_panel("Uncertainty of forecasts", paths)
+    if SPREAD not in camera.highest:
+        return []
+    paths = {
+        f"{source}/scores.rows[:].spread_mean_m": Curve("mean (m)", colour),
+        f"{source}/scores.rows[:].spread_90_m": Curve("90 % (m)", colour, _THICK),
+    }
+    panels["Plot!spread"] = plot_panel("Radius that holds 95 %", paths, limit_of(camera.highest[SPREAD]))
+    return ["Plot!spread"]
 
 
 def limit_of(highest: float | None, is_count: bool = False) -> float | None:
@@ -424,25 +418,19 @@ def _recorded(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
 
 
 def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
-    """The number of people, or of objects, if it is counted; otherwise their positions."""
-    of_name = {name: kind for kind in KINDS for name in reversed(kind.names)}
+    """The number of people, or of objects, if it is counted."""
     counted = {
         f"{camera.prefix}/{name}/counts.rows[:].tracked": Curve(kind.title, kind.curve)
-        for name, kind in of_name.items()
+        for kind in KINDS
+        for name in reversed(kind.names)
         if f"{name}/counts" in camera.names
     }
-    places = {
-        f"{camera.prefix}/{name}.rows[:].x_m": Curve(f"{kind.title}, x (m)", kind.curve)
-        for name, kind in of_name.items()
-        if name in camera.names and name != RETRACKED.names[0]
-    }
-    if counted and "truth" in camera.names:
-        counted[next(iter(counted)).replace(".tracked", ".people")] = Curve(GROUND_TRUTH.title, GROUND_TRUTH.curve)
-    if not counted and not places:
+    if not counted:
         return []
-    title = ("Objects" if camera.recorded else "People") if counted else "Places"
-    most = limit_of(camera.highest.get(PEOPLE), is_count=True) if counted else None
-    panels["Plot!people"] = plot_panel(title, counted or places, most)
+    if "truth" in camera.names:
+        counted[next(iter(counted)).replace(".tracked", ".people")] = Curve(GROUND_TRUTH.title, GROUND_TRUTH.curve)
+    title, most = "Objects" if camera.recorded else "People", camera.highest.get(PEOPLE)
+    panels["Plot!people"] = plot_panel(title, counted, limit_of(most, is_count=True))
     return ["Plot!people"]
 
 
