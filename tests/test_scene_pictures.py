@@ -22,6 +22,7 @@ from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, Frame
 from mcaptrack.sources.demo import PLACES, Pedestrian, Pose, SyntheticScene, three_cameras
 from mcaptrack.sources.video import write_mp4
 from mcaptrack.transforms.fuse import CameraView
+from mcaptrack.viewing.links import find_moments
 from tests.commands import done
 
 FPS, NS = 2, 1_000_000_000
@@ -133,6 +134,9 @@ def test_layouts_and_videos_show_the_scene_on_the_pictures(path: Path, tmp_path:
     for panel in panels:
         assert f"/world/retracks/full/view/image{panel['imageTopic']}" in panel["annotations"]
     with log.read(path) as opened, collected() as warnings:
+        # What links open has the ids of the scene, as the pictures have.
+        assert "/left/tracks/events" in opened.channels
+        assert all(moment.topic.startswith("/world/") for moment in find_moments(opened))
         views, pictures = pipeline.find_views(opened, "/right")
     assert (pictures, views[0]) == ("/right/video", "/world/retracks/full/view/image/right/video")
     assert "drawing the tracks of /world on /right/video; `topic=` names those of /right" in warnings[0].message
