@@ -183,12 +183,17 @@ def predictions(
                     line = segments(_moved(seen.path_px[ok], then_ns[ok], now_ns[ok], path))
                     weaker = styles.fade_ahead(line.shape[1] // 2)
                     drawn.pairs(frame[ok], line, seen.rgb[ok], weaker, styles.FORECAST_LINE * line_px)
-                ok = np.flatnonzero(seen.has_ellipse)
-                around_px = _moved(seen.ellipse_px[ok], then_ns[ok], now_ns[ok], path)
+                known = np.flatnonzero(seen.has_ellipse)
+                around_px = _moved(seen.ellipse_px[known], then_ns[known], now_ns[known], path)
                 for of, ring in clipped(around_px, size):
                     alpha = np.full(len(of), styles.ELLIPSE_ALPHA)
                     drawn.loops(
-                        frame[ok[of]], ring, seen.rgb[ok[of]], alpha, styles.ELLIPSE_LINE * line_px, styles.ELLIPSE_FILL
+                        frame[known[of]],
+                        ring,
+                        seen.rgb[known[of]],
+                        alpha,
+                        styles.ELLIPSE_LINE * line_px,
+                        styles.ELLIPSE_FILL,
                     )
             yield from pictures.numbered(span, drawn)
 
