@@ -138,7 +138,7 @@ def test_without_a_robot_all_places_are_in_the_video(tmp_path):
     assert (result.pictures, result.views) == (16, ("/camera/tracks/view/scene",))
     with av.open(str(tmp_path / "a.gif")) as container:
         image = next(container.decode(video=0)).to_ndarray(format="bgr24").astype(int)
-    bright = np.argwhere(image[:240].min(axis=2) > 120)[:, 1]
+    bright = np.argwhere(image[:240].max(axis=2) > 120)[:, 1]
     assert image.shape[0] > 240  # a legend below
     assert image.shape[1:] == (320, 3)
     assert (bright < 60).any()

@@ -147,9 +147,8 @@ class _Work:
         self.calibrated = calibrated_cameras(opened, solid_in) if solid_in and self.tree else {}
         self.scene = scene_on_pictures(state)
         self.frames = new_frames(prefix, shown, self.tree.frames() if self.tree else ())
-        inputs = [channel.provenance.input for channel in state.results.values()]
-        self.sources = recorded_sources(opened, [*camera.topics, *inputs])
-        self.robot = robot_frame(opened, self.sources, self.tree, self.frame_id) if self.tree and self.frame_id else ""
+        self.sources = self._sources()
+        self.robot = robot_frame(opened, self.sources, self.tree, self.frame_id) if self.tree else ""
         self.seen_on = (*self.calibrated, *(seen.pictures for seen in self.scene.cameras))
         self.start_ns = _start_ns(opened, camera, shown, self.clock)
         of_shown = self._outdated()
@@ -157,6 +156,11 @@ class _Work:
         self.outdated = of_shown - self._recorded
         for topic in sorted(self._recorded):
             warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
+
+    def _sources(self) -> list[str]:
+        """Return the recorded topics that the channels were made from."""
+        inputs = [channel.provenance.input for channel in self.state.results.values()]
+        return recorded_sources(self.state.opened, [*self.camera.topics, *inputs])
 
     def _outdated(self) -> set[str]:
         """Return the topics of all views of these channels."""

@@ -56,7 +56,7 @@ def _legend(views: tuple[str, ...], width_px: int) -> Image | None:
 
 
 def _samples(views: Sequence[str]) -> dict[str, TrackStyle]:
-    """What is drawn in views, by text: the styles of tracks, which forecasts have, too."""
+    """The styles of what is drawn in views, by its text."""
     names = [view.partition("/view/")[0] for view in views]
     tracks = [name for name in names if not name.endswith(("/predictions", "/detections", "/zones", "/boxes"))]
     kinds = {style.title: style for style in map(styles.style_of, tracks)}

@@ -66,7 +66,7 @@ _TRANSFORMS: Final = {"enablePreloading": True, "showLabel": False}
 ROBOT: Final = "robot"
 
 
-class Curve(NamedTuple):
+class PlotCurve(NamedTuple):
     """A curve of a plot: its label, colour and thickness."""
 
     label: str
@@ -156,7 +156,7 @@ def _scene_style(topic: str) -> Config:
     return {"showOutlines": False} if "/predictions/" in topic else {}
 
 
-def plot_panel(title: str, paths: Mapping[str, Curve], most: float | None = None) -> dict[str, Any]:
+def plot_panel(title: str, paths: Mapping[str, PlotCurve], most: float | None = None) -> dict[str, Any]:
     """A plot over time: curves by their message paths. Its axis ends at 0 and ``most``, if that is given.
 
     Without limits, viewers cut lines at the border of the panel.
@@ -346,8 +346,8 @@ def _spread(camera: CameraChannels, panels: dict[str, Any], future: str) -> list
     if SPREAD not in camera.highest:
         return []
     paths = {
-        f"{source}/scores.rows[:].spread_mean_m": Curve("mean (m)", colour),
-        f"{source}/scores.rows[:].spread_90_m": Curve("90 % (m)", colour, _THICK),
+        f"{source}/scores.rows[:].spread_mean_m": PlotCurve("mean (m)", colour),
+        f"{source}/scores.rows[:].spread_90_m": PlotCurve("90 % (m)", colour, _THICK),
     }
     panels["Plot!spread"] = plot_panel("Radius that holds 95 %", paths, limit_of(camera.highest[SPREAD]))
     return ["Plot!spread"]
@@ -367,7 +367,7 @@ def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """Errors of forecasts: against ground truth, or without it against the later tracks."""
     front = "" if camera.is_truth_known else "later_"
     paths = {
-        f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": Curve(
+        f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": PlotCurve(
             f"{measure}, {kind.title}", kind.curve, px
         )
         for measure, px in (("ADE", _THIN), ("FDE", _THICK))
@@ -420,7 +420,7 @@ def _recorded(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
 def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """The number of people, or of objects, if it is counted."""
     counted = {
-        f"{camera.prefix}/{name}/counts.rows[:].tracked": Curve(kind.title, kind.curve)
+        f"{camera.prefix}/{name}/counts.rows[:].tracked": PlotCurve(kind.title, kind.curve)
         for kind in KINDS
         for name in reversed(kind.names)
         if f"{name}/counts" in camera.names
@@ -428,7 +428,7 @@ def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     if not counted:
         return []
     if "truth" in camera.names:
-        counted[next(iter(counted)).replace(".tracked", ".people")] = Curve(GROUND_TRUTH.title, GROUND_TRUTH.curve)
+        counted[next(iter(counted)).replace(".tracked", ".people")] = PlotCurve(GROUND_TRUTH.title, GROUND_TRUTH.curve)
     title, most = "Objects" if camera.recorded else "People", camera.highest.get(PEOPLE)
     panels["Plot!people"] = plot_panel(title, counted, limit_of(most, is_count=True))
     return ["Plot!people"]

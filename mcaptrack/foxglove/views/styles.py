@@ -1,4 +1,4 @@
-"""What is drawn of tracks and forecasts: one declaration for pictures, scenes, layouts, plots and legends.
+"""The styles of tracks and forecasts: one declaration for pictures, scenes, layouts, plots and legends.
 
 Letters: N objects.
 """
