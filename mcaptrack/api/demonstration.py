@@ -22,8 +22,6 @@ from mcaptrack.tables.export import default_folder
 SceneName = Literal["square", "walkers", "crowd", "side-by-side", "standing", "three-cameras"]
 #: Largest distance in metres at which ground truth and a track match in the scores.
 GATE_M: Final = 1.0
-#: Pictures are JPEG of this quality: Lichtblick shows none of a video in every other log that it opens at an event.
-_QUALITY: Final = 50
 
 
 @dataclass(frozen=True)
@@ -129,8 +127,6 @@ def demo(
                 target,
                 ground_plane=footage.ground_plane,
                 truth=footage.ground_truth,
-                image_format="jpeg",
-                quality=_QUALITY,
                 force=force,
                 progress=progress,
             )
@@ -159,14 +155,6 @@ def _several(
     footage, positions = drawing.draw_place(cameras, folder, progress)
     for name, drawn in footage.items():
         where = {"output": target, "force": force} if drawn is next(iter(footage.values())) else {"into": target}
-        ingest(
-            drawn.video,
-            ground_plane=drawn.ground_plane,
-            camera=name,
-            image_format="jpeg",
-            quality=_QUALITY,
-            progress=progress,
-            **where,
-        )
+        ingest(drawn.video, ground_plane=drawn.ground_plane, camera=name, progress=progress, **where)
     ingest(positions, into=target, role="truth", camera="world", frame="map")
     return next(iter(footage.values())), positions
