@@ -292,7 +292,7 @@ def test_labels_name_the_class_where_there_are_several(tmp_path):
     one = two_tracks(tmp_path / "one.mcap", 7, 7, {7: name})
     assert list(texts_of(one, "/camera/tracks/view/scene"))[1] == ["T12", "T3"]
     unnamed = two_tracks(tmp_path / "unnamed.mcap", 0, 9, None)
-    assert list(texts_of(unnamed, "/camera/tracks/view/scene"))[1] == ["12 class 9", "3 unknown"]
+    assert list(texts_of(unnamed, "/camera/tracks/view/scene"))[1] == ["T12 class 9", "T3 unknown"]
 
 
 def supervision(xyxy, **columns):
