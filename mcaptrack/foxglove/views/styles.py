@@ -24,11 +24,11 @@ LIKELY: Final = 0.5
 FORECAST_LINE, ELLIPSE_LINE, ELLIPSE_ALPHA, ELLIPSE_FILL = 1.5, 1.0, 0.5, 0.15
 #: The number of points of an ellipse in pictures.
 ELLIPSE_POINTS: Final = 10
-WHITE: Final = (1.0, 1.0, 1.0)
-GREY: Final = (0.75, 0.75, 0.75)
+WHITE: Final[tuple[float, float, float]] = (1.0, 1.0, 1.0)
+GREY: Final[tuple[float, float, float]] = (0.75, 0.75, 0.75)
 #: The outline of a robot seen from above, in its own frame in m: an arrow ahead.
 ROBOT_M: Final = np.array([[2.0, 0.0], [-2.0, 1.0], [-1.2, 0.0], [-2.0, -1.0]])
-ROBOT_ALPHA: Final = 0.9
+ROBOT_ALPHA: Final[float] = 0.9
 
 
 class TrackStyle(NamedTuple):
