@@ -288,11 +288,11 @@ def texts_of(path, topic):
 def test_labels_name_the_class_where_there_are_several(tmp_path):
     name = "motorcycle with a side car 自転車"
     two = two_tracks(tmp_path / "two.mcap", 1, 7, {7: name})
-    assert list(texts_of(two, "/camera/tracks/view/scene"))[1] == [f"12 {name[:19]}\u2026", "3 person"]
+    assert list(texts_of(two, "/camera/tracks/view/scene"))[1] == [f"T12 {name[:19]}\u2026", "T3 person"]
     one = two_tracks(tmp_path / "one.mcap", 7, 7, {7: name})
-    assert list(texts_of(one, "/camera/tracks/view/scene"))[1] == ["12", "3"]
+    assert list(texts_of(one, "/camera/tracks/view/scene"))[1] == ["T12", "T3"]
     unnamed = two_tracks(tmp_path / "unnamed.mcap", 0, 9, None)
-    assert list(texts_of(unnamed, "/camera/tracks/view/scene"))[1] == ["12 class 9", "3 unknown"]
+    assert list(texts_of(unnamed, "/camera/tracks/view/scene"))[1] == ["T12 class 9", "T3 unknown"]
 
 
 def supervision(xyxy, **columns):

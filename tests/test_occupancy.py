@@ -20,11 +20,10 @@ def test_nothing_is_an_empty_grid():
         assert heat.person_s.shape == (0, 0)
     unknown = np.array([[np.nan, 0.0], [0.0, 0.0], [1.0, np.inf], [0.0, 0.0]])
     assert occupancy(t_ns, ids, unknown).person_s.size == 0
-    assert occupancy(t_ns, ids, unknown, span_m=(0, 4, 0, 2)).person_s.shape == (4, 8)
 
 
-def slowly(t_ns, ids, xy, cell, span, gap_s=2.0):
-    """Step by step, piece by piece; the extent without a span by adding up the time of ends of steps along each axis."""
+def slowly(t_ns, ids, xy, cell, gap_s):
+    """Step by step, piece by piece; the extent by adding up the time of ends of steps along each axis."""
     steps = []
     for one in sorted(set(ids.tolist())):
         mine = sorted((int(t), *at) for t, at in zip(t_ns[ids == one], xy[ids == one].tolist(), strict=True))
@@ -33,10 +32,6 @@ def slowly(t_ns, ids, xy, cell, span, gap_s=2.0):
         ]
     bounds = []
     for axis in (0, 1):
-        if span is not None:
-            low, high = span[2 * axis : 2 * axis + 2]
-            bounds.append((math.floor(low / cell), math.ceil(high / cell) - 1))
-            continue
         ends = sorted((end[1 + axis], (b[0] - a[0]) / S) for a, b in steps for end in (a, b))
         total = np.cumsum([time for _, time in ends])
         place = [
@@ -59,20 +54,18 @@ def slowly(t_ns, ids, xy, cell, span, gap_s=2.0):
     return grid, (x0 * cell, y0 * cell), outside
 
 
-@pytest.mark.parametrize("part", [1 << 18, 40])
-@pytest.mark.parametrize(
-    ("span", "gap_s"), [(None, 2.0), ((-3.0, 4.2, -1.1, 2.0), 2.0), (None, 0.5), ((1.0, 1.0, 1.0, 1.0), 2.0)]
-)
-def test_the_grid_is_that_of_a_slow_count(span, gap_s, part, monkeypatch):
-    monkeypatch.setattr("mcaptrack.viewing.heat_map._PART", part)
+@pytest.mark.parametrize(("part", "gap_s"), [(1 << 18, 2.0), (40, 2.0), (40, 0.5)])
+def test_the_grid_is_that_of_a_slow_count(part, gap_s, monkeypatch):
+    for name, value in {"_PART": part, "_CELL_M": 0.7, "MAX_GAP_S": gap_s}.items():
+        monkeypatch.setattr(f"mcaptrack.viewing.heat_map.{name}", value)
     rng = np.random.default_rng(5)
     count = 120
     ids = rng.integers(0, 5, count)
     t_ns = np.sort(rng.choice(400, count, replace=False)) * (S // 10)
     xy = rng.normal(0, 3, (count, 2))
     xy[7, 0], xy[30] = np.nan, 60.0  # not known, and farther than 64 pieces tell
-    heat = occupancy(t_ns, ids, xy, cell_m=0.7, span_m=span, max_gap_s=gap_s)
-    grid, low_m, outside = slowly(t_ns, ids, xy, 0.7, span, gap_s)
+    heat = occupancy(t_ns, ids, xy)
+    grid, low_m, outside = slowly(t_ns, ids, xy, 0.7, gap_s)
     np.testing.assert_allclose(heat.person_s, grid, atol=1e-9)
     assert heat.low_m == pytest.approx(low_m)
     assert heat.high_m == pytest.approx((low_m[0] + 0.7 * grid.shape[1], low_m[1] + 0.7 * grid.shape[0]))
@@ -81,14 +74,11 @@ def test_the_grid_is_that_of_a_slow_count(span, gap_s, part, monkeypatch):
 
 def test_cells_grow_where_there_would_be_more_than_two_hundred():
     t_ns, ids = np.array([0, 1]) * S, np.array([1, 1])
-    still = np.zeros((2, 2))
     for extent, cell in (
         *((100.0, 0.5), (100.5, 1.0), (200.0, 1.0), (200.5, 2.0), (400.0, 2.0), (401.0, 5.0), (1000.0, 5.0)),
         *((1001.0, 10.0), (2000.0, 10.0), (2001.0, 20.0), (4001.0, 50.0), (10_001.0, 100.0), (1e6, 5000.0)),
     ):
-        assert occupancy(t_ns, ids, still, span_m=(5.0, 5.0 + extent, 0.0, 1.0)).cell_m == cell
-        assert occupancy(t_ns, ids, still, span_m=(0.0, 1.0, -extent, 0.0)).cell_m == cell
-    assert occupancy(t_ns, ids, still, cell_m=3.0, span_m=(0, 9e5, 0, 1)).person_s.shape == (1, 300_000)
-    nothing = occupancy(t_ns[:1], ids[:1], still[:1], cell_m=3.0)
-    assert (nothing.low_m, nothing.high_m, nothing.cell_m, nothing.outside_s) == ((0.0, 0.0), (0.0, 0.0), 3.0, 0.0)
-    assert occupancy(t_ns[:1], ids[:1], still[:1]).cell_m == 0.5
+        for way in ((extent, 1.0), (1.0, -extent)):
+            assert occupancy(t_ns, ids, np.array([(0.0, 0.0), way])).cell_m == cell
+    nothing = occupancy(t_ns[:1], ids[:1], np.zeros((1, 2)))
+    assert (nothing.low_m, nothing.high_m, nothing.cell_m, nothing.outside_s) == ((0.0, 0.0), (0.0, 0.0), 0.5, 0.0)

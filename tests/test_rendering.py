@@ -20,7 +20,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.rendering import RenderOptions, draw, render
+from mcaptrack.viewing.legend import with_legend
+from mcaptrack.viewing.painting import draw
+from mcaptrack.viewing.rendering import RenderOptions, message_at, render
 from tests.commands import call, printed
 from tests.robots import write_log
 
@@ -201,6 +203,31 @@ def test_the_grid_has_round_steps_at_their_multiples(px_per_m, step):
     assert len(east) + len(north) == len(lines) > 2
     np.testing.assert_allclose(np.array(east + north) / step, np.rint(np.array(east + north) / step), atol=1e-9)
     np.testing.assert_allclose(np.diff(east), step)
+
+
+def test_a_legend_says_what_is_drawn_where_it_can_be_read():
+    picture = np.full((90, 480, 3), 100, np.uint8)
+
+    def strip(*names: str) -> np.ndarray:
+        image = with_legend(picture, [f"/c/{name}/view/image" for name in names])
+        assert (image[:90] == picture).all()
+        assert len(image) % 2 == 0
+        return image[90:].astype(int)
+
+    whole, dashed, more = strip("retracks/full"), strip("tracks"), strip("retracks/full", "retracks/predictions")
+    blue, green, red = (np.array(foxglove.colour(1)[2::-1]) * 255).tolist()
+    painted = [(np.abs(image[:, :40] - [blue, green, red]).max(axis=2) < 30).sum() for image in (whole, dashed)]
+    assert painted[0] > 1.3 * painted[1] > 0
+    ends = [np.flatnonzero((image > 60).any(axis=(0, 2))).max() for image in (whole, more)]
+    assert ends[1] > ends[0] + 50
+    assert not len(strip("zones"))
+    assert with_legend(picture[:, :200], ["/c/tracks/view/image"]).shape == (90, 200, 3)
+
+
+def test_scenes_are_shown_until_the_next_is_due_and_drawings_only_on_their_picture():
+    for held, shown in ((0, [None, "a", None, None, "b", None]), (5, [None, "a", "a", None, "b", "b"])):
+        at = message_at(iter([(10, b"a"), (30, b"b")]), bytes.decode, held)
+        assert [at(t_ns) for t_ns in (9, 10, 15, 16, 30, 35)] == shown
 
 
 def test_nothing_is_left_of_a_clip_that_fails(tmp_path):

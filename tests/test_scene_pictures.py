@@ -18,11 +18,15 @@ from mcaptrack.api import demonstration
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.scene_views import PictureClock, SceneCamera, SceneOnPictures
-from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, Frame
+from mcaptrack.pipeline.write import Made
+from mcaptrack.schema import DETECTIONS, EVENTS, SIGHTINGS, TRACKS, EventKind, Frame
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.demo import PLACES, Pedestrian, Pose, SyntheticScene, three_cameras
 from mcaptrack.sources.video import write_mp4
 from mcaptrack.transforms.fuse import CameraView
+from mcaptrack.viewing.links import find_moments
 from tests.commands import done
+from tests.logs import write_with_views
 
 FPS, NS = 2, 1_000_000_000
 #: Coordinates in views are written to a quarter of a pixel.
@@ -138,6 +142,23 @@ def test_layouts_and_videos_show_the_scene_on_the_pictures(path: Path, tmp_path:
     assert "drawing the tracks of /world on /right/video; `topic=` names those of /right" in warnings[0].message
     told = done("render", path, "--camera", "right", "-o", tmp_path / "a.gif", "--width", "64", "--end-s", "0.5").err
     assert "/world/retracks/full/view/image/right/video" in told
+
+
+def test_links_are_to_events_of_the_scene_as_its_ids_are_those_on_the_pictures(path: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "scene.mcap"
+    copy.write_bytes(path.read_bytes())
+    for name in ("left", "world"):
+        switch = EVENTS.rows(
+            kind=[EventKind.SWITCH], track_id=[5], truth_id=[1], previous_id=[2], source_id=[-1], frames=[0]
+        )
+        how = Provenance("events", {}, f"/{name}/tracks")
+        with log.read(copy) as opened:
+            write_with_views(
+                opened, f"/{name}", {f"/{name}/tracks/events": Made.of(EVENTS, [Frame(NS, 1, switch)], how)}
+            )
+    with log.read(copy) as opened:
+        assert {"/left/tracks/events", "/world/tracks/events"} <= set(opened.channels)
+        assert [moment.topic for moment in find_moments(opened)] == ["/world/tracks"]
 
 
 @given(st.tuples(*[st.floats(-50, 50)] * 2, st.floats(-360, 360)), st.lists(st.tuples(*[st.floats(-99, 99)] * 2)))

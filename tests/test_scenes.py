@@ -100,7 +100,7 @@ def test_kinds_of_tracks_differ():
     assert (white.r, white.g, white.b) == (1, 1, 1)
 
 
-def test_forecasts_end_in_ellipses_that_hold_95_percent():
+def test_forecasts_end_in_ellipses_that_hold_half():
     rows = FORECAST.copy()
     turn = np.radians(30)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -113,8 +113,8 @@ def test_forecasts_end_in_ellipses_that_hold_95_percent():
     (disc,), (line,) = entity.cylinders, entity.lines
     assert [(p.x, p.y) for p in line.points] == [(1, 3), (2, 4)]
     assert (disc.pose.position.x, disc.pose.position.y) == (2, 4)
-    assert disc.size.x == pytest.approx(2 * np.sqrt(5.991 * 4), abs=M)
-    assert disc.size.y == pytest.approx(2 * np.sqrt(5.991), abs=M)
+    assert disc.size.x == pytest.approx(2 * np.sqrt(2 * np.log(2) * 4), abs=M)
+    assert disc.size.y == pytest.approx(2 * np.sqrt(2 * np.log(2)), abs=M)
     where = disc.pose.orientation
     assert (where.x, where.y) == (0, 0)
     assert 2 * np.arctan2(where.z, where.w) == pytest.approx(turn, abs=1e-3)
@@ -202,7 +202,7 @@ def test_layouts_name_only_what_there_is(text, pictures):
     names = {name for name, *_ in parts} | {f"{name}/view/{kind}" for name, _, kind in parts if kind}
     if pictures is None:
         names = {name for name in names if not name.endswith("/view/image")}
-    made = make(CameraChannels("/c", frozenset(names), pictures, "c/ground", EYE, 12))
+    made = make(CameraChannels("/c", frozenset(names), pictures, "c/ground", EYE))
     assert bool(made) == any(name.endswith(("/view/image", "/view/scene")) for name in names)
     for content in made.values():
         layout = json.loads(content)

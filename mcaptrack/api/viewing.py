@@ -182,10 +182,9 @@ class LogServer:
             name: links_to(address, contents.at_ns)["Lichtblick"] for name, address in self.layouts.items()
         }
         self.links = links_to(first, contents.at_ns)
+        of_events = self.layouts.get(links.EVENT_LAYOUT, first)
         self.events = tuple(
-            event._replace(
-                link=links_to(self.layouts.get(event.layout, first), event.opens_ns(contents.start_ns))["Lichtblick"]
-            )
+            event._replace(link=links_to(of_events, event.opens_ns(contents.start_ns))["Lichtblick"])
             for event in contents.events
         )
         self.at_s = contents.seconds(contents.at_ns)

@@ -247,15 +247,19 @@ class Annotations(StampedMessages):
         self._add(np.arange(self._count), _head())
 
     def loops(
-        self, frame: Ints, xy_px: Floats, rgb: Floats, alpha: Floats, thickness: float, fill: float = 0.0
-    ) -> None:
-        """Draw closed lines through points (N, P, 2) in colours (N, 3); inside with ``fill`` times their opacity."""
-        count = xy_px.shape[1]
-        more = (
-            {} if not fill else {"fill_r": rgb[:, 0], "fill_g": rgb[:, 1], "fill_b": rgb[:, 2], "fill_a": alpha * fill}
-        )
-        template = _loop(count, thickness, bool(fill))
-        self._draw(frame, template, xy_px, r=rgb[:, 0], g=rgb[:, 1], b=rgb[:, 2], a=alpha, **more)
+        self, frame: Ints, xy_px: Floats, rgb: Floats, alpha: Floats, thickness: float, fill: float = 0.0,
+        dashes: int = 0,
+    ) -> None:  # fmt: skip
+        """Draw closed lines through points (N, P, 2) in colours (N, 3); inside with ``fill`` times their opacity.
+
+        With ``dashes`` each side is so many dashes, of which two are at its ends.
+        """
+        shades = {name: rgb[:, place] for place, name in enumerate("rgb")}
+        more = {f"fill_{name}": values for name, values in (*shades.items(), ("a", alpha * fill))} if fill else {}
+        xy = short(_dashed(xy_px, dashes) if dashes else xy_px, PER_PX)
+        template = _loop(xy.shape[1], thickness, bool(fill), LINE_LIST if dashes else LINE_LOOP)
+        self._add(frame, template, points__x=xy[..., 0], points__y=xy[..., 1], a=alpha, **shades, **more)
+        self._drawn[frame] = True
 
     def pairs(self, frame: Ints, xy_px: Floats, rgb: Floats, alpha: Floats, thickness: float) -> None:
         """Draw lines between pairs of points (N, 2 Q, 2) in colours (N, 3) with opacities (N, Q), or (Q,) for all.
@@ -301,10 +305,12 @@ class Annotations(StampedMessages):
                     whole.append(nested(_POINTS, joined([begin], frame) + content))
             yield b"".join(whole)
 
-    def _draw(self, frame: Ints, template: Template, xy_px: Floats, **columns: Any) -> None:
-        xy = short(xy_px, PER_PX)
-        self._add(frame, template, points__x=xy[..., 0], points__y=xy[..., 1], **columns)
-        self._drawn[frame] = True
+
+def _dashed(xy_px: Floats, dashes: int) -> Floats:
+    """The ends (N, 2 P dashes, 2) of the dashes of closed lines through points (N, P, 2)."""
+    share = np.arange(2 * dashes) / (2 * dashes - 1)
+    sides = np.roll(xy_px, -1, axis=1) - xy_px
+    return (xy_px[:, :, None] + share[:, None] * sides[:, :, None]).reshape(len(xy_px), 2 * dashes * xy_px.shape[1], 2)
 
 
 def _template(content: dict[str, Any]) -> Template:
@@ -340,9 +346,9 @@ def _some_lines(points: int) -> Template:
 
 
 @cache
-def _loop(points: int, thickness: float, filled: bool) -> Template:
+def _loop(points: int, thickness: float, filled: bool, kind: int) -> Template:
     content = {
-        "type": LINE_LOOP,
+        "type": kind,
         "outline_color": paint(),
         "thickness": thickness,
         **({"fill_color": paint("fill_")} if filled else {}),

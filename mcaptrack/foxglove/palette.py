@@ -20,8 +20,10 @@ _HUES: Final = ("E69F00", "56B4E9", "009E73", "F0E442", "0072B2", "D55E00", "CC7
 _SHADES: Final = (1.0, 1.35, 0.7)
 #: The number of colours; identities beyond it repeat them.
 COUNT: Final = len(_HUES) * len(_SHADES)
-#: Colours brighter than this get dark text.
-_LIGHT: Final = 0.55
+#: Colours brighter than this get dark text; text on black is at least so bright.
+_LIGHT, _DIM = 0.55, 0.45
+#: The brightness of red, green and blue.
+_BRIGHTNESS: Final = np.array([0.299, 0.587, 0.114])
 
 
 @cache
@@ -69,5 +71,12 @@ def _table() -> Floats:
 
 def ink(rgb: Floats) -> Floats:
     """The colour of text on colours (N, 3): black on light ones, white on dark ones, (N, 3)."""
-    is_light = rgb @ [0.299, 0.587, 0.114] > _LIGHT
+    is_light = rgb @ _BRIGHTNESS > _LIGHT
     return np.where(is_light[:, None], 0.0, 1.0) * np.ones(3)
+
+
+def legible(rgb: Floats) -> Floats:
+    """Colours (N, 3) as text has them on black: dark ones with as much white as they need."""
+    bright = rgb @ _BRIGHTNESS
+    white = np.clip((_DIM - bright) / np.maximum(1.0 - bright, _DIM), 0.0, 1.0)[:, None]
+    return np.asarray(np.rint((rgb + white * (1.0 - rgb)) * 256) / 256, np.float64)

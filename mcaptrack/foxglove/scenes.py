@@ -29,6 +29,7 @@ from mcaptrack.foxglove.annotations import (
     short,
 )
 from mcaptrack.foxglove.messages import SCENE, message_class
+from mcaptrack.foxglove.palette import legible
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 
@@ -95,9 +96,10 @@ class SceneMessages(StampedMessages):
 
     def people(
         self, frame: Ints, labels: NDArray[Any], xy_m: Floats, rgb: Floats, alpha: Floats, marker: PersonMarker,
-        trail_m: Floats, fade: Floats, apart_m: Floats,
+        trail_m: Floats, fade: Floats, apart_m: Floats, sign: str = "",
     ) -> None:  # fmt: skip
-        """Draw people at (N, 2) with labels (N,), numbers or texts, and a trail through points (N, P, 2), oldest first.
+        """Draw people at (N, 2) with labels (N,), numbers or texts behind a sign, and a trail through points (N, P, 2),
+        oldest first.
 
         ``apart_m`` (N,) is how much farther from the ground labels stand than usual.
 
@@ -107,19 +109,21 @@ class SceneMessages(StampedMessages):
         xy, trail = _short(xy_m), _short(trail_m)
         text_z = marker.number_m + np.sign(marker.number_m) * _short(apart_m)
         for length, chosen, texts in by_length(labels):
-            template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1])
+            template = _person(self._frame_id, self._lifetime_ns, length, marker, trail.shape[1], len(sign))
             self._add(
-                frame[chosen], template, entity_id=texts, label=texts, x=xy[chosen, 0], y=xy[chosen, 1],
-                text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen], a=alpha[chosen],
-                **_shades("", rgb[chosen]), **_shades("text_", rgb[chosen]), **_line(trail[chosen], rgb[chosen], fade),
+                frame[chosen], template, entity_id=texts, label=np.char.add(sign.encode(), texts),
+                x=xy[chosen, 0], y=xy[chosen, 1], a=alpha[chosen],
+                text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen],
+                **_shades("", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
+                **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
     def boxes(
-        self, frame: Ints, labels: NDArray[Any], boxes: Cuboids, rgb: Floats, alpha: Floats, label_rgb: Floats,
-        marker: CuboidMarker, trail_m: Floats, fade: Floats, line: PersonMarker,
+        self, frame: Ints, labels: NDArray[Any], boxes: Cuboids, rgb: Floats, alpha: Floats, marker: CuboidMarker,
+        trail_m: Floats, fade: Floats, line: PersonMarker, sign: str = "",
     ) -> None:  # fmt: skip
         """Draw boxes of N objects in colours (N, 3), a line that leads ahead from the middle of each top, and labels
-        and trails through points (N, P, 3), as ``people`` does, in colours ``label_rgb`` (N, 3).
+        and trails through points (N, P, 3), as ``people`` does.
         """
         base, (length_m, width_m, height_m) = boxes.base_m(), boxes.size_m.T
         size = _short(np.stack([length_m, width_m, np.maximum((marker.top - marker.bottom) * height_m, _SLAB_M)], -1))
@@ -131,16 +135,17 @@ class SceneMessages(StampedMessages):
         ahead[:, 1, :2] += _AHEAD * length_m[:, None] * heading
         trail, ahead = _short(trail_m), _short(ahead)
         for length, chosen, texts in by_length(labels):
-            template = _box(self._frame_id, self._lifetime_ns, length, line, trail.shape[1])
+            template = _box(self._frame_id, self._lifetime_ns, length, line, trail.shape[1], len(sign))
             place = {name: middle[chosen, axis] for axis, name in enumerate("xyz")}
             above = {"text_x": place["x"], "text_y": place["y"], "text_z": _short((base + over)[chosen])}
             extent = {name: size[chosen, axis] for axis, name in enumerate(("long", "wide", "high"))}
             front = {f"ahead__{name}": ahead[chosen, :, axis] for axis, name in enumerate("xyz")}
             self._add(
-                frame[chosen], template, entity_id=texts, label=texts, a=alpha[chosen], **place, **above, **extent,
+                frame[chosen], template, entity_id=texts, label=np.char.add(sign.encode(), texts), a=alpha[chosen],
+                **place, **above, **extent,
                 **front, **_turned(boxes.heading_rad[chosen]), **_shades("", rgb[chosen]),
-                **_shades("ahead_", rgb[chosen]), **_shades("text_", label_rgb[chosen]),
-                **_line(trail[chosen], label_rgb[chosen], fade),
+                **_shades("ahead_", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
+                **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
     def forecasts(
@@ -257,7 +262,7 @@ def _each(name: str, count: int, axes: str) -> Each:
 
 
 @cache
-def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, points: int) -> Template:
+def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, points: int, more: int) -> Template:
     body = {
         "pose": {"position": {"x": Slot("x"), "y": Slot("y"), "z": marker.height_m / 2}, "orientation": _UPRIGHT},
         "size": {"x": marker.width_m, "y": marker.width_m, "z": marker.height_m},
@@ -265,7 +270,7 @@ def _person(frame_id: str, lifetime_ns: int, length: int, marker: PersonMarker, 
         "top_scale": 1.0,
         "color": paint(),
     }
-    name = _label(length, Slot("text_z"))
+    name = _label(length + more, Slot("text_z"))
     lines = _lines(points, marker.thickness_px, marker.in_pieces)
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=[body], texts=[name], lines=lines)
 
@@ -283,7 +288,7 @@ def _label(length: int, height: float | Slot) -> dict[str, Any]:
 
 
 @cache
-def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, points: int) -> Template:
+def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, points: int, more: int) -> Template:
     turn = {"z": Slot("turn_z"), "w": Slot("turn_w")}
     body = {
         "pose": {"position": {name: Slot(name) for name in "xyz"}, "orientation": turn},
@@ -292,7 +297,7 @@ def _box(frame_id: str, lifetime_ns: int, length: int, line: PersonMarker, point
     }
     ahead = _one_line(_LINE_STRIP, 2.0, _each("ahead", 2, "xyz"), {**paint("ahead_"), "a": 1.0})
     lines = [ahead, *_lines(points, line.thickness_px, line.in_pieces, is_high=True)]
-    name = _label(length, Slot("text_z"))
+    name = _label(length + more, Slot("text_z"))
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cubes=[body], texts=[name], lines=lines)
 
 
@@ -308,8 +313,7 @@ def _forecast(
         "size": {"x": Slot("wide"), "y": Slot("deep"), "z": 0.01},
         "bottom_scale": 1.0,
         "top_scale": 1.0,
-        # Ellipses are large, those of vehicles more so, and many lie over one another.
-        "color": {**paint(), "a": 0.0625 if is_high else 0.125},
+        "color": {**paint(), "a": 0.125},  # many lie over one another
     }
     lines, discs = _lines(points, thickness_px, is_high=is_high), [disc] if has_ellipse else []
     return _entity(frame_id, lifetime_ns, TextSlot("entity_id", length), cylinders=discs, lines=lines)

@@ -204,7 +204,7 @@ def has_bodies(schema: Schema, frames: Sequence[Frame]) -> bool:
 class ViewFactory:
     """Draws the channels of a camera: in its pictures, and in the frame of their metres.
 
-    ``frames`` are the coordinate frames that no transform of the log names.
+    ``frames`` are the coordinate frames that no transform of the log names, ``robot`` is that of the robot, or "".
     ``cameras`` are calibrated ones by the topics of their pictures, for tracks with 3D boxes; ``scene`` has the cameras
     that a scene was fused of.
     """
@@ -215,11 +215,12 @@ class ViewFactory:
     planes: Planes
     path: CameraPath | None
     frames: Sequence[str]
+    robot: str
     cameras: Mapping[str, MovingCamera]
     scene: SceneOnPictures
 
     def views(self, shown: Mapping[str, ChannelToDraw], start_ns: int) -> Iterator[View]:
-        """Yield the views of these channels, and, once, the transforms to the frames that no other names."""
+        """Yield the views of these channels, and, once, that of the robot and the transforms that no other names."""
         for topic, channel in shown.items():
             if topic == f"{self.prefix}/ground_plane":
                 outline = views.ground.outlines(self.planes, start_ns, frame_of(self.prefix, channel))
@@ -228,14 +229,20 @@ class ViewFactory:
             if channel.schema in views.DRAWN and not topic.endswith(NOT_SHOWN) and topic + FULL not in shown:
                 yield from self._drawn(topic, channel)
         on_ground = next(((topic, channel) for topic, channel in shown.items() if channel.is_on_ground()), None)
-        if on_ground and self.frames:
+        if on_ground is None:
+            return
+        made_from = Provenance(VIEW, {}, on_ground[0], on_ground[1].digest)
+        if self.frames:
             transforms = [
                 (start_ns, number, foxglove.pack_transform(start_ns, views.ground.world_of(self.prefix), frame_id))
                 for number, frame_id in enumerate(self.frames)
             ]
             self.frames = ()
-            made_from = Provenance(VIEW, {}, on_ground[0], on_ground[1].digest)
             yield View(frame_topic(self.prefix), foxglove.TRANSFORM, made_from, "", iter(transforms))
+        if self.robot:
+            drawn = views.ground.robot(start_ns, self.robot)
+            self.robot = ""
+            yield View(robot_topic(self.prefix), foxglove.SCENE, made_from, "", drawn)
 
     def _view(self, topic: str, channel: ChannelToDraw, suffix: str, schema_name: str, messages: Iterator[Any]) -> View:
         made_from = Provenance(VIEW, {}, topic, channel.digest)
@@ -268,6 +275,11 @@ class ViewFactory:
 def frame_topic(prefix: str) -> str:
     """Return the topic of the transforms to the frames that no other transform of the log names."""
     return f"{prefix}/view/tf"
+
+
+def robot_topic(prefix: str) -> str:
+    """Return the topic of the drawing of the robot."""
+    return f"{prefix}/{layouts.ROBOT}{views.SCENE_SUFFIX}"
 
 
 def frame_of(prefix: str, channel: ChannelToDraw) -> str:

@@ -38,6 +38,7 @@ from mcaptrack.pipeline.drawing import (
     recorded_drawings,
     recorded_sources,
     robot_frame,
+    robot_topic,
 )
 from mcaptrack.pipeline.motion import path_with
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock, scene_on_pictures
@@ -57,7 +58,7 @@ from mcaptrack.schema import (
 )
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.encodings import PROTOBUF
-from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned, unique_values
+from mcaptrack.schema.framing import has_any, join_frames, joined_parts, thinned
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import tracks_topic
@@ -146,6 +147,8 @@ class _Work:
         self.calibrated = calibrated_cameras(opened, solid_in) if solid_in and self.tree else {}
         self.scene = scene_on_pictures(state)
         self.frames = new_frames(prefix, shown, self.tree.frames() if self.tree else ())
+        self.sources = self._sources()
+        self.robot = robot_frame(opened, self.sources, self.tree, self.frame_id) if self.tree else ""
         self.seen_on = (*self.calibrated, *(seen.pictures for seen in self.scene.cameras))
         self.start_ns = _start_ns(opened, camera, shown, self.clock)
         of_shown = self._outdated()
@@ -154,13 +157,19 @@ class _Work:
         for topic in sorted(self._recorded):
             warn(f"no view at {topic}, which {describe_origin(opened, topic)}", "left-out")
 
+    def _sources(self) -> list[str]:
+        """Return the recorded topics that the channels were made from."""
+        inputs = [channel.provenance.input for channel in self.state.results.values()]
+        return recorded_sources(self.state.opened, [*self.camera.topics, *inputs])
+
     def _outdated(self) -> set[str]:
         """Return the topics of all views of these channels."""
         topics = {topic + suffix for topic in self.shown for suffix in views.SUFFIXES}
         topics |= {topic + views.SUFFIX + pictures for topic in self.shown for pictures in self.seen_on}
         on_others = tuple(f"{topic}{views.SUFFIX}/" for topic in self.shown)
         topics |= {view for view in self.state.opened.channels if view.startswith(on_others)}
-        return topics | ({frame_topic(self.state.prefix)} if self.frames else set())
+        topics |= {frame_topic(self.state.prefix)} if self.frames else set()
+        return topics | ({robot_topic(self.state.prefix)} if self.robot else set())
 
     def views(self) -> tuple[list[View], list[View]]:
         """Return the views of channels that stay as they are, and of those of this run.
@@ -168,7 +177,7 @@ class _Work:
         The former come first, so that channels that are made again keep their place, and the log its bytes.
         """
         factory = ViewFactory(
-            self.state.prefix, self.clock.t_ns, self.clock.stamp_ns, self.planes, self.path, self.frames,
+            self.state.prefix, self.clock.t_ns, self.clock.stamp_ns, self.planes, self.path, self.frames, self.robot,
             self.calibrated, self.scene,
         )  # fmt: skip
         first, last = (
@@ -184,10 +193,8 @@ class _Work:
         opened, prefix, results, gone = self.state
         current = _Current(self.state, {**self.shown, **{topic: _nothing(opened, topic) for topic in gone}})
         topics = {*opened.channels} - self.outdated - gone | {*results} | drawn.topics
-        inputs = [channel.provenance.input for channel in results.values()]
-        sources = recorded_sources(opened, [*self.camera.topics, *inputs])
-        by_viewers = recorded_drawings(opened, sources) if self.frame_id else {}
-        by_viewers |= {name: True for source in sources if (name := source + views.SCENE_SUFFIX) in topics}
+        by_viewers = recorded_drawings(opened, self.sources) if self.frame_id else {}
+        by_viewers |= {name: True for source in self.sources if (name := source + views.SCENE_SUFFIX) in topics}
         eye = layouts.eye_on(current.positions(), self.planes, self.start_ns)
         return layouts.CameraChannels(
             prefix,
@@ -195,9 +202,8 @@ class _Work:
             self.clock.topic,
             self.frame_id or views.ground.frame_of(prefix),
             eye._replace(z_m=current.floor_m() if self.frame_id else 0.0),
-            current.last_step(),
             current.is_truth_known(),
-            robot_frame(opened, sources, self.tree, self.frame_id) if self.tree and self.frame_id else "",
+            self.robot,
             by_viewers,
             self.seen_on,
             highest_values(prefix, current.frames),
@@ -321,14 +327,6 @@ class _Current:
     def _each(self, schema: Schema, *names: str) -> Iterator[Sequence[Frame]]:
         """Yield the frames of channels, by the ends of their topics."""
         return (self.frames(f"{self.state.prefix}/{name}", schema) for name in names)
-
-    def last_step(self) -> int:
-        """Return the horizon of forecasts as a number of steps; 0 if there are no forecasts."""
-        for frames in self._each(PREDICTIONS, "retracks/predictions", "predictions"):
-            steps = unique_values(PREDICTIONS, frames, "step")
-            if len(steps):
-                return int(steps[-1])
-        return 0
 
     def is_truth_known(self) -> bool:
         """Return whether any forecast is compared with the ground truth."""

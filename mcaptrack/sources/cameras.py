@@ -163,6 +163,12 @@ def scenes_of(opened: log.Log) -> tuple[str, ...]:
     return tuple(prefix for prefix, how in fused if how is not None and how.transform == FUSE)
 
 
+def members_of(opened: log.Log, scene: str) -> list[str]:
+    """Return the prefixes of the cameras that were fused to a scene."""
+    how = provenance_of(opened, f"{scene}/{STAGES['detect'].output_topic}")
+    return [f"/{name}" for name in how.parameters["cameras"]] if how else []
+
+
 def camera_at(opened: log.Log, prefix: str) -> Camera:
     """Return the camera of this name, even if the log has no channels for it."""
     camera = next((camera for camera in cameras(opened) if prefix in camera.names), None)

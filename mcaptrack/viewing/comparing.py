@@ -30,10 +30,11 @@ from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.transforms import FULL, STAGES
+from mcaptrack.viewing.legend import BACKGROUND, INK
+from mcaptrack.viewing.painting import draw, put_text, text_size
 from mcaptrack.viewing.rendering import (
     RenderOptions,
     SceneDrawing,
-    draw,
     empty_ground,
     pictures_of_video,
     rate_of,
@@ -46,13 +47,13 @@ from mcaptrack.viewing.rendering import (
 
 #: The largest width of a comparison in pixels, unless one is given.
 _WIDTH_PX: Final = 1920
-_BACKGROUND, _INK, _FAINT = (32, 28, 26), (235, 230, 225), (150, 145, 140)
+_FAINT: Final = (150, 145, 140)
 #: Events stand below the pictures for this time, the newest ones of all panels.
 _SHOWN_S: Final = 4.0
 _REPAIRS: Final = (EventKind.JOINED, EventKind.PARTED)
-#: The share of the width that the ground takes, and the height of a line of text in shares of a panel's width.
+#: The share of the width that the ground takes, and the height of a line in shares of a panel's width, and of its text.
 _GROUND: Final = 0.25
-_LINE: Final = 0.055
+_LINE, _TEXT = 0.055, 0.7
 
 
 class Panel(NamedTuple):
@@ -275,11 +276,11 @@ def _composed(
     header = round(line * 1.5)
     below = max(line * 4, 0 if inset is None else inset.shape[0])
     total = (header + height + below + 1) // 2 * 2
-    out = np.full((total, width * len(parts), 3), _BACKGROUND, np.uint8)
+    out = np.full((total, width * len(parts), 3), BACKGROUND, np.uint8)
     for number, part in enumerate(parts):
         left = number * width
         out[header : header + height, left : left + width] = part
-        end = _write(out, panels[number].title, (left + line // 3, line), line, _INK, width - line)
+        end = _write(out, panels[number].title, (left + line // 3, line), line, INK, width - line)
         _write(out, counters[number], (end + line // 2, line), line, _FAINT, left + width - end - line)
         if number:
             out[: header + height, left - 1 : left + 1] = 0
@@ -289,20 +290,17 @@ def _composed(
         out[header + height : header + height + inset.shape[0], left:] = inset
         space = left - line
     top = header + height
-    _write(out, clock, (line // 3, top + round(line * 1.6)), round(line * 1.7), _INK, space)
+    _write(out, clock, (line // 3, top + round(line * 1.6)), round(line * 1.7), INK, space)
     lines = int((total - top - line * 2.2) // (line * 1.25))
     for number, caption in enumerate(captions[: max(lines, 0)]):
         at = (line // 3, top + round(line * (3.2 + 1.25 * number)))
-        _write(out, caption, at, line, _INK if number == 0 else _FAINT, space)
+        _write(out, caption, at, line, INK if number == 0 else _FAINT, space)
     return out
 
 
 def _write(image: Image, text: str, at: tuple[int, int], line_px: int, bgr: Any, most_px: int) -> int:
     """Write a line of text from its lower left corner on, smaller if it is too long; returns where it ends."""
-    import cv2
-
-    font, size = cv2.FONT_HERSHEY_SIMPLEX, line_px / 34
-    wide = cv2.getTextSize(text, font, size, 1)[0][0]
-    size *= min(1.0, max(most_px, 1) / max(wide, 1))
-    cv2.putText(image, text, at, font, size, bgr, 1, cv2.LINE_AA)
-    return at[0] + int(cv2.getTextSize(text, font, size, 1)[0][0])
+    size_px = line_px * _TEXT
+    size_px *= min(1.0, max(most_px, 1) / max(text_size(text, size_px)[0], 1))
+    put_text(image, text, at, size_px, bgr)
+    return at[0] + text_size(text, size_px)[0]

@@ -11,13 +11,14 @@ import numpy as np
 
 from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
+from mcaptrack.foxglove.views import styles
 from mcaptrack.geometry.arrays import Floats, Image
+from mcaptrack.viewing.legend import BACKGROUND
+from mcaptrack.viewing.painting import text_size
 
-#: The colour of the ground: blue, green, red.
-BACKGROUND: Final = (32, 28, 26)
 _GRID: Final = (0.2, 0.22, 0.25, 1.0)
 _INK: Final = (0.85, 0.87, 0.9, 1.0)
-_ROBOT: Final = (1.0, 1.0, 1.0, 0.9)
+_ROBOT: Final = (*styles.WHITE, styles.ROBOT_ALPHA)
 #: Red, green, blue and opacity.
 Shade = tuple[float, float, float, float]
 #: Types of lines in scenes, and in annotations.
@@ -25,12 +26,11 @@ _STRIP, _LOOP, _LIST = 0, 1, 2
 _ANNOTATED: Final = {_STRIP: 3, _LOOP: 2, _LIST: 4}
 _CORNERS: Final = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])
 _ROUND: Final = np.array([[np.cos(turn), np.sin(turn), 0.0] for turn in np.arange(24) * np.pi / 12]) / 2
-#: The outline of a robot, which is 4 m long and 2 m wide: an arrow ahead.
-_ARROW: Final = np.array([[2.0, 0.0], [-2.0, 1.0], [-1.2, 0.0], [-2.0, -1.0]])
 #: The largest number of lines of the grid in a direction.
 _MOST_LINES: Final = 10
 _STEPS: Final = (1.0, 2.0, 5.0)
-_TEXT_PX: Final = 12.0
+#: Text is as high as this part of the width, and never lower than so many pixels.
+_TEXT, _LEAST_TEXT_PX = 1 / 60, 11.0
 #: The distance of labels from their places, so that they don't hide small objects.
 _BESIDE_PX: Final = np.array([8.0, -8.0])
 
@@ -76,7 +76,8 @@ class LabelPlaces:
     def spread(self, drawn: Any) -> Any:
         """Move the texts of annotations away from each other and from those before in this picture; returns them."""
         for text in drawn.texts:
-            wide, high = text_size(text.text, text.font_size)
+            width, above, below = text_size(text.text, text.font_size)
+            wide, high = width + 2.0, above + below + 1.0
             x, y = text.position.x, text.position.y
             back_px = _BACK * high
             shift = max(0.0, self._shifts.get(text.text, 0.0) - back_px)
@@ -95,14 +96,6 @@ class LabelPlaces:
             self._taken.append((x, y - shift - high, x + wide, y - shift))
             text.position.y = y - shift
         return drawn
-
-
-def text_size(text: str, font_size: float) -> tuple[float, float]:
-    """Width and height in px of a text of annotations in a video."""
-    import cv2
-
-    (wide, high), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, font_size / 24, 1)
-    return float(wide + 2), float(high + below + 1)
 
 
 def ground(sight: Sight) -> Image:
@@ -125,7 +118,7 @@ def grid(sight: Sight) -> Any:
     low, left = sight.height_px - 14.0, 14.0
     bar = np.array([[left, low], [left + step * sight.px_per_m, low]])
     _line(out, _ANNOTATED[_STRIP], bar, _INK, 3.0)
-    _text(out, f"{step:g} m", bar[0] - [0.0, 6.0], _INK)
+    _text(out, f"{step:g} m", bar[0] - [0.0, 6.0], _INK, sight)
     return out
 
 
@@ -134,7 +127,7 @@ def robot(sight: Sight, at_m: Floats, heading_rad: float) -> Any:
     out = message_class(ANNOTATIONS)()
     if np.isfinite([*at_m, heading_rad]).all():
         cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
-        outline = at_m + _ARROW @ np.array([[cosine, sine], [-sine, cosine]])
+        outline = at_m + styles.ROBOT_M @ np.array([[cosine, sine], [-sine, cosine]])
         _line(out, _ANNOTATED[_LOOP], sight.to_pixels(outline), _ROBOT, fill=_ROBOT)
     return out
 
@@ -159,7 +152,7 @@ def drawing(scene: Any, sight: Sight) -> Any:
             _line(out, _ANNOTATED.get(line.type, _ANNOTATED[_STRIP]), px, plain, line.thickness / 2, shades)
         for text in entity.texts:
             at = sight.to_pixels(_placed(text.pose, np.zeros((1, 3))))[0] + _BESIDE_PX
-            _text(out, text.text, at, (text.color.r, text.color.g, text.color.b, 1.0))
+            _text(out, text.text, at, (text.color.r, text.color.g, text.color.b, 1.0), sight)
     return out
 
 
@@ -199,8 +192,8 @@ def _line(
         _paint(part.fill_color, fill)
 
 
-def _text(out: Any, content: str, at_px: Floats, rgba: Shade) -> None:
-    text = out.texts.add(text=content, font_size=_TEXT_PX)
+def _text(out: Any, content: str, at_px: Floats, rgba: Shade, sight: Sight) -> None:
+    text = out.texts.add(text=content, font_size=max(_LEAST_TEXT_PX, sight.width_px * _TEXT))
     text.position.x, text.position.y = at_px.tolist()
     _paint(text.text_color, rgba)
     _paint(text.background_color, (BACKGROUND[2] / 255, BACKGROUND[1] / 255, BACKGROUND[0] / 255, 1.0))

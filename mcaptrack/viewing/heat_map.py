@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import publish_bytes
+from mcaptrack.foxglove.views.styles import GROUND_TRUTH, RETRACKED, TRACKED
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane
@@ -26,14 +27,15 @@ from mcaptrack.schema.classes import UNKNOWN, class_name, class_names, is_person
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
-from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
-from mcaptrack.viewing.rendering import ABOVE_PX, RenderOptions, draw, scaled, sight_of
+from mcaptrack.viewing.legend import BACKGROUND, INK
+from mcaptrack.viewing.painting import draw, put_text, text_size
+from mcaptrack.viewing.rendering import ABOVE_PX, RenderOptions, scaled, sight_of
 
 #: The formats of a heat map by the suffix of its file.
 SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 #: Channels below the prefix of a camera, the best one first.
-_BEST: Final = ("retracks" + FULL, "retracks", "tracks", "truth")
+_BEST: Final = (*RETRACKED.names, *TRACKED.names, *GROUND_TRUTH.names)
 #: The scene without people is the median of this many pictures.
 _PICTURES: Final = 15
 #: The heat is drawn over the picture with this opacity at most, and is faded below this share of the highest.
@@ -43,7 +45,8 @@ _FADED: Final = 0.04
 _FARTHEST: Final = 20.0
 #: Narrower pictures are enlarged, so that their legend can be read.
 _LEAST_PX: Final = 240
-_INK: Final = (235, 230, 225)
+#: The size of text in heights of a line.
+_TEXT: Final = 0.7
 
 
 class HeatMap(NamedTuple):
@@ -163,15 +166,7 @@ class Occupancy(NamedTuple):
         return self.low_m[0] + columns * self.cell_m, self.low_m[1] + rows * self.cell_m
 
 
-def occupancy(
-    t_ns: Ints,
-    track_id: NDArray[Any],
-    xy_m: Floats,
-    *,
-    cell_m: float | None = None,
-    span_m: tuple[float, float, float, float] | None = None,
-    max_gap_s: float = MAX_GAP_S,
-) -> Occupancy:
+def occupancy(t_ns: Ints, track_id: NDArray[Any], xy_m: Floats) -> Occupancy:
     """Count the person-seconds in each cell of the ground.
 
     People move evenly from one position of their track to the next. So the sum over all cells, and outside, is the
@@ -184,18 +179,12 @@ def occupancy(
     track_id : (N,) of int
     xy_m : (N, 2) of float64
         Positions; rows that are not finite are left out.
-    cell_m : float, optional
-        The side of a cell; by default 0.5 m, and as much more as large places need.
-    span_m : tuple of float, optional
-        Lowest and highest x, lowest and highest y of the grid, which is extended to whole cells. By default all
-        places but those where less than 0.2 % of the time is spent at either end of an axis.
-    max_gap_s : float
-        Longer gaps of a track count for nothing.
 
     Returns
     -------
     Occupancy
-        An empty grid (0, 0) if no track has two positions.
+        All places but those where less than 0.2 % of the time is spent at either end of an axis; an empty grid (0, 0)
+        if no track has two positions. Cells have 0.5 m, and as much more as large places need.
 
     Examples
     --------
@@ -205,20 +194,14 @@ def occupancy(
     >>> heat.person_s.tolist()
     [[1.25, 0.5, 0.25]]
     """
-    start_m, step_m, seconds = _steps(t_ns, track_id, xy_m, seconds_to_ns(max_gap_s))
-    if span_m is None:
-        if not len(seconds):
-            return Occupancy(np.zeros((0, 0)), (0.0, 0.0), cell_m or _CELL_M, 0.0)
-        ends, weight = np.concatenate([start_m, start_m + step_m]), np.tile(seconds, 2)
-        low, high = (_weighted(ends, weight, share) for share in (_BEYOND, 1 - _BEYOND))
-        cell = cell_m or _cell_of(float((high - low).max()))
-        last = np.floor(high / cell).astype(np.int64)
-    else:
-        low, high = np.array([span_m[0], span_m[2]], np.float64), np.array([span_m[1], span_m[3]], np.float64)
-        cell = cell_m or _cell_of(float((high - low).max()))
-        last = np.ceil(high / cell).astype(np.int64) - 1
+    start_m, step_m, seconds = _steps(t_ns, track_id, xy_m, seconds_to_ns(MAX_GAP_S))
+    if not len(seconds):
+        return Occupancy(np.zeros((0, 0)), (0.0, 0.0), _CELL_M, 0.0)
+    ends, weight = np.concatenate([start_m, start_m + step_m]), np.tile(seconds, 2)
+    low, high = (_weighted(ends, weight, share) for share in (_BEYOND, 1 - _BEYOND))
+    cell = _cell_of(float((high - low).max()))
     first = np.floor(low / cell).astype(np.int64)
-    count = np.maximum(last - first + 1, 1)
+    count = np.floor(high / cell).astype(np.int64) - first + 1
     grid, outside = np.zeros(int(count.prod())), 0.0
     pieces = np.clip(np.ceil(8 * np.abs(step_m).max(axis=1, initial=0.0) / cell), 1, _MOST_PIECES).astype(np.int64)
     for part in _parts(pieces):
@@ -371,20 +354,17 @@ def _with_legend(image: Image, most: float, total_s: float, topic: str) -> Image
 
     width = image.shape[1]
     line = round(np.clip(width / 45, 10, 40))
-    strip = np.full((line * 4, width, 3), (32, 28, 26), np.uint8)
+    strip = np.full((line * 4, width, 3), BACKGROUND, np.uint8)
     long = width // 3
     level = np.linspace(0, 1, long)
     colours = cv2.applyColorMap(np.rint(55 + 200 * level).astype(np.uint8)[None], cv2.COLORMAP_INFERNO)
     strip[line // 2 : line // 2 + line, line : line + long] = colours
-    font, size = cv2.FONT_HERSHEY_SIMPLEX, line / 34
     for share in (0.0, 0.5, 1.0) if long > line * 8 else (0.0, 1.0):
         text = f"{most * share**2:.2g}" + (" s/m2" if share == 1 else "")
-        cv2.putText(
-            strip, text, (line + round(long * share * 0.96), round(line * 2.6)), font, size, _INK, 1, cv2.LINE_AA
-        )
+        put_text(strip, text, (line + round(long * share * 0.96), round(line * 2.6)), line * _TEXT, INK)
     amount = f"{total_s:.0f} person-seconds" if total_s < 600 else f"{total_s / 60:.0f} person-minutes"
     text = f"{amount} of {topic}"
-    wide = cv2.getTextSize(text, font, size, 1)[0][0]
-    size *= min(1.0, (width - long - 4.5 * line) / max(wide, 1))
-    cv2.putText(strip, text, (round(long + 3.5 * line), round(line * 1.4)), font, size, _INK, 1, cv2.LINE_AA)
+    size_px = line * _TEXT
+    size_px *= min(1.0, (width - long - 4.5 * line) / max(text_size(text, size_px)[0], 1))
+    put_text(strip, text, (round(long + 3.5 * line), round(line * 1.4)), size_px, INK)
     return np.concatenate([image, strip])

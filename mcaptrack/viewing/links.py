@@ -21,6 +21,7 @@ from mcaptrack.schema.classes import class_names, is_person
 from mcaptrack.schema.framing import frame_times, join_frames, row_ends
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import foreign
+from mcaptrack.sources.cameras import members_of, scenes_of
 from mcaptrack.sources.video import is_video_codec
 
 LICHTBLICK: Final = "https://lichtblick-suite.github.io/lichtblick/"
@@ -77,6 +78,8 @@ KINDS: Final = (EventKind.SWITCH, EventKind.JOINED, EventKind.PARTED)
 #: Viewers open so long before an event, or before the time without detections that it ended, so that it is seen when
 #: they play.
 LEAD_S: Final = 1.0
+#: The layout that shows the tracks before and after a repair.
+EVENT_LAYOUT: Final = "comparing"
 #: The tracks that viewers show first, below the name of a camera; the first that has events or people is opened.
 _BEST: Final = ("retracks", "tracks")
 _NO_TRACKS: Final = (np.empty(0, np.int64), np.empty(0, np.int64))
@@ -112,11 +115,6 @@ class LinkedEvent(NamedTuple):
     link: str = ""
     unseen_s: float = 0.0
 
-    @property
-    def layout(self) -> str:
-        """The name of the layout that shows its tracks."""
-        return "tracking" if "/retracks" in self.topic else "comparing"
-
     def opens_ns(self, start_ns: int) -> int:
         """Return the log time in ns at which viewers open, in a log with this start."""
         return max(self.t_ns - round((LEAD_S + self.unseen_s) * NS_PER_S), start_ns)
@@ -125,11 +123,13 @@ class LinkedEvent(NamedTuple):
 def find_moments(opened: log.Log) -> list[LinkedEvent]:
     """Return the identity switches and repairs in the channels of events of a log, in the order of time.
 
-    Channels that can't be read are left out, with a warning.
+    Cameras that were fused to a scene are left out: viewers show the ids of the scene on their pictures. So are
+    channels that can't be read, with a warning.
     """
     moments: list[LinkedEvent] = []
+    fused = tuple(f"{member}/" for scene in scenes_of(opened) for member in members_of(opened, scene))
     for topic, channel in sorted(opened.channels.items()):
-        if not channel.holds(EVENTS):
+        if not channel.holds(EVENTS) or topic.startswith(fused):
             continue
         provenance = Provenance.from_metadata(channel.metadata)
         tracks = provenance.input if provenance else topic.removesuffix("/events")

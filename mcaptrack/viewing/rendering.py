@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
+from mcaptrack.foxglove.views.ground import lifetime_ns
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.pipeline import RobotPath
@@ -27,10 +27,9 @@ from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.blur.people import HiddenPeople, hide
 from mcaptrack.viewing.from_above import Sight
+from mcaptrack.viewing.legend import with_legend
+from mcaptrack.viewing.painting import draw
 
-_LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
-#: The number of binary places of pixel coordinates.
-_SHIFT: Final = 4
 _GIF_FPS: Final = 10.0
 #: Seen from above: the width of a video in pixels and its height as a share of it, the width in metres around a robot,
 #: the least one around places, and the margin around these as a factor.
@@ -103,7 +102,7 @@ def render(
             for view in views:
                 if (annotations := view(frame.t_ns)) is not None:
                     image = draw(image, annotations, scale)
-            yield frame.t_ns, image
+            yield frame.t_ns, with_legend(image, view_topics)
             progress("render", done, len(chosen))
         if not done:
             raise McaptrackError(f"{opened.path}: no picture of {picture_topic} in this time can be decoded")
@@ -163,7 +162,8 @@ def render_from_above(
     def drawn() -> Iterator[tuple[int, Image]]:
         drawing = SceneDrawing(opened, view_topics, span)
         for done, (t_ns, sight) in enumerate(zip(chosen.tolist(), seen, strict=True), 1):
-            yield t_ns, drawing.drawn(empty_ground(sight, path, done - 1), t_ns, sight)
+            image = drawing.drawn(empty_ground(sight, path, done - 1), t_ns, sight)
+            yield t_ns, with_legend(image, view_topics)
             progress("render", done, len(chosen))
 
     return write_clip(output, drawn(), rate_of(chosen))
@@ -196,7 +196,7 @@ class SceneDrawing:
     """Draws scenes of channels, seen from above, at rising times; their labels keep apart."""
 
     def __init__(self, opened: log.Log, topics: Sequence[str], span: tuple[int, int]) -> None:
-        self._views = views_at(opened, topics, span)
+        self._views = views_at(opened, topics, span, is_held=True)
         self._places = from_above.LabelPlaces()
 
     def drawn(self, image: Image, t_ns: int, sight: Sight) -> Image:
@@ -276,23 +276,38 @@ def rate_of(t_ns: Ints) -> Fraction:
     return Fraction(NS_PER_S, int(np.median(rest))).limit_denominator(1001) if len(rest) else Fraction(1)
 
 
-def views_at(opened: log.Log, topics: Sequence[str], span: tuple[int, int]) -> list[Callable[[int], Any]]:
-    """For each topic, a function that returns the message at exactly a time in a span, for rising times, or None."""
+def views_at(
+    opened: log.Log, topics: Sequence[str], span: tuple[int, int], is_held: bool = False
+) -> list[Callable[[int], Any]]:
+    """For each topic, a function that returns the message at a time in a span, for rising times, or None.
+
+    With ``is_held`` messages are shown until the next one is due, as viewers do with scenes.
+    """
     return [
-        message_at(((m.t_ns, m.payload) for m in opened.messages(topic, *span)), message_decoder(opened, topic))
+        message_at(
+            ((message.t_ns, message.payload) for message in opened.messages(topic, *span)),
+            message_decoder(opened, topic),
+            lifetime_ns(opened.times(topic)) if is_held else 0,
+        )
         for topic in topics
     ]
 
 
-def message_at(coming: Iterator[tuple[int, bytes]], read: Callable[[bytes], Any]) -> Callable[[int], Any]:
-    """A function that reads the message at exactly a time, for rising times; None if there is none."""
+def message_at(
+    coming: Iterator[tuple[int, bytes]], read: Callable[[bytes], Any], held_ns: int = 0
+) -> Callable[[int], Any]:
+    """A function that reads the message at a time, for rising times, or the last one that is at most so much older.
+
+    None if there is none.
+    """
+    last: tuple[int, bytes] | None = None
     waiting = next(coming, None)
 
     def at(t_ns: int) -> Any:
-        nonlocal waiting
-        while waiting is not None and waiting[0] < t_ns:
-            waiting = next(coming, None)
-        return read(waiting[1]) if waiting is not None and waiting[0] == t_ns else None
+        nonlocal last, waiting
+        while waiting is not None and waiting[0] <= t_ns:
+            last, waiting = waiting, next(coming, None)
+        return read(last[1]) if last is not None and last[0] >= t_ns - held_ns else None
 
     return at
 
@@ -309,76 +324,3 @@ def scaled(image: Image, width_px: int | None) -> Image:
     if width_px is None:
         return np.ascontiguousarray(image[: size[1], : size[0]])
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
-    """Draw an ImageAnnotations message on a picture, BGR (height, width, 3), that has ``scale`` times its size."""
-    import cv2
-
-    paint, cover = np.zeros_like(image), np.zeros(image.shape[:2], np.uint8)
-
-    def stroke(line: NDArray[np.int32], rgba: Any, thickness: int, is_closed: bool = False) -> None:
-        if rgba.a <= 0:
-            return
-        bgr = tuple(round(255 * part) for part in (rgba.b, rgba.g, rgba.r))
-        # The colour is drawn a little wider than its mask, so that soft edges have it, too.
-        cv2.polylines(paint, [line], is_closed, bgr, thickness + 2, cv2.LINE_8, _SHIFT)
-        cv2.polylines(cover, [line], is_closed, round(255 * rgba.a), thickness, cv2.LINE_AA, _SHIFT)
-
-    lines = []
-    for part in annotations.points:
-        points = np.array([(point.x, point.y) for point in part.points], np.float64).reshape(-1, 2) * scale
-        lines.append(np.rint(points * 2**_SHIFT).clip(-(2**24), 2**24).astype(np.int32))
-        if part.type == _LINE_LOOP and part.fill_color.a > 0:
-            image = _filled(image, lines[-1], part.fill_color)
-    for part, line in zip(annotations.points, lines, strict=True):
-        thickness = max(1, round(part.thickness * max(scale, 0.5)))
-        shades = part.outline_colors
-        if part.type == _LINE_LOOP:
-            stroke(line, part.outline_color, thickness, is_closed=True)
-        elif part.type == _LINE_LIST:
-            for pair in range(len(line) // 2):
-                shade = shades[pair] if len(shades) == len(line) // 2 else part.outline_color
-                stroke(line[2 * pair : 2 * pair + 2], shade, thickness)
-        elif part.type == _LINE_STRIP and len(shades) == len(line):
-            for start in range(len(line) - 1):
-                stroke(line[start : start + 2], shades[start + 1], thickness)
-        elif part.type == _LINE_STRIP:
-            stroke(line, part.outline_color, thickness)
-    share = cover[..., None].astype(np.float32) / 255
-    image = np.rint(image * (1 - share) + paint * share).astype(np.uint8)
-    for text in annotations.texts:
-        _write(image, text, scale)
-    return image
-
-
-def _filled(image: Image, line: NDArray[np.int32], rgba: Any) -> Image:
-    """Paint the inside of a closed line over what was painted before, with the line's opacity."""
-    import cv2
-
-    cover = np.zeros(image.shape[:2], np.uint8)
-    cv2.fillPoly(cover, [line], round(255 * rgba.a), cv2.LINE_AA, _SHIFT)
-    rows, columns = (np.flatnonzero(cover.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return image
-    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    share = cover[part][..., None].astype(np.float32) / 255
-    bgr = np.array([rgba.b, rgba.g, rgba.r], np.float32) * 255
-    image = image.copy()
-    image[part] = np.rint(image[part] * (1 - share) + bgr * share).astype(np.uint8)
-    return image
-
-
-def _write(image: Image, text: Any, scale: float) -> None:
-    import cv2
-
-    size = text.font_size / 24 * max(scale, 0.75)
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    (width, height), below = cv2.getTextSize(text.text, font, size, 1)
-    x, y = round(text.position.x * scale), round(text.position.y * scale)
-    y = max(y, height + below)
-    back, front = (
-        [round(255 * c) for c in (rgba.b, rgba.g, rgba.r)] for rgba in (text.background_color, text.text_color)
-    )
-    cv2.rectangle(image, (x, y - height - below), (x + width + 2, y), back, cv2.FILLED)
-    cv2.putText(image, text.text, (x + 1, y - below + 1), font, size, front, 1, cv2.LINE_AA)

@@ -12,9 +12,9 @@ import numpy as np
 
 from mcaptrack.foxglove.views import ground, image, projected
 from mcaptrack.foxglove.views.image import View
-from mcaptrack.foxglove.views.label_places import line_unit, style_of
 from mcaptrack.foxglove.views.people import PeopleInParts
 from mcaptrack.foxglove.views.projected import MovingCamera
+from mcaptrack.foxglove.views.styles import Scale, style_of
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
@@ -64,8 +64,8 @@ class Drawing:
         if self._schema is DETECTIONS:
             yield from image.detections(self._frames, pictures, self._planes)
         elif self._schema is TRACKS:
-            unit = line_unit(self._frames, self._planes)
-            yield from image.tracks(self._people(picture_ns), pictures, unit, self._style, self._path)
+            scale = Scale.of(self._frames, self._planes)
+            yield from image.tracks(self._people(picture_ns), pictures, scale, self._style, self._path)
         elif self._schema is PREDICTIONS:
             yield from image.predictions(self._frames, pictures, self._planes, self._path)
 
@@ -75,7 +75,7 @@ class Drawing:
         ``bodies`` are the tracks with 3D boxes that forecasts belong to.
         """
         if self._schema is TRACKS:
-            yield from projected.tracks(self._frames, camera, self._style, self._classes)
+            yield from projected.tracks(self._frames, camera, self._style)
         elif self._schema is PREDICTIONS:
             yield from projected.predictions(self._frames, camera, bodies)
 
@@ -85,7 +85,7 @@ class Drawing:
         ``frame_id`` is their coordinate frame; ``bodies`` are the tracks with 3D boxes that forecasts belong to.
         """
         if self._schema is TRACKS:
-            yield from ground.tracks(self._people(t_ns), t_ns, frame_id, self._style, self._classes)
+            yield from ground.tracks(self._people(t_ns), t_ns, frame_id, self._style)
         elif self._schema is PREDICTIONS:
             yield from ground.predictions(self._frames, t_ns, frame_id, bodies)
         elif self._schema is DETECTIONS:

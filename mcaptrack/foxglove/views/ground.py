@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.foxglove import SceneMessages, class_colour, colours
-from mcaptrack.foxglove.views import label_places
-from mcaptrack.foxglove.views.image import BATCH, View, fade
-from mcaptrack.foxglove.views.label_places import INTERPOLATED, OBSERVED, RETRACKED, TrackStyle
+from mcaptrack.foxglove import SCENE, SceneMessages, class_colour, colours, message_class
+from mcaptrack.foxglove.views import label_places, styles
+from mcaptrack.foxglove.views.image import BATCH, View
 from mcaptrack.foxglove.views.people import (
     ForecastPaths,
     PeopleInParts,
@@ -23,19 +22,18 @@ from mcaptrack.foxglove.views.people import (
     by_count,
     ellipses,
     forecasts_in_parts,
-    labels_of,
     latest,
     segments,
     shown_at,
     trails,
 )
+from mcaptrack.foxglove.views.styles import RETRACKED, TrackStyle
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.framing import frame_times, join_frames
 
-_WHITE: Final = (1.0, 1.0, 1.0)
 _FORECAST_PX: Final = 3.0
 #: The opacity of detections, which tracks are seen through.
 _DETECTED: Final = 0.3125
@@ -81,10 +79,10 @@ class Instants:
         yield from zip(self.t_ns[span].tolist(), range(span.start, span.stop), scene.messages(), strict=True)
 
 
-def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, classes: Mapping[int, str] = {}) -> View:
-    """Draw cylinders with numbers and fading trails; interpolated positions are fainter.
+def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle) -> View:
+    """Draw cylinders, or 3D boxes, with ids and fading trails; interpolated positions are fainter.
 
-    ``shown`` are those at these times. 3D boxes are drawn in the colours of their ``classes``, names by number.
+    ``shown`` are those at these times.
     """
     instants = Instants(t_ns, frame_id)
     for first, last, people in shown.parts(BATCH):
@@ -92,9 +90,7 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
         placed = np.asarray(np.isfinite(people.at_m).all(axis=1), np.bool_)
         lines = trails(people, placed, t_ns)
         longest = lines.row.shape[1] - 1
-        rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
-        body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
-        strength = np.where(people.observed, OBSERVED, INTERPOLATED)
+        rgb, strength = style.colours(people.number), styles.opacity(people.observed)
         alpha, body_alpha = 0.875 * strength, 0.625 * strength
         places = np.column_stack([people.at_m, people.body.base_m()])
         apart_m = np.zeros(len(people.number))
@@ -104,20 +100,20 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle, c
             rows = rows[placed[rows]]
             for points, is_solid, these in _alike(lines.points, has_body, rows):
                 trail = places[lines.row[these, -points:], : 3 if is_solid else 2]
-                opacity = fade(points, longest + 1)
+                opacity = styles.fade(points, longest + 1)
                 if style.marker.in_pieces:
-                    trail, opacity = segments(trail, style.dash), np.repeat(opacity[1:], 2)
+                    trail, opacity = segments(trail, style.trail), np.repeat(opacity[1:], 2)
                 frame, label = people.frame[these] - span.start, people.label[these]
                 if is_solid:
                     boxes = people.body.chosen(these)
                     scene.boxes(
-                        frame, label, boxes, body_rgb[these], body_alpha[these], rgb[these], style.box, trail, opacity,
-                        style.marker,
+                        frame, label, boxes, rgb[these], body_alpha[these], style.box, trail, opacity, style.marker,
+                        style.sign,
                     )  # fmt: skip
                 else:
                     scene.people(
                         frame, label, people.at_m[these], rgb[these], alpha[these], style.marker, trail, opacity,
-                        apart_m[these],
+                        apart_m[these], style.sign,
                     )  # fmt: skip
             yield from instants.numbered(span, scene)
 
@@ -134,17 +130,13 @@ def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapp
     number = joined.rows["source_id"].astype(np.int64)
     if (number < 0).any() or len(np.unique(np.stack([joined.frame, number]), axis=1).T) < len(number):
         number = np.arange(len(number)) - joined.ends[joined.frame]
-    class_id = joined.rows["class_id"].astype(np.int64)
-    label, rgb = (
-        labels_of(number, class_id, classes if len(np.unique(class_id)) > 1 else None),
-        class_colours(class_id, classes),
-    )
+    rgb = class_colours(joined.rows["class_id"].astype(np.int64), classes)
     bounds = np.searchsorted(joined.frame[complete], np.arange(len(t_ns) + 1))
     for span, scene in instants.batches():
         rows = complete[bounds[span.start] : bounds[span.stop]]
         some = body.chosen(rows)
         scene.boxes(
-            joined.frame[rows] - span.start, label[rows], some, rgb[rows], np.full(len(rows), _DETECTED), rgb[rows],
+            joined.frame[rows] - span.start, number[rows], some, rgb[rows], np.full(len(rows), _DETECTED),
             RETRACKED.box, some.centre_m[:, None], np.ones(1), RETRACKED.marker,
         )  # fmt: skip
         yield from instants.numbered(span, scene)
@@ -166,7 +158,7 @@ def class_colours(class_id: Ints, classes: Mapping[int, str]) -> Floats:
 
 
 def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequence[Frame] = ()) -> View:
-    """Draw the latest forecasts as lines that fade into the future, with the 95 % ellipses of their last step.
+    """Draw the latest forecasts as lines that fade into the future, with the ellipses of their last step.
 
     ``bodies`` are tracks with 3D boxes; forecasts of these are drawn at the height of their bottoms.
     """
@@ -180,7 +172,7 @@ def predictions(frames: Sequence[Frame], t_ns: Ints, frame_id: str, bodies: Sequ
             for future, (half, turn), rgb in futures:
                 which, frame = shown_at(future.message, wanted[span])
                 path = future.path_m[which]
-                weaker = fade(path.shape[1], path.shape[1], weakest=0.25)[::-1]
+                weaker = styles.fade_ahead(path.shape[1])
                 is_known = np.isfinite(half[which]).all(axis=1)
                 for has_ellipse in (True, False):
                     ok = is_known == has_ellipse
@@ -201,6 +193,21 @@ def raised(future: ForecastPaths, frames: Sequence[Frame], bodies: Sequence[Fram
     return future._replace(
         path_m=np.concatenate([future.path_m, along], axis=2), end_m=np.column_stack([future.end_m, height])
     )
+
+
+def robot(t_ns: int, frame_id: str) -> View:
+    """Draw a robot once, at its frame, with which it moves."""
+    scene = message_class(SCENE)()
+    entity = scene.entities.add(id="robot", frame_id=frame_id, frame_locked=True)
+    entity.timestamp.FromNanoseconds(t_ns)
+    part = entity.triangles.add()
+    part.pose.orientation.w = 1.0
+    red, green, blue = styles.WHITE
+    part.color.r, part.color.g, part.color.b, part.color.a = red, green, blue, styles.ROBOT_ALPHA
+    for x, y in styles.ROBOT_M.tolist():
+        part.points.add(x=x, y=y)
+    part.indices.extend([0, 1, 2, 0, 2, 3])
+    yield t_ns, 0, scene.SerializeToString(deterministic=True)
 
 
 def outlines(planes: Planes, start_ns: int, frame_id: str) -> View:

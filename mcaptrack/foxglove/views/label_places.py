@@ -10,18 +10,14 @@ Letters: N labels, F pictures, K pairs of labels in a picture.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.foxglove import CuboidMarker, PersonMarker
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
-from mcaptrack.schema import Frame
 
 #: Width of a character and height of a line, in sizes of the font: as much as viewers and videos need.
 _WIDE: Final = 0.75
@@ -49,7 +45,9 @@ def extents(labels: NDArray[Any], size_px: float) -> Floats:
     return np.stack([wide, np.full(len(wide), _HIGH * size_px)], axis=-1)
 
 
-def shifts(at_ns: Ints, frame: Ints, number: Ints, corner_px: Floats, extent_px: Floats, is_down: bool) -> Floats:
+def shifts(
+    at_ns: Ints, frame: Ints, number: Ints, corner_px: Floats, labels: NDArray[Any], text_px: float, is_down: bool
+) -> Floats:
     """Compute the shifts that keep labels apart.
 
     Parameters
@@ -60,8 +58,12 @@ def shifts(at_ns: Ints, frame: Ints, number: Ints, corner_px: Floats, extent_px:
         The picture of each label, rising.
     number : (N,) of int64
         Ids; lower ones stay where they are.
-    corner_px, extent_px : (N, 2)
-        Lower left corners; widths and heights.
+    corner_px : (N, 2)
+        Lower left corners.
+    labels : (N,)
+        Numbers or texts.
+    text_px : float
+        The size of the text.
     is_down : bool
         Labels move down, and not up.
 
@@ -70,7 +72,7 @@ def shifts(at_ns: Ints, frame: Ints, number: Ints, corner_px: Floats, extent_px:
     (N,) of float64
         Pixels to add to the second coordinate: of 0 or less, or of 0 or more with ``is_down``.
     """
-    out = np.zeros(len(frame))
+    out, extent_px = np.zeros(len(frame)), extents(labels, text_px)
     lower, higher, age_s = _held(at_ns, frame, number, *_meeting(frame, number, corner_px, extent_px))
     if not len(lower):
         return out
@@ -177,63 +179,3 @@ def _held(at_ns: Ints, frame: Ints, number: Ints, lower: Ints, higher: Ints) -> 
         rows_of_both.append(np.where(sorted_keys[place] == wanted, rows[place], -1))
     both = (rows_of_both[0] >= 0) & (rows_of_both[1] >= 0)
     return rows_of_both[0][both].astype(np.int64), rows_of_both[1][both].astype(np.int64), age_s[both]
-
-
-# The styles of tracks: tracked, re-tracked and ground truth can be told apart at a glance.
-
-
-#: Up to this width of pictures, lines of thickness 1 are 1 px thick and text is 12 px high; on wider ones, more.
-_WIDTH_PX: Final = 800
-
-
-class TrackStyle(NamedTuple):
-    """The style of the people of a channel.
-
-    ``name_at`` is the position of the number at a box, different for each style, so that numbers don't overlap.
-    ``dash`` is the drawn share of each piece of a trail on pictures; 0 for no trail.
-    """
-
-    thickness: float
-    is_open: bool
-    dash: float
-    is_white: bool
-    name_at: Literal["above", "below", "beside"]
-    marker: PersonMarker
-    box: CuboidMarker
-
-
-#: On the ground the numbers of a person in several channels have different heights, so that all can be read. So have
-#: those of 3D boxes, of which re-tracked ones are drawn whole, tracked ones at the bottom and true ones at the top.
-RETRACKED: Final = TrackStyle(
-    2.5, False, 1.0, False, "above", PersonMarker(0.4, 1.7, 2.2, 4.0), CuboidMarker(0.0, 1.0, 0.5)
-)
-TRACKED: Final = TrackStyle(
-    2.0, True, 0.6, False, "below", PersonMarker(0.6, 0.06, -0.8, 3.0, in_pieces=True), CuboidMarker(0.0, 0.0, -0.8)
-)
-GROUND_TRUTH: Final = TrackStyle(
-    1.0, False, 0.0, True, "beside", PersonMarker(0.12, 4.6, 5.0, 1.5), CuboidMarker(1.0, 1.0, 3.0)
-)
-#: The opacity of observed and of interpolated positions.
-OBSERVED, INTERPOLATED = 1.0, 0.375
-
-
-def style_of(topic: str, is_retracked: bool = False) -> TrackStyle:
-    """The style of a channel of tracks, by its topic and by whether a stage made it that repairs tracks."""
-    if topic.endswith("/truth"):
-        return GROUND_TRUTH
-    return RETRACKED if is_retracked or "/retracks" in topic else TRACKED
-
-
-def line_unit(frames: Sequence[Frame], planes: Planes) -> float:
-    """The thickness in px of a line of thickness 1, by the width of the pictures as far as it is known."""
-    width = float(max((plane.width_px for _, plane in planes), default=0))
-    if not width:
-        for frame in frames:
-            if {"x_px", "w_px"} <= set(frame.rows.dtype.names or ()):
-                width = float(np.fmax.reduce(frame.rows["x_px"] + frame.rows["w_px"], initial=width))
-    return unit_of_width(width)
-
-
-def unit_of_width(width_px: float) -> float:
-    """The thickness in px of a line of thickness 1 on pictures of this width."""
-    return float(np.clip(round(width_px / _WIDTH_PX * 4) / 4, 1.0, 5.0))

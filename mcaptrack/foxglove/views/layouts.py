@@ -10,24 +10,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.choices import LAYOUTS
+from mcaptrack.foxglove.views.styles import BEST, GROUND_TRUTH, KINDS, RETRACKED, TRACKED
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.plane import Planes, plane_at
 
 #: The names of the layouts.
 TRACKING, COMPARING, PREDICTIONS = LAYOUTS
-#: The channels that a layout switches on, below the prefix: the first that exists.
-_BEST: Final = ("retracks/full", "retracks", "tracks", "detections")
-#: The kinds of tracks that are compared: title, and channels of which the first that exists is shown.
-_KINDS: Final = (
-    ("Tracker", ("tracks",)),
-    ("Re-tracked", ("retracks/full", "retracks")),
-    ("Truth", ("truth",)),
-)
-#: The most pictures of a layout that are side by side.
+#: The most cameras of a layout.
 _MOST_CAMERAS: Final = 3
 _TILT_DEG: Final = 45.0
-#: The distance of the camera, in radii of the places of people: discs and labels at the border are whole.
-_DISTANCE: Final = 3.4
+#: The distance of the camera, in radii of the places of people: they are as large as can be, and all in sight.
+_DISTANCE: Final = 2.0
 #: The names of plots with known limits.
 PEOPLE, ERRORS, SPREAD = "people", "errors", "spread"
 #: The suffix of the text of events, after the topic of tracks.
@@ -58,10 +51,27 @@ _CAMERA: Final = {
 #: Grids have cells of 1 m, or of 10 m if there would be more cells than this.
 _MOST_CELLS: Final = 100
 #: Grids are as wide as this part of the distance of the camera; their lines are faint, so that tracks stand out.
-_GRID_SHARE: Final = 0.8
+_GRID_SHARE: Final = 1.4
 _GRID_COLOUR: Final = "#8080a028"
-#: The width of the legend in px, beside the curves, which it would hide otherwise.
-_LEGEND_PX: Final = 130
+#: The width of the legend in px, beside the curves, which it would hide otherwise; thickness of curves of means, and of
+#: those of ends.
+_LEGEND_PX: Final = 170
+_THIN, _THICK = 1.0, 2.5
+#: Level of messages: from warnings on. Tracks begin and end all the time (INFO), which would bury the rest.
+_WARNING, _ALL_LEVELS = 3, 1
+#: Transforms are read before they are needed: without that, viewers ask for it in each panel. Names of frames would
+#: cover people.
+_TRANSFORMS: Final = {"enablePreloading": True, "showLabel": False}
+#: The robot itself, as if it were a channel.
+ROBOT: Final = "robot"
+
+
+class PlotCurve(NamedTuple):
+    """A curve of a plot: its label, colour and thickness."""
+
+    label: str
+    colour: str
+    line_px: float = _THIN
 
 
 class Eye(NamedTuple):
@@ -95,7 +105,9 @@ def image_panel(title: str, image_topic: str, annotations: Mapping[str, bool]) -
         "synchronize": False,
         "annotations": {topic: {"visible": is_on} for topic, is_on in annotations.items()},
     }
-    return panel(title, {"imageMode": mode, "synchronize": False, "syncedTopics": dict.fromkeys(annotations, False)})
+    scene = {"transforms": _TRANSFORMS}
+    synced = dict.fromkeys(annotations, False)
+    return panel(title, {"imageMode": mode, "scene": scene, "synchronize": False, "syncedTopics": synced})
 
 
 def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye, follow: str = "") -> dict[str, Any]:
@@ -130,7 +142,7 @@ def scene_panel(title: str, frame_id: str, topics: Mapping[str, bool], eye: Eye,
         "followMode": "follow-pose",
         "followTf": follow or frame_id,
         # Lines to the parents of frames end at the origin of the map, which may be far away.
-        "scene": {"transforms": {"visible": False, **({"lineWidth": 0} if follow else {})}},
+        "scene": {"transforms": {**_TRANSFORMS, "visible": False, **({"lineWidth": 0} if follow else {})}},
         "transforms": {},
         "topics": {topic: {"visible": is_on, **_scene_style(topic)} for topic, is_on in topics.items()},
         "layers": {"grid": grid},
@@ -144,14 +156,21 @@ def _scene_style(topic: str) -> Config:
     return {"showOutlines": False} if "/predictions/" in topic else {}
 
 
-def plot_panel(title: str, paths: Mapping[str, str], most: float | None = None) -> dict[str, Any]:
-    """A plot over time: message paths with their labels. Its axis ends at 0 and ``most``, if that is given.
+def plot_panel(title: str, paths: Mapping[str, PlotCurve], most: float | None = None) -> dict[str, Any]:
+    """A plot over time: curves by their message paths. Its axis ends at 0 and ``most``, if that is given.
 
     Without limits, viewers cut lines at the border of the panel.
     """
     curves = [
-        {"value": value, "enabled": True, "timestampMethod": "receiveTime", "label": label}
-        for value, label in paths.items()
+        {
+            "value": value,
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+            "label": curve.label,
+            "color": curve.colour,
+            "lineSize": curve.line_px,
+        }
+        for value, curve in paths.items()
     ]
     plot = {
         "paths": curves,
@@ -168,9 +187,9 @@ def plot_panel(title: str, paths: Mapping[str, str], most: float | None = None) 
     return panel(title, plot)
 
 
-def log_panel(title: str, topic: str) -> dict[str, Any]:
-    """A panel with the lines of a log topic."""
-    return panel(title, {"topicToRender": topic, "minLogLevel": 1, "searchTerms": []})
+def log_panel(title: str, topic: str, level: int) -> dict[str, Any]:
+    """A panel with the lines of a log topic, from a level on."""
+    return panel(title, {"topicToRender": topic, "minLogLevel": level, "searchTerms": []})
 
 
 def split(parts: Sequence[Tree], direction: str = "row") -> Tree:
@@ -206,8 +225,7 @@ def _mosaic(tree: Tree) -> str | dict[str, Any]:
 
 class CameraChannels(NamedTuple):
     """The channels of a camera: the names of its topics below the prefix, the topic of pictures, the coordinate frame
-    and the view of the ground, the number of steps of forecasts, and whether their errors against ground truth are
-    known.
+    and the view of the ground, and whether errors of forecasts against ground truth are known.
 
     ``follow`` is the frame of the robot that recorded 3D boxes; ``recorded`` are topics that viewers draw in 3D
     themselves, and whether they are these boxes; ``seen_by`` are the topics of the pictures that boxes are drawn on.
@@ -219,7 +237,6 @@ class CameraChannels(NamedTuple):
     pictures: str | None
     frame_id: str
     eye: Eye
-    last_step: int
     is_truth_known: bool = False
     follow: str = ""
     recorded: Mapping[str, bool] = {}
@@ -242,7 +259,7 @@ class CameraChannels(NamedTuple):
 
 def best_channels(names: Collection[str]) -> list[str]:
     """The channels to switch on, of those below the prefix: the best tracks, and their forecasts."""
-    best = [name for name in _BEST if name in names][:1]
+    best = [name for name in BEST if name in names][:1]
     of_these = "retracks/predictions"
     forecasts = [of_these for name in best if name.startswith("retracks") and of_these in names]
     return best + forecasts + zones_of(best, names)
@@ -273,7 +290,7 @@ def make(camera: CameraChannels) -> dict[str, bytes]:
     if not camera.has_any_view():
         return {}
     files = {TRACKING: _tracking(camera)}
-    if sum(any(camera.has_view(name) for name in names) for _, names in _KINDS) > 1:
+    if sum(any(map(camera.has_view, kind.names)) for kind in KINDS) > 1:
         files[COMPARING] = _comparing(camera)
     if camera.has_view("predictions") or camera.has_view("retracks/predictions"):
         files[PREDICTIONS] = _predictions(camera)
@@ -284,10 +301,10 @@ def _tracking(camera: CameraChannels) -> bytes:
     channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in camera.names}
     on = best_channels([name for name in channels if camera.has_view(name)])
     panels: dict[str, Any] = {}
-    picture = _seen_by(camera, panels, on) or _image(camera, panels, "picture", "Video", on)
+    pictures = _pictures(camera, panels, "Video", on)
     scene = _ground(camera, panels, "ground", "Tracks" if camera.recorded else "Ground", on)
-    left = [*(picture or scene), *_plots(camera, panels)]
-    right = [*(scene if picture else ()), *_recorded(camera, panels), *_event_text_or_log(camera, panels)]
+    left = [*(pictures or scene), *_plots(camera, panels)]
+    right = [*(scene if pictures else ()), *_recorded(camera, panels), *_event_text_or_log(camera, panels)]
     return layout(panels, _columns(left, right, 55.0))
 
 
@@ -295,16 +312,18 @@ def _comparing(camera: CameraChannels) -> bytes:
     panels: dict[str, Any] = {}
     upper: list[Tree] = []
     shown = []
-    for number, (title, names) in enumerate(_KINDS):
-        shown_of_kind = [name for name in names if camera.has_view(name)][:1]
+    for number, kind in enumerate(KINDS):
+        title = kind.title.capitalize()
+        shown_of_kind = [name for name in kind.names if camera.has_view(name)][:1]
         shown_of_kind += [f"{name}{_ZONES}" for name in shown_of_kind if camera.has_view(f"{name}{_ZONES}")]
         if shown_of_kind:
             shown += shown_of_kind
             upper += _image(camera, panels, f"picture{number}", title, shown_of_kind) or _ground(
                 camera, panels, f"ground{number}", title, shown_of_kind
             )
-    lower = [*_ground(camera, panels, "ground", "All", shown), *_plots(camera, panels)]
-    events = [part for title, names in _KINDS for part in _events(camera, panels, title, names)]
+    all_of = ", ".join(f"{kind.sign} {kind.title}" for kind in KINDS if kind.sign and {*kind.names} & {*shown})
+    lower = [*_ground(camera, panels, "ground", f"All ({all_of})", shown), *_plots(camera, panels)]
+    events = [part for kind in KINDS for part in _events(camera, panels, kind.title.capitalize(), kind.names)]
     lower += [split(events, "column")] if events else []
     return layout(panels, ("column", split(upper), split(lower), 50.0) if lower else split(upper))
 
@@ -314,27 +333,24 @@ def _predictions(camera: CameraChannels) -> bytes:
     past = "retracks/full" if future.startswith("retracks") else "tracks"
     on = [future, past, "truth"]
     panels: dict[str, Any] = {}
-    panels["Plot!spread"] = _spread(camera, future)
     events = "retracks" if future.startswith("retracks") else "tracks"
-    left = [*_image(camera, panels, "picture", "Forecasts", on), *_errors(camera, panels)]
-    right = [*_ground(camera, panels, "ground", "Forecasts on the ground", on)]
-    beside = _events(camera, panels, "Tracking", (events,))
-    right.append(("row", "Plot!spread", beside[0], 60.0) if beside else "Plot!spread")
+    left = [*_pictures(camera, panels, "Forecasts", on), *_errors(camera, panels)]
+    beside = [*_spread(camera, panels, future), *_events(camera, panels, "Tracking", (events,))]
+    right = _ground(camera, panels, "ground", "Forecasts on the ground", on) + ([split(beside)] if beside else [])
     return layout(panels, _columns(left, right, 50.0))
 
 
-def _spread(camera: CameraChannels, future: str) -> dict[str, Any]:
-    """The spread of forecasts: mean and 90th percentile of each frame, or the variances of all people."""
-    source = f"{camera.prefix}/{future}"
-    if SPREAD in camera.highest:
-        paths = {
-            f"{source}/scores.rows[:].spread_mean_m": "mean (m)",
-            f"{source}/scores.rows[:].spread_90_m": "90 % (m)",
-        }
-        return plot_panel("Radius that holds 95 %", paths, limit_of(camera.highest[SPREAD]))
-    last = f"{source}.rows[:]{{step=={camera.last_step}}}"
-    paths = {f"{last}.cov_{axis}_m2": f"{axis[0]} variance (m2)" for axis in ("xx", "yy")}
-    return plot_panel("Uncertainty of forecasts", paths)
+def _spread(camera: CameraChannels, panels: dict[str, Any], future: str) -> list[Tree]:
+    """The spread of forecasts: mean and 90th percentile of each frame."""
+    source, colour = f"{camera.prefix}/{future}", (RETRACKED if future.startswith("retracks") else TRACKED).curve
+    if SPREAD not in camera.highest:
+        return []
+    paths = {
+        f"{source}/scores.rows[:].spread_mean_m": PlotCurve("mean (m)", colour),
+        f"{source}/scores.rows[:].spread_90_m": PlotCurve("90 % (m)", colour, _THICK),
+    }
+    panels["Plot!spread"] = plot_panel("Radius that holds 95 %", paths, limit_of(camera.highest[SPREAD]))
+    return ["Plot!spread"]
 
 
 def limit_of(highest: float | None, is_count: bool = False) -> float | None:
@@ -350,11 +366,12 @@ def limit_of(highest: float | None, is_count: bool = False) -> float | None:
 def _errors(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """Errors of forecasts: against ground truth, or without it against the later tracks."""
     front = "" if camera.is_truth_known else "later_"
-    labels = {"retracks/predictions": "re-tracked", "predictions": "tracker"}
     paths = {
-        f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": f"{measure}, {label}"
-        for measure in ("ADE", "FDE")
-        for name, label in labels.items()
+        f"{camera.prefix}/{name}/scores.rows[:].{front}{measure.lower()}_m": PlotCurve(
+            f"{measure}, {kind.title}", kind.curve, px
+        )
+        for measure, px in (("ADE", _THIN), ("FDE", _THICK))
+        for name, kind in (("retracks/predictions", RETRACKED), ("predictions", TRACKED))
         if f"{name}/scores" in camera.names
     }
     if not paths:
@@ -372,18 +389,18 @@ def _image(camera: CameraChannels, panels: dict[str, Any], name: str, title: str
     return [f"Image!{name}"]
 
 
-def _seen_by(camera: CameraChannels, panels: dict[str, Any], on: Collection[str]) -> list[Tree]:
-    """The pictures of calibrated cameras, side by side, with the 3D boxes on them."""
-    names = []
+def _pictures(camera: CameraChannels, panels: dict[str, Any], title: str, on: Collection[str]) -> list[Tree]:
+    """The pictures of the camera, or those of several cameras with the objects on them, one above the other."""
+    names: list[str] = []
     for number, pictures in enumerate(camera.seen_by[:_MOST_CAMERAS]):
         names.append(f"Image!camera{number}")
         annotations = camera.topics(f"/view/image{pictures}", on)
         panels[names[-1]] = image_panel(pictures, pictures, annotations)
-    return [split(names)] if names else []
+    return [split(names, "column")] if names else _image(camera, panels, "picture", title, on)
 
 
 def _ground(camera: CameraChannels, panels: dict[str, Any], name: str, title: str, on: Collection[str]) -> list[Tree]:
-    topics = camera.topics("/view/scene", [*on, "ground_plane"])
+    topics = camera.topics("/view/scene", [*on, "ground_plane", ROBOT])
     if not topics:
         return []
     topics |= dict.fromkeys(camera.recorded, False)
@@ -395,31 +412,25 @@ def _recorded(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
     """The boxes that other software recorded, for comparison."""
     if not any(camera.recorded.values()):
         return []
-    topics = {**camera.topics("/view/scene", ()), **camera.recorded}
+    topics = {**camera.topics("/view/scene", (ROBOT,)), **camera.recorded}
     panels["3D!recorded"] = scene_panel("Recorded boxes", camera.frame_id, topics, camera.eye, camera.follow)
     return ["3D!recorded"]
 
 
 def _plots(camera: CameraChannels, panels: dict[str, Any]) -> list[Tree]:
-    """The number of people, or of objects, if it is counted; otherwise their positions."""
-    labels = {"tracks": "tracker", "retracks": "re-tracked", "retracks/full": "re-tracked", "truth": "truth"}
+    """The number of people, or of objects, if it is counted."""
     counted = {
-        f"{camera.prefix}/{name}/counts.rows[:].tracked": label
-        for name, label in labels.items()
+        f"{camera.prefix}/{name}/counts.rows[:].tracked": PlotCurve(kind.title, kind.curve)
+        for kind in KINDS
+        for name in reversed(kind.names)
         if f"{name}/counts" in camera.names
     }
-    places = {
-        f"{camera.prefix}/{name}.rows[:].x_m": f"{label}, x (m)"
-        for name, label in labels.items()
-        if name in camera.names and name != "retracks/full"
-    }
-    if counted and "truth" in camera.names:
-        counted[next(iter(counted)).replace(".tracked", ".people")] = "truth"
-    if not counted and not places:
+    if not counted:
         return []
-    title = ("Objects" if camera.recorded else "People") if counted else "Places"
-    most = limit_of(camera.highest.get(PEOPLE), is_count=True) if counted else None
-    panels["Plot!people"] = plot_panel(title, counted or places, most)
+    if "truth" in camera.names:
+        counted[next(iter(counted)).replace(".tracked", ".people")] = PlotCurve(GROUND_TRUTH.title, GROUND_TRUTH.curve)
+    title, most = "Objects" if camera.recorded else "People", camera.highest.get(PEOPLE)
+    panels["Plot!people"] = plot_panel(title, counted, limit_of(most, is_count=True))
     return ["Plot!people"]
 
 
@@ -427,7 +438,10 @@ def _events(camera: CameraChannels, panels: dict[str, Any], title: str, names: C
     """The text of events of the first of these channels that has any."""
     with_events = [f"{name}{_EVENTS}" for name in names if f"{name}{_EVENTS}" in camera.names][:1]
     for topic in with_events:
-        panels[f"RosOut!{title}"] = log_panel(f"{title}: events", f"{camera.prefix}/{topic}")
+        # A tracker's tracks begin and end, and nothing else is known of them without ground truth.
+        is_told = "truth" in camera.names or topic.startswith("retracks")
+        level = _WARNING if is_told else _ALL_LEVELS
+        panels[f"RosOut!{title}"] = log_panel(f"{title}: events", f"{camera.prefix}/{topic}", level)
     return [f"RosOut!{title}" for _ in with_events]
 
 

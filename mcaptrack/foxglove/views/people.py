@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.foxglove import Cuboids
+from mcaptrack.foxglove.views.styles import LIKELY
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
@@ -22,7 +23,7 @@ from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.camera_motion import to_scene
 from mcaptrack.schema.classes import class_name
-from mcaptrack.schema.framing import frame_times, join_frames, row_ends, unique_values
+from mcaptrack.schema.framing import frame_times, has_any, join_frames, row_ends, unique_values
 from mcaptrack.schema.predictions import tails_of
 from mcaptrack.schema.resampling import interval_ns, resample
 
@@ -40,10 +41,7 @@ _NAME_LENGTH: Final = 20
 #: Forecasts are shown until the next ones are due.
 _FORECAST_S: Final = 1.0
 #: The largest number of points of the line of a forecast.
-_FORECAST_POINTS: Final = 5
-#: The 95 % quantile of the chi-squared distribution with two degrees of freedom: the squared size, in standard
-#: deviations, of an ellipse with probability 95 %.
-CHI2_95: Final = 5.991464547107979
+_FORECAST_POINTS: Final = 4
 
 
 class People(NamedTuple):
@@ -80,8 +78,8 @@ class Trails(NamedTuple):
 class ForecastPaths(NamedTuple):
     """N forecasts of equal length: index of the message, id, and the path (N, P, 2) m.
 
-    ``end_m`` (N, 2) is the mean of the last step. ``spread_m2`` (N, 2, 2) is the covariance of the normal distribution
-    with the same 95 % ellipse as the last step, NaN if unknown: of a mixture, another one than its covariance.
+    ``end_m`` (N, 2) is the mean of the last step. ``spread_m2`` (N, 2, 2) are the squared half axes of the ellipse that
+    holds it with the probability ``LIKELY``, as a covariance holds standard deviations; NaN if unknown.
     """
 
     message: Ints
@@ -108,7 +106,7 @@ class PeopleInParts:
     """The people of a channel of tracks at rising times (F,), for some of the times at once.
 
     Missing pixels or metres are computed with the plane. ``classes`` are names of classes by number, which labels show
-    if the channel has several classes. ``path`` is how the camera moves, if boxes between frames are to be compensated
+    if the channel has several classes and no 3D boxes. ``path`` is how the camera moves, if boxes are to be compensated
     for it.
     """
 
@@ -124,7 +122,8 @@ class PeopleInParts:
         self._frames = to_scene(frames, path)
         self._usual_ns = interval_ns(frame_times(frames))
         has_several = len(unique_values(TRACKS, frames, "class_id")) > 1
-        self._names = classes if has_several else None
+        is_solid = has_any(TRACKS, frames, lambda rows: np.isfinite(rows["z_m"]))
+        self._names = classes if has_several and not is_solid else None
         total = int(row_ends(frames)[-1])
         self._each = max(total / max(len(frames), 1), total / max(len(at_ns), 1))
         self._last: tuple[int, People] | None = None
@@ -261,7 +260,7 @@ def forecasts(frames: Sequence[Frame], first: int = 0, last: int | None = None) 
         shown = np.unique(np.linspace(0, count - 1, min(count, _FORECAST_POINTS)).round().astype(np.int64))
         names = ("cov_xx_m2", "cov_xy_m2", "cov_xy_m2", "cov_yy_m2")
         spread = np.stack([rows[name][end] for name in names], axis=-1).reshape(-1, 2, 2)
-        spread *= (squared_radius(0.95, tails_of(rows[end])) / CHI2_95)[:, None, None]
+        spread *= squared_radius(LIKELY, tails_of(rows[end]))[:, None, None]
         yield ForecastPaths(message[begin], number[begin], xy[begin[:, None] + shown], xy[end], spread)
 
 
@@ -310,14 +309,14 @@ def segments(points: Floats, drawn: float = 1.0) -> Floats:
 
 
 def ellipses(spread_m2: Floats) -> tuple[Floats, Floats]:
-    """Half axes (N, 2), the longer first, and turns (N,) of the 95 % ellipses of covariances (N, 2, 2).
+    """Half axes (N, 2), the longer first, and turns (N,) of ellipses, by their squares (N, 2, 2).
 
-    NaN where a covariance is not known or not positive.
+    NaN where these are not known or not positive.
     """
     is_positive = np.asarray(np.isfinite(spread_m2).all(axis=(1, 2)), np.bool_)
     values, vectors = np.linalg.eigh(np.where(is_positive[:, None, None], spread_m2, np.eye(2)))
     is_positive &= values[:, 0] >= -1e-9 * np.abs(values[:, 1])
-    half = np.sqrt(CHI2_95 * np.maximum(values[:, ::-1], 0))
+    half = np.sqrt(np.maximum(values[:, ::-1], 0))
     turn = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
     turn = np.where(turn > np.pi / 2, turn - np.pi, np.where(turn <= -np.pi / 2, turn + np.pi, turn))
     return np.where(is_positive[:, None], half, np.nan), np.where(is_positive, turn, np.nan)

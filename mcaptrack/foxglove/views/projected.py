@@ -5,16 +5,15 @@ Letters: M pictures, N objects, E lines, P points.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.foxglove import Annotations, Cuboids, colours
-from mcaptrack.foxglove.views import label_places
-from mcaptrack.foxglove.views.ground import class_colours, raised
-from mcaptrack.foxglove.views.image import BATCH, PictureTimes, View, fade
-from mcaptrack.foxglove.views.label_places import INTERPOLATED, OBSERVED, TrackStyle, unit_of_width
+from mcaptrack.foxglove.views import label_places, styles
+from mcaptrack.foxglove.views.ground import raised
+from mcaptrack.foxglove.views.image import BATCH, PictureTimes, View
 from mcaptrack.foxglove.views.people import (
     People,
     PeopleInParts,
@@ -25,17 +24,15 @@ from mcaptrack.foxglove.views.people import (
     segments,
     shown_at,
 )
+from mcaptrack.foxglove.views.styles import Scale, TrackStyle
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.pinhole import Lens, project
 from mcaptrack.schema import Frame
 
 #: Lines are cut off at this distance before the camera.
 _NEAR_M: Final = 0.1
-_TEXT_PX: Final = 12.0
-_ELLIPSE_POINTS: Final = 14
 #: Lines that end farther outside of the picture than so many of its widths are not drawn.
 _MOST_WIDTHS: Final = 8.0
-_WHITE: Final = (1.0, 1.0, 1.0)
 #: The corners of a box, as shares of its size, and its edges as pairs of these.
 _CORNERS: Final = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 _EDGES: Final = np.array([(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1])
@@ -58,32 +55,30 @@ class MovingCamera(NamedTuple):
     height_px: int
 
 
-def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle, classes: Mapping[int, str] = {}) -> View:
-    """Draw the edges of 3D boxes in the colours of their classes, with numbers; interpolated ones are fainter."""
-    unit = unit_of_width(camera.width_px)
+def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle) -> View:
+    """Draw the edges of 3D boxes with ids; interpolated ones are fainter."""
+    scale = Scale.of_width(camera.width_px)
     pictures = PictureTimes(camera.t_ns, camera.stamp_ns)
-    for first, last, people in PeopleInParts(frames, camera.at_ns, (), classes).parts(BATCH):
+    for first, last, people in PeopleInParts(frames, camera.at_ns, ()).parts(BATCH):
         with_body = np.flatnonzero(people.has_body())
-        rgb = np.broadcast_to(_WHITE, (len(people.number), 3)) if style.is_white else colours(people.number)
-        body_rgb = rgb if style.is_white else class_colours(people.class_id, classes)
-        alpha = np.where(people.observed, OBSERVED, INTERPOLATED)
+        rgb, alpha = style.colours(people.number), styles.opacity(people.observed)
         px, is_seen = _on_pictures(corners(people.body.chosen(with_body))[:, _EDGES], people.frame[with_body], camera)
-        named, corner = _label_corners(people, with_body, px, is_seen, unit, camera.at_ns)
+        named, corner = _label_corners(people, with_body, px, is_seen, scale.text_px, camera.at_ns)
         for span, drawn in pictures.batches(first, last):
             some = slice(*np.searchsorted(people.frame[with_body], [span.start, span.stop]))
             rows = with_body[some]
             frame = people.frame[rows] - span.start
-            thickness = style.thickness * unit
-            _draw(drawn, frame, px[some], is_seen[some], body_rgb[rows], alpha[rows, None], thickness)
+            thickness = style.thickness * scale.line_px
+            _draw(drawn, frame, px[some], is_seen[some], rgb[rows], alpha[rows, None], thickness)
             here = slice(*np.searchsorted(people.frame[named], [span.start, span.stop]))
             these = named[here]
             frame = people.frame[these] - span.start
-            drawn.labels(frame, corner[here], people.label[these], rgb[these], _TEXT_PX * unit)
+            drawn.labels(frame, corner[here], people.label[these], rgb[these], scale.text_px)
             yield from pictures.numbered(span, drawn)
 
 
 def _label_corners(
-    people: People, rows: Ints, px: Floats, is_seen: Bools, unit: float, at_ns: Ints
+    people: People, rows: Ints, px: Floats, is_seen: Bools, text_px: float, at_ns: Ints
 ) -> tuple[Ints, Floats]:
     """The rows with boxes in view, of those with lines (N, E, 2, 2) in pictures, and the lower left corners of their
     labels: at the upper left of what is seen of a box, and away from each other.
@@ -91,21 +86,20 @@ def _label_corners(
     has_name = is_seen.any(axis=1)
     named = rows[has_name]
     inside = np.where(is_seen[..., None, None], px, np.inf)[has_name].reshape(len(named), -1, 2)
-    corner = np.maximum(inside.min(axis=1, initial=np.inf), [0.0, _TEXT_PX * unit])
-    extent = label_places.extents(people.label[named], _TEXT_PX * unit)
-    frame, number = people.frame[named], people.number[named]
-    corner[:, 1] += label_places.shifts(at_ns, frame, number, corner, extent, is_down=False)
+    corner = np.maximum(inside.min(axis=1, initial=np.inf), [0.0, text_px])
+    frame, number, label = people.frame[named], people.number[named], people.label[named]
+    corner[:, 1] += label_places.shifts(at_ns, frame, number, corner, label, text_px, is_down=False)
     return named, corner
 
 
 def predictions(frames: Sequence[Frame], camera: MovingCamera, bodies: Sequence[Frame]) -> View:
-    """Draw the latest forecasts of tracks with 3D boxes, ``bodies``, as lines on the ground with 95 % ellipses."""
-    unit = unit_of_width(camera.width_px)
+    """Draw the latest forecasts of tracks with 3D boxes, ``bodies``, as lines on the ground with ellipses."""
+    line_px = Scale.of_width(camera.width_px).line_px
     wanted = latest(frames, camera.at_ns)
     futures = []
     for plain in forecasts(frames):
         future = raised(plain, frames, bodies)
-        flat = ellipse_points(plain.end_m, *ellipses(plain.spread_m2), _ELLIPSE_POINTS)
+        flat = ellipse_points(plain.end_m, *ellipses(plain.spread_m2), styles.ELLIPSE_POINTS)
         up = np.broadcast_to(future.end_m[:, None, 2:], (*flat.shape[:2], 1))
         ring = np.concatenate([flat, up], axis=2)
         ring = np.concatenate([ring, ring[:, :1]], axis=1)
@@ -115,11 +109,11 @@ def predictions(frames: Sequence[Frame], camera: MovingCamera, bodies: Sequence[
         for future, ring, rgb in futures:
             which, frame = shown_at(future.message, wanted[span])
             steps = future.path_m.shape[1] - 1
-            weaker = np.broadcast_to(fade(steps, steps, weakest=0.25)[::-1], (len(which), steps))
-            for points, alpha in ((future.path_m, weaker), (ring, np.full((len(which), 1), 0.5))):
+            weaker = np.broadcast_to(styles.fade_ahead(steps), (len(which), steps))
+            for points, alpha in ((future.path_m, weaker), (ring, np.full((len(which), 1), styles.ELLIPSE_ALPHA))):
                 ends = segments(points[which]).reshape(len(which), points.shape[1] - 1, 2, 3)
                 px, is_seen = _on_pictures(ends, frame + span.start, camera)
-                _draw(drawn, frame, px, is_seen, rgb[which], alpha, 1.5 * unit)
+                _draw(drawn, frame, px, is_seen, rgb[which], alpha, styles.FORECAST_LINE * line_px)
         yield from pictures.numbered(span, drawn)
 
 

@@ -16,7 +16,7 @@ from markupsafe import Markup
 
 from mcaptrack.foxglove.views import SUFFIXES
 from mcaptrack.transforms import FULL
-from mcaptrack.viewing.from_above import BACKGROUND
+from mcaptrack.viewing.legend import BACKGROUND
 from mcaptrack.viewing.notebook.pictures import Clip
 from mcaptrack.viewing.report.formatting import render
 

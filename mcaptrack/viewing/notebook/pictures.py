@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from math import ceil, isfinite
 from typing import Any, Final, NamedTuple
 
@@ -34,7 +33,8 @@ from mcaptrack.sources.video import encode_image
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.rendering import draw, message_at, scaled, sights, without_repeated
+from mcaptrack.viewing.painting import CLOSED, draw, strokes
+from mcaptrack.viewing.rendering import message_at, scaled, sights, without_repeated
 
 #: The largest width of a player and of a still in pixels, unless it is given.
 PLAYER_PX: Final = 640
@@ -59,8 +59,6 @@ Progress = Callable[[str, int, int], None]
 # colour, background, text], at its lower left corner. All is in pixels of the picture.
 
 
-CLOSED, OPEN, PAIRS = 0, 1, 2
-_LINE_LOOP, _LINE_STRIP, _LINE_LIST = 2, 3, 4
 #: The decimal places of coordinates.
 _DIGITS: Final = 2
 
@@ -82,21 +80,12 @@ class Strokes:
     def of(self, annotations: Any) -> list[list[Any]]:
         """Return the lines and the texts of an ImageAnnotations message; what can't be seen is left out."""
         lines: list[Line] = []
-        for part in annotations.points:
-            points = [(round(point.x, _DIGITS), round(point.y, _DIGITS)) for point in part.points]
-            if not all(isfinite(x) and isfinite(y) for x, y in points):
-                continue
-            shades = part.outline_colors
-            if part.type == _LINE_LOOP:
-                fill = self._colour(part.fill_color)
-                self._add(lines, CLOSED, part.thickness, self._colour(part.outline_color), points, fill)
-            elif part.type == _LINE_LIST and 2 * len(shades) == len(points):
-                self._pairs(lines, part.thickness, shades, zip(points[::2], points[1::2], strict=True))
-            elif part.type == _LINE_STRIP and points and len(shades) == len(points):
-                self._pairs(lines, part.thickness, shades[1:], pairwise(points))
-            elif part.type in (_LINE_STRIP, _LINE_LIST):
-                kind = OPEN if part.type == _LINE_STRIP else PAIRS
-                self._add(lines, kind, part.thickness, self._colour(part.outline_color), points)
+        for line in strokes(annotations):
+            colour = self._colour(line.colour)
+            fill = self._colour(line.fill) if line.kind == CLOSED else -1
+            if max(colour, fill) >= 0:
+                points = [round(value, _DIGITS) for value in line.points.ravel().tolist()]
+                lines.append([line.kind, round(line.thickness, 2), colour, fill, points])
         texts: list[Text] = [
             [
                 round(text.position.x, _DIGITS),
@@ -110,21 +99,6 @@ class Strokes:
             if isfinite(text.position.x) and isfinite(text.position.y)
         ]
         return [lines, texts]
-
-    def _pairs(self, lines: list[Line], thickness: float, shades: Any, pairs: Any) -> None:
-        """Add pairs of points that have colours of their own: one line for each colour."""
-        by_colour: dict[int, list[tuple[float, float]]] = {}
-        for shade, pair in zip(shades, pairs, strict=True):
-            by_colour.setdefault(self._colour(shade), []).extend(pair)
-        for colour, points in by_colour.items():
-            self._add(lines, PAIRS, thickness, colour, points)
-
-    @staticmethod
-    def _add(
-        lines: list[Line], kind: int, thickness: float, colour: int, points: list[tuple[float, float]], fill: int = -1
-    ) -> None:
-        if points and max(colour, fill) >= 0:
-            lines.append([kind, round(thickness, 2), colour, fill, [value for point in points for value in point]])
 
     def _colour(self, rgba: Any) -> int:
         """Return the number of a colour; -1 if it can't be seen."""

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.foxglove.palette import COUNT as COLOURS
-from mcaptrack.foxglove.views.people import CHI2_95, ellipse_points, ellipses
+from mcaptrack.foxglove.views.people import ellipse_points, ellipses
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
@@ -39,8 +39,8 @@ _GROUND: Final = (460, 520)
 _AXIS_PX: Final = 34
 #: The time before a forecast from which its track is drawn.
 _PAST_S: Final = 4.0
-#: The size of an ellipse that holds half of a normal distribution, in that of one that holds 95 %.
-_HALF: Final = (2 * np.log(2) / CHI2_95) ** 0.5
+#: The squared size of an ellipse that holds half of a normal distribution, in standard deviations.
+_HALF: Final = 2 * np.log(2)
 #: The colour of a heat map, red, green and blue.
 _HEAT: Final = (224, 84, 0)
 
@@ -140,8 +140,7 @@ def forecast_map(
         mean_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
         last = rows[-1]
         spread = np.array([[[last["cov_xx_m2"], last["cov_xy_m2"]], [last["cov_xy_m2"], last["cov_yy_m2"]]]])
-        half, turn = ellipses(spread)
-        outline = ellipse_points(mean_m[-1:], half * _HALF, turn, 32)[0]
+        outline = ellipse_points(mean_m[-1:], *ellipses(_HALF * spread), 32)[0]
         start = before.get(track, np.empty((0, 2)))
         tracks.append(
             {

@@ -1,0 +1,135 @@
+"""Annotation messages painted on pictures, and as lines of one colour.
+
+Letters: P points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.geometry.arrays import Floats, Image
+
+#: The size of text that OpenCV draws at a scale of 1, and the least one in a video.
+_TEXT_PX: Final = 24.0
+_LEAST_TEXT_PX: Final = 9.0
+#: The number of binary places of pixel coordinates.
+_SHIFT: Final = 4
+#: Kinds of lines, and those of messages.
+CLOSED, OPEN, PAIRS = 0, 1, 2
+_KINDS: Final = {2: CLOSED, 3: OPEN, 4: PAIRS}
+
+
+class Stroke(NamedTuple):
+    """A line of one colour: ``kind`` is closed, open or pairs of points (P, 2); ``fill`` is the colour inside of it.
+
+    Colours are those of messages; the opacity of a fill that isn't there is 0.
+    """
+
+    kind: int
+    thickness: float
+    colour: Any
+    fill: Any
+    points: Floats
+
+
+def strokes(annotations: Any) -> Iterator[Stroke]:
+    """The lines of an ImageAnnotations message: those with several colours as pairs of points of each."""
+    for part in annotations.points:
+        kind = _KINDS.get(part.type)
+        points = np.array([(point.x, point.y) for point in part.points], np.float64).reshape(-1, 2)
+        if kind is None or not len(points) or not np.isfinite(points).all():
+            continue
+        shades, pairs = list(part.outline_colors), None
+        if kind == PAIRS:
+            points = points[: len(points) // 2 * 2]
+            pairs = points.reshape(-1, 2, 2)
+        elif kind == OPEN and len(shades) == len(points):
+            pairs, shades = np.stack([points[:-1], points[1:]], axis=1), shades[1:]
+        if pairs is None or len(shades) != len(pairs):
+            yield Stroke(kind, part.thickness, part.outline_color, part.fill_color, points)
+            continue
+        of_colour: dict[tuple[float, ...], list[int]] = {}
+        for number, shade in enumerate(shades):
+            of_colour.setdefault((shade.r, shade.g, shade.b, shade.a), []).append(number)
+        for numbers in of_colour.values():
+            yield Stroke(PAIRS, part.thickness, shades[numbers[0]], part.fill_color, pairs[numbers].reshape(-1, 2))
+
+
+def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
+    """Draw an ImageAnnotations message on a picture, BGR (height, width, 3), that has ``scale`` times its size."""
+    import cv2
+
+    paint, cover = np.zeros_like(image), np.zeros(image.shape[:2], np.uint8)
+    lines = list(strokes(annotations))
+    pixels = [np.rint(line.points * (scale * 2**_SHIFT)).clip(-(2**24), 2**24).astype(np.int32) for line in lines]
+    for line, at in zip(lines, pixels, strict=True):
+        if line.kind == CLOSED and line.fill.a > 0:
+            image = _filled(image, at, line.fill)
+    for line, at in zip(lines, pixels, strict=True):
+        if line.colour.a > 0:
+            thickness = max(1, round(line.thickness * max(scale, 0.5)))
+            drawn = list(at.reshape(-1, 2, 2)) if line.kind == PAIRS else [at]
+            is_closed = line.kind == CLOSED
+            # The colour is drawn a little wider than its mask, so that soft edges have it, too.
+            cv2.polylines(paint, drawn, is_closed, _bgr(line.colour), thickness + 2, cv2.LINE_8, _SHIFT)
+            cv2.polylines(cover, drawn, is_closed, round(255 * line.colour.a), thickness, cv2.LINE_AA, _SHIFT)
+    share = cover[..., None].astype(np.float32) / 255
+    image = np.rint(image * (1 - share) + paint * share).astype(np.uint8)
+    for text in annotations.texts:
+        _write(image, text, scale)
+    return image
+
+
+def _bgr(rgba: Any) -> tuple[int, int, int]:
+    return round(255 * rgba.b), round(255 * rgba.g), round(255 * rgba.r)
+
+
+def _filled(image: Image, line: NDArray[np.int32], rgba: Any) -> Image:
+    """Paint the inside of a closed line over what was painted before, with the line's opacity."""
+    import cv2
+
+    cover = np.zeros(image.shape[:2], np.uint8)
+    cv2.fillPoly(cover, [line], round(255 * rgba.a), cv2.LINE_AA, _SHIFT)
+    rows, columns = (np.flatnonzero(cover.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return image
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    share = cover[part][..., None].astype(np.float32) / 255
+    image = image.copy()
+    image[part] = np.rint(image[part] * (1 - share) + np.array(_bgr(rgba), np.float32) * share).astype(np.uint8)
+    return image
+
+
+def _write(image: Image, text: Any, scale: float) -> None:
+    size_px = max(text.font_size * scale, _LEAST_TEXT_PX)
+    width, height, below = text_size(text.text, size_px)
+    x, y = round(text.position.x * scale), round(text.position.y * scale)
+    y = max(y, height + below)
+    image[max(0, y - height - below) : max(0, y + 1), max(0, x) : max(0, x + width + 3)] = _bgr(text.background_color)
+    put_text(image, text.text, (x + 1, y - below + 1), size_px, _bgr(text.text_color))
+
+
+def text_size(text: str, size_px: float) -> tuple[int, int, int]:
+    """Width, height and depth below the line in px of a text of this size."""
+    import cv2
+
+    size = size_px / _TEXT_PX
+    (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, _thickness(size))
+    return width, height, below
+
+
+def put_text(image: Image, text: str, at: tuple[int, int], size_px: float, bgr: tuple[int, int, int]) -> None:
+    """Write a text of this size from its lower left corner on."""
+    import cv2
+
+    size = size_px / _TEXT_PX
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, bgr, _thickness(size), cv2.LINE_AA)
+
+
+def _thickness(size: float) -> int:
+    """The thickness of the lines of letters of a scale."""
+    return max(1, round(size / 2))
