@@ -26,8 +26,8 @@ THREADS: Final = (
 #: Names and descriptions.
 VARIABLES: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "MCAPTRACK_CONFIG": "the file of options, as `--config` names it",
-        "MCAPTRACK_LOG_FORMAT": "`text` or `json`, as `--log-format` says",
+        "MCAPTRACK_CONFIG": "the file of options",
+        "MCAPTRACK_LOG_FORMAT": "`text` or `json`: the form of notes, progress and errors",
         "MCAPTRACK_MAX_CHUNK_MIB": "chunks of a log with a larger stated size are refused, in MiB",
         "MCAPTRACK_MAX_MEGAPIXELS": "pictures with a larger stated size are refused, in millions of pixels",
         "MCAPTRACK_MAX_NETWORK_MB": "a predictor in ONNX format that takes more memory is ended, in MB",

@@ -41,7 +41,7 @@ def test_tables_have_the_name_of_the_log_as_exported_ones_do(tmp_path):
             assert set(table.column("recording").to_pylist()) <= {"a"}
         assert opened.table("tracks", "/camera/truth").num_rows == 6
         assert opened.table("/imu").column("gyro_x").to_pylist() == [0.5] * 4
-        with pytest.raises(McaptrackError, match="has no table nothing; there are frames, detections"):
+        with pytest.raises(McaptrackError, match="has no table or channel nothing; there are frames, detections"):
             opened.table("nothing")
         with pytest.raises(McaptrackError, match="has no channel /nowhere"):
             opened.table("tracks", "/nowhere")

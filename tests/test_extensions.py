@@ -564,7 +564,7 @@ def test_names_that_are_no_words_are_left_out(site):
     said = done("--help").out
     assert "odd-names" not in said
     assert "\x1b[31m" not in said
-    assert "no such command" in call("a b").err
+    assert "there is no command a b" in call("a b").err
 
 
 def test_two_commands_of_one_name_are_refused(site):

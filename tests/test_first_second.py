@@ -65,7 +65,7 @@ def test_each_switch_and_repair_has_a_link_a_second_before_the_track_was_lost(se
         assert opened_at(one.link) == pytest.approx(one.t_ns / 1e9 - 1 - one.unseen_s, abs=1e-6)
         assert f"at {one.t_ns / 1e9:.1f} s" in one.text
         (layout,) = parse_qs(urlsplit(one.link).query)["layoutUrl"]
-        assert layout == served.layouts["tracking" if "retracks" in one.topic else "comparing"]
+        assert layout == served.layouts["comparing"]
 
 
 def test_viewers_open_where_tracks_are_and_all_links_agree(served):
@@ -169,7 +169,7 @@ def test_plots_have_room_for_every_value_and_legends_beside_them(finished):
     limited = 0
     with mcaptrack.open(finished) as opened:
         for plot in plots:
-            assert (plot["legendDisplay"], plot["sidebarDimension"]) == ("left", 130)
+            assert (plot["legendDisplay"], plot["sidebarDimension"]) == ("left", 170)
             values = []
             for one in plot["paths"]:
                 topic, column = one["value"].split(".rows[:].")

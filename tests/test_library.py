@@ -193,7 +193,7 @@ class TestRefused:
             ),
             "a parameter that can't be searched": (
                 lambda: mcaptrack.tune("log.mcap", search=["min_ious"]),
-                "`search=` has min_ious, which can't be searched; there are max_age_s",
+                "`search=` has min_ious, which can't be searched; did you mean min_iou? there are max_age_s",
             ),
             "a URL": (lambda: mcaptrack.info("https://host/a.mcap"), "https://host/a.mcap is a URL"),
             "what exists": (lambda: mcaptrack.recover("log.mcap", "log.mcap"), "both input and output"),
@@ -241,7 +241,7 @@ class TestRefused:
             ),
             "no limit": (
                 lambda: mcaptrack.evaluate("log.mcap").below({"idf1": 1}),
-                "there is no score idf1; there are",
+                "there is no score idf1; did you mean IDF1? there are",
             ),
             "what is there": (lambda: mcaptrack.open("log.mcap", create=True), "open it without `create=True`"),
         }.values(),
@@ -432,7 +432,10 @@ class TestNothingIsSilent:
     def test_an_unknown_camera_is_refused(self, place):
         before = Path("log.mcap").read_bytes()
         outcome = call("run", "log.mcap", "--camera", "camra")
-        assert (outcome.code, outcome.err) == (1, "mcaptrack: log.mcap has no camera camra; it has camera\n")
+        assert (outcome.code, outcome.err) == (
+            1,
+            "mcaptrack: log.mcap has no camera camra; did you mean camera? it has camera\n",
+        )
         assert Path("log.mcap").read_bytes() == before
 
     def test_predictions_at_the_rate_of_the_video_are_a_warning(self, place):

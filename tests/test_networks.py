@@ -190,7 +190,7 @@ class TestFiles:
             Predict(predictor=name)
 
     def test_a_file_that_is_not_there_is_refused_before_anything_runs(self):
-        with pytest.raises(McaptrackError, match=r"there is no file nowhere\.safetensors"):
+        with pytest.raises(McaptrackError, match=r"nowhere\.safetensors does not exist"):
             Predict(predictor="red:nowhere.safetensors")
 
 

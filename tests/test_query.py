@@ -429,7 +429,7 @@ def test_functions_that_lack_nanoseconds_are_named_with_the_remedy(known):
 def test_a_file_that_is_not_a_log_is_refused(tmp_path):
     (tmp_path / "empty.mcap").touch()
     assert "it is empty" in refusal(tmp_path / "empty.mcap", "select 1")
-    assert "can't be opened" in refusal(tmp_path / "none.mcap", "select 1")
+    assert "does not exist" in refusal(tmp_path / "none.mcap", "select 1")
     assert "no log" in refusal("select 1")
     assert "it is empty" in refusal(tmp_path, "select 1")  # a folder stands for the logs in it
     (tmp_path / "folder").mkdir()

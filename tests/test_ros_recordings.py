@@ -96,6 +96,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "report": [path, "-o", elsewhere / "a.html"],
         "recover": [path, "-o", elsewhere / "recovered.mcap"],
         "tune": [path, "--trials", "1", "--output", elsewhere / "tuned.toml"],
+        "cut": [path, "-o", elsewhere / "cut.mcap"],
         "drop": [path, "/robot/front/retracks*"],
         "zones": [path, "--zones", zones_file(elsewhere)],
         "view": [],  # serves until it is interrupted, and opens the log like all others

@@ -77,7 +77,7 @@ def cut(
     force: Force = False,
     progress: Reports = no_progress,
 ) -> CutResult:
-    """Cut a moment out of a log, choose channels, or merge logs: into a new log that can be looked at by itself.
+    """Cut a moment out of a log, choose channels, or merge logs.
 
     What viewers need from before the start is kept: latched messages, transforms, calibrations, ground planes and maps,
     each written again just before the start; and video from its key picture on. Results stay up to date with what they

@@ -495,8 +495,14 @@ def _differences(
 def _refuse_own(opened: logs.Log, prefix: str, ground_truth: Sequence[Frame]) -> None:
     """Raise McaptrackError if the ground truth of a log is its own re-tracking."""
     stage = STAGES["retrack"]
-    for topic in (f"{prefix}/{name}" for name in (FULL, stage.output_topic)):
-        if topic in opened.channels and repeats(ground_truth, opened.frames(topic, TRACKS)):
+
+    def is_truth(name: str) -> bool:
+        topic = f"{prefix}/{name}"
+        return topic in opened.channels and repeats(ground_truth, opened.frames(topic, TRACKS))
+
+    for name in (FULL, stage.output_topic):
+        topic = f"{prefix}/{name}"
+        if is_truth(name) and not is_truth(stage.input_topic):  # of a drawn scene without noise both may be
             raise McaptrackError(
                 f"{opened.path}: the ground truth is {topic} itself, row by row, so scores would say nothing; "
                 "`against=` compares other trackers by it"

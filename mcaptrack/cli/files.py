@@ -12,7 +12,7 @@ from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import print_table, refuse_usage, show
 from mcaptrack.errors import command, list_names
-from mcaptrack.location import Location
+from mcaptrack.location import Location, is_remote, parse
 
 if TYPE_CHECKING:
     from mcaptrack import CutResult, DropResult, LogCheck, LogRecovery
@@ -164,7 +164,7 @@ class Drop(EachLog["DropResult"]):
         from mcaptrack.fleet import find_logs
 
         log, files = self.values["logs"], [name for name in self.values["topics"] if Path(name).is_file()]
-        if files and not log.exists():
+        if files and not (log.exists() or is_remote(parse(log))):
             refuse_usage(f"the log comes before the topics: {command('drop', Path(files[0]), str(log))}")
         return find_logs([log])
 

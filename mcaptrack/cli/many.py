@@ -144,7 +144,8 @@ class EachLog(Called[T]):
         """
         if output is None or self.shares_output:
             return None
-        is_folder = output.is_dir() or not (output.suffix or (self.makes_folders and len(self.inputs) == 1))
+        is_itself = self.makes_folders and len(self.inputs) == 1
+        is_folder = not is_itself and (output.is_dir() or not output.suffix)
         return output if is_folder else None
 
     def run(self, names: Mapping[str, str]) -> None:

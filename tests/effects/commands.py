@@ -174,6 +174,7 @@ CASES: dict[str, dict[str, Case]] = {
     ),
     "evaluate": common(
         "evaluate a.mcap",
+        against="--against /camera/retracks",
         set=("evaluate a.mcap --json", "--set rules=motmetrics"),
         truth=("evaluate truth.txt", "--truth truth.txt"),
         similarity="--similarity iou",
@@ -243,11 +244,12 @@ CASES: dict[str, dict[str, Case]] = {
         output="-o b.csv",
         force=("query a.mcap 'select 1' -o clip.mp4", "--force"),
         verbose=("query a.mcap 'select 1'", "-v"),
+        worlds="--worlds",
     ),
     "info": common("info a.mcap", frames="--frames", output="-o b.txt", force=("info a.mcap -o clip.mp4", "--force")),
     "view": common(
         "view a.mcap",
-        at="--at 1",
+        at=("view eventful.mcap --links", "--at 1"),
         event=("view eventful.mcap", "--event 2"),
         links=("view eventful.mcap", "--links"),
         port="--port 1",
@@ -277,8 +279,8 @@ CASES: dict[str, dict[str, Case]] = {
     "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
     "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o fresh.mcap", "--force")),
     "cut": common(
-        "cut a.mcap -o b.mcap",
-        output=("cut a.mcap", "-o c.mcap"),
+        "cut a.mcap",
+        output="-o c.mcap",
         start_s="--start-s 1",
         end_s="--end-s 1",
         around="--around 1",

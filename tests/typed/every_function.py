@@ -100,9 +100,10 @@ def use(log: str) -> None:
 def repair(log: str) -> None:
     health: mcaptrack.DoctorResult = mcaptrack.doctor()
     dropped: mcaptrack.DropResult = mcaptrack.drop(log, ["/camera/tracks"], output="less.mcap")
+    cut: mcaptrack.CutResult = mcaptrack.cut(log, "moment.mcap", start_s=1.0, end_s=2.0)
     found: mcaptrack.LogCheck = mcaptrack.check(log, progress=say)
     kept: mcaptrack.LogRecovery | None = None if found.is_sound else mcaptrack.recover(log, "sound.mcap")
-    print(health.to_json(), dropped, [finding.words for finding in found.findings], kept)
+    print(health.to_json(), dropped, cut.messages, [finding.words for finding in found.findings], kept)
 
 
 if __name__ == "__main__":
