@@ -81,6 +81,11 @@ class TestHelp:
             assert option in words
             assert f"[{default}]" in words
 
+    def test_run_shows_the_defaults_of_the_stages(self):
+        of = {stage: {option.name: option for option in COMMANDS[stage].params} for stage in ("run", *STAGES)}
+        for name, stage in {"detector": "detect", "retracker": "retrack", "predictor": "predict"}.items():
+            assert of["run"][name].show_default == f"as before, or {of[stage][name].show_default}"
+
     @pytest.mark.parametrize("stage", STAGES)
     def test_the_help_of_a_stage_says_what_its_transforms_do(self, stage):
         words = COMMANDS[stage].help

@@ -307,6 +307,7 @@ class TestTables:
         assert table.schema.field("x_m").metadata[b"description"].decode() in titles
         assert f"{table.num_rows:,} rows, {len(table.column_names)} columns; the first 8 and the last 2 rows" in text
         assert len(html.of("tr")) == 1 + 8 + 1 + 2
+        assert " t t_ns ns row " in text  # a time is shown with its unit, a number is not
         rows = table.slice(0, 8).to_pylist() + table.slice(table.num_rows - 2).to_pylist()
         assert all(f" {row['t_ns']} " in text for row in rows)
 

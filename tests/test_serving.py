@@ -25,9 +25,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mcaptrack import log
+from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.viewing.serving import Limits, Server, requested_range
+from mcaptrack.viewing.serving import Limits, Page, Server, requested_range
 from tests.awaiting import until
 from tests.commands import call
 from tests.logs import SOME, write_log
@@ -343,6 +343,24 @@ def test_a_name_in_any_encoding_is_found(tmp_path):
     (tmp_path / name).write_bytes(b"here")
     with serving({name: tmp_path / name}) as server:
         assert ask(server.address(name))[2] == b"here"
+
+
+def test_warnings_of_a_page_go_to_the_listener_of_the_server():
+    heard = list[notices.Notice]()
+
+    def content() -> bytes:
+        notices.warn("odd")
+        return b""
+
+    with notices.listening(heard.append):
+        server = Server({}, index=Page(content))
+    with server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
+        thread.start()
+        assert ask(server.root)[0] == 200
+        server.shutdown()
+        thread.join()
+    assert [notice.message for notice in heard] == ["odd"]
 
 
 def test_a_port_in_use_is_refused(server):

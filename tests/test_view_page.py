@@ -153,6 +153,17 @@ def test_a_click_on_an_event_shows_its_frame_and_nothing_is_asked_for_elsewhere(
         events = [event for event in server.events if event.topic == "/camera/tracks"]
         tab.open(server.address)
         tab.wait("document.documentElement.classList.contains('ready')", "player-0.html")
+        tab.call("Emulation.setDeviceMetricsOverride", width=900, height=1600, deviceScaleFactor=1, mobile=False)
+        tab.wait(  # no gap between the picture and what it is controlled with, however high the window is
+            "(([w, h], {clientWidth: wide, clientHeight: high}) => innerHeight > 900 && Math.abs(high - wide * h / w) < 2)"
+            "(data.sizes[0], by('stage'))",
+            "player-0.html",
+        )
+        tab.run("document.querySelector('aside').hidden = true")
+        assert tab.run(
+            "[...document.querySelectorAll('[hidden]')].every(one => getComputedStyle(one).display === 'none')"
+        )
+        tab.run("document.querySelector('aside').hidden = false")
         for event in events[:2]:
             at_s = (event.t_ns - start_ns) / 1e9
             tab.run("by('which').value = '/camera/tracks'; list()")

@@ -185,6 +185,8 @@ def arrow_html(table: pa.Table) -> str | None:
     >>> arrow_html(pyarrow.table({"a": [1]})) is None
     True
     """
+    import pyarrow as pa
+
     about = [{key.decode(): text.decode() for key, text in (field.metadata or {}).items()} for field in table.schema]
     if not any("unit" in metadata and "description" in metadata for metadata in about):
         return None
@@ -192,11 +194,15 @@ def arrow_html(table: pa.Table) -> str | None:
     is_whole = rows <= FIRST + LAST
     numbers, texts = tables.cells(table, rows if is_whole else FIRST)
     texts += [] if is_whole else tables.cells(table.slice(rows - LAST), LAST)[1]
+    units = [  # dates and seconds have theirs in the text
+        "" if pa.types.is_timestamp(kind) else metadata.get("unit", "")
+        for kind, metadata in zip(table.schema.types, about, strict=True)
+    ]
     columns = [
-        ShownColumn(
-            name, metadata.get("unit", ""), metadata.get("description", ""), is_number, [line[place] for line in texts]
+        ShownColumn(name, unit, metadata.get("description", ""), is_number, [line[place] for line in texts])
+        for place, (name, unit, metadata, is_number) in enumerate(
+            zip(table.column_names, units, about, numbers, strict=True)
         )
-        for place, (name, metadata, is_number) in enumerate(zip(table.column_names, about, numbers, strict=True))
     ]
     return table_html(columns, rows)
 

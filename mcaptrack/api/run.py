@@ -70,7 +70,7 @@ def run(
         str | Transform | None, chooser("tracker", _AGAIN, shown="as before, or one that suits the detections")
     ] = None,
     retracker: Annotated[str | Transform | None, chooser("retracker", _AGAIN, shown="as before, or likelihood")] = None,
-    predictor: Annotated[str | Transform | None, chooser("predictor", _AGAIN, shown="as before, or red")] = None,
+    predictor: Annotated[str | Transform | None, chooser("predictor", _AGAIN, shown="as before, or blend")] = None,
     camera_motion: Annotated[CameraMotionUse | None, Option(tuning=True, shown="auto")] = None,
     across_classes: Annotated[
         bool | None, Option(_CLASSES, tuning=True, flag="across-classes/within-classes", shown="within")

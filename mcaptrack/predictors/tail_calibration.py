@@ -312,8 +312,8 @@ class TailCalibration:
         """Warn if ellipses, those of the predictor ``name``, became much larger than those of the table."""
         if self._independent * self._sums[1].sum() > _ENOUGH and self.factor > _LARGER:
             warn(
-                f"errors of predictions by {name} are {self.factor:.1f} times as large as in the walks that its "
-                "ellipses begin with; ellipses followed, but those of the first seconds are too small",
+                f"predictions by {name} are {self.factor:.1f} times as far off as in the walks that it was measured "
+                "on; their ellipses grew to fit this log, but those of its first seconds are too small",
                 "ellipses",
             )
 

@@ -20,6 +20,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from contextvars import copy_context
 from dataclasses import dataclass
 from email.utils import formatdate
 from http import HTTPStatus
@@ -110,6 +111,8 @@ class Server(ThreadingHTTPServer):
         index: Page | None = None,
     ) -> None:
         self._word = secrets.token_urlsafe(12)
+        #: Pages are made as the server was: their warnings go to its listener, and commands are spelled alike.
+        self._context = copy_context()
         self.limits, self.host = limits, host
         self.served: dict[bytes, Served] = {self.path(name): content for name, content in served.items()}
         self.served |= {b"/": index} if index else {}
@@ -176,6 +179,10 @@ class Server(ThreadingHTTPServer):
         del self._idle_since[longest]
         _end(longest)
         return True
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer in this thread, in the context of the server."""
+        self._context.copy().run(super().process_request_thread, request, client_address)
 
     def waits(self, connection: socket.socket, is_idle: bool) -> None:
         """Note whether a connection is idle."""

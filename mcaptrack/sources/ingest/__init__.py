@@ -122,7 +122,7 @@ class VideoJob(IngestJob):
         if video.why_transcode:
             parameters |= {"encoded_again_because": video.why_transcode}
             parameters |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
-            self.report.remarks.append(f"{video.path} is encoded again, as H.264: {video.why_transcode}")
+            self.report.remarks.append(f"{video.path} is encoded again, as H.264 for viewers: {video.why_transcode}")
         elif video.format in _FOXGLOVE_ALONE:
             kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
             self.report.remarks.append(f"{kept} and Lichtblick does not (`image_format='h264'` is for both)")

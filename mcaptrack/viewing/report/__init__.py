@@ -132,12 +132,8 @@ def _without_ground_truth(reports: Sequence[LogReport]) -> str:
     offline = {report.track_sets["offline"].topic for report in reports if "offline" in report.track_sets}
     if offline:
         events = [channel for report in reports for channel in report.data["events"] if channel["topic"] in offline]
-        joined = sum(event["counts"]["joined"] for event in events)
-        text += (
-            f"; re-tracked there are {number(total('offline'))}, and "
-            f"{counted(joined, 'gap or mix-up', 'gaps and mix-ups')} {'was' if joined == 1 else 'were'} repaired by "
-            "joining"
-        )
+        repairs = sum(event["counts"][kind] for event in events for kind in ("joined", "parted"))
+        text += f"; re-tracked there are {number(total('offline'))}, after {counted(repairs, 'repair')}"
     return f"{text}. Their accuracy is not known without ground truth."
 
 

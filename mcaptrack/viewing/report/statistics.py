@@ -179,7 +179,7 @@ def _constant_velocity(
 ) -> Displacement | None:
     """The errors of constant velocity for the same tracks at the same times; None if it makes no forecasts."""
     try:
-        walking_on = Predict(predictor="cv", horizon_s=steps * step_s, rate_hz=1 / step_s)
+        walking_on = Predict(predictor="cv", horizon_s=steps * step_s, rate_hz=1 / step_s, adapt=False)
         frames = [frame for (frame,) in walking_on(candidate.frames)]
         return score_forecasts(frames, candidate.frames, sequence.ground_truth, "cv")
     except McaptrackError:  # a horizon or a rate that no built-in predictor supports

@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
-from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.errors import McaptrackError, call, list_names
 from mcaptrack.files import read_json, visible
 from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
@@ -193,6 +193,8 @@ class LabelFile:
         if "," in line and any(cell[:1].isalpha() for cell in split(line)):
             text += "; a table with names of classes needs a first line that names its columns, separated by commas, "
             text += "semicolons or tabs: frame,id,class,left,top,width,height,score"
+        if [len(split(line)) for _, line in islice(lines_of(self.path, MAX_LINE), 4)] == [3, 3, 3]:
+            text += f"; a ground plane is given with the video: {call('ingest', 'VIDEO', ground_plane=self.path)}"
         return McaptrackError(f"{self.path}:{number}: {text}")
 
 

@@ -137,6 +137,7 @@ function start() {
     event.preventDefault(); key(event);
   });
   addEventListener("resize", paint);
+  by("stage").style.aspectRatio = Math.min(...data.sizes.map(([w, h]) => w / h)); // what it is controlled with stands right below it
   document.documentElement.classList.add("ready");
   show(data.open);
   if (asked) obey(asked);
