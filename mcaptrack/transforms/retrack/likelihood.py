@@ -117,7 +117,7 @@ class InputNoise:
 
 #: Predictions that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
-#: Tracks whose products of matrices are computed at once: more would start threads that wait for each other.
+#: Tracks in one product of matrices: more would start threads that compete.
 _BLOCK: Final = 32
 
 
