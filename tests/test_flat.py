@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.notices import collected
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.flatten import flattener
@@ -152,12 +152,14 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
 
     with log.read(tmp_path / "a.mcap") as opened:
         done = export(opened, tmp_path / "t", topics=["/x"])
-        assert done.notes == ["/x: picture left out, bytes; `blobs=True` keeps them"]
+        assert done.notes == [
+            f"/x: picture left out, bytes; {call('export', opened.path, topic='/x', blobs=True)} keeps them"
+        ]
         export(opened, tmp_path / "t", topics=["/x"], part=MessagesPart(blobs=True))
         assert export(opened, tmp_path / "t").written == []  # and they stay
         assert export(opened, tmp_path / "t", topics=["/y"], part=MessagesPart(blobs=True)).rows["topics/y"] == 1
         (words,) = export(opened, tmp_path / "t", topics=["/y"]).notes
-        assert words == "/y: picture left out, bytes; `blobs=True` keeps them"  # of /y alone
+        assert words == f"/y: picture left out, bytes; {call('export', opened.path, topic='/y', blobs=True)} keeps them"
     import pyarrow.parquet as pq
 
     (file,) = (tmp_path / "t" / "topics" / "x").rglob("*.parquet")

@@ -38,7 +38,7 @@ SECOND = 10**9
 START = 1_700_000_000 * SECOND
 #: What differs from system to system or from release to release, and isn't what a text is about.
 VARYING = (
-    (r"[\d,]+(?= bytes\b)|(?<=bytes became )\d+", "#"),
+    (r"[\d,]+(?= bytes\b)|(?<=bytes became )[\d,]+", "#"),
     (r"(?<=\"bytes\": )\d+", "#"),
     (r"(?<=\"version\": )\"[^\"]+\"", "#"),
     (r"[0-9a-f]{40,}", "#"),

@@ -92,7 +92,7 @@ def cut(
     log : path or sequence of paths
         The log, or several to merge.
     output : path, optional
-        Write to this file; by default LOG.cut.mcap beside the log.
+        Write to this file.
 
         In the working folder if the log is in a store. Several logs need a name.
     start_s : float, optional

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import print_table, refuse_usage, show
+from mcaptrack.cli.text import counted, print_table, refuse_usage, show
 from mcaptrack.errors import command, list_names
 from mcaptrack.location import Location, is_remote, parse
 
@@ -37,7 +37,7 @@ class Check(EachLog["LogCheck"]):
     def line(self, done: LogCheck) -> str:
         """Return the verdict on one of many logs."""
         errors = sum(finding.level == "error" for finding in done.findings)
-        return "sound" if done.is_sound else f"damaged, {errors} errors"
+        return "sound" if done.is_sound else f"damaged, {counted(errors, 'error')}"
 
     def data(self, done: LogCheck) -> dict[str, Any]:
         """Return the findings in a log and its results as values of JSON."""
@@ -76,7 +76,7 @@ def _print_check(checked: CheckResult, quiet: bool) -> None:
 
     if not quiet:
         verdict = "sound" if checked.is_sound else "damaged"
-        show(f"{checked.path}: {verdict}; {checked.messages} messages in {checked.chunks} chunks")
+        show(f"{checked.path}: {verdict}; {_contents(checked)}")
     findings = [finding for finding in checked.findings if not quiet or finding.level == "error"]
     if not findings:
         return
@@ -102,14 +102,14 @@ class Recover(EachLog["LogRecovery"]):
 
     def show(self, log: Location, done: LogRecovery, talk: common.Talk) -> None:
         """Print what was saved and what was lost."""
-        talk.say(f"{done.output}: {done.messages} messages in {done.chunks} chunks are saved")
+        talk.say(f"{done.output}: {_contents(done)} saved")
         _say_lost(done.lost, talk)
         if not done.lost:
             talk.say("nothing was lost")
 
     def line(self, done: LogRecovery) -> str:
         """Return what was saved in a line."""
-        saved = f"{done.messages} messages in {done.chunks} chunks are saved in {done.output}"
+        saved = f"{_contents(done)} saved in {done.output}"
         return f"{saved}; {f'{len(done.lost)} losses' if done.lost else 'nothing was lost'}"
 
     def data(self, done: LogRecovery) -> dict[str, Any]:
@@ -141,10 +141,11 @@ class Cut(Once["CutResult"]):
         """Print what was written, what is there from before the start, and what was lost."""
         since, until = (None if s is None else f"{s:.3f} s" for s in (done.start_s, done.end_s))
         span = "".join(f" {word} {s}" for word, s in (("from", since), ("to", until)) if s)
-        talk.say(f"{done.output}: {done.messages} messages in {len(done.topics)} topics{span}; {done.bytes} bytes")
+        held = f"{counted(done.messages, 'message')} in {counted(len(done.topics), 'topic')}"
+        talk.say(f"{done.output}: {held}{span}; {counted(done.bytes, 'byte')}")
         if done.earlier:
             count = sum(done.earlier.values())
-            talk.say(f"with {count} from before the start that hold there, of {list_names(sorted(done.earlier))}")
+            talk.say(f"with {count:,} from before the start, in force there, of {list_names(sorted(done.earlier))}")
         _say_lost(done.lost, talk)
 
     def data(self, done: CutResult) -> dict[str, Any]:
@@ -174,9 +175,13 @@ class Drop(EachLog["DropResult"]):
 
     def line(self, done: DropResult) -> str:
         """Return what was removed in a line."""
-        dropped = f"{', '.join(done.dropped)} with {done.messages} messages left out"
-        return f"{dropped}; {done.bytes_before} bytes became {done.bytes}"
+        dropped = f"{', '.join(done.dropped)} with {counted(done.messages, 'message')} left out"
+        return f"{dropped}; {counted(done.bytes_before, 'byte')} became {done.bytes:,}"
 
     def data(self, done: DropResult) -> dict[str, Any]:
         """Return the result as values of JSON."""
         return {"log": str(done.log), "dropped": list(done.dropped), "messages": done.messages, "bytes": done.bytes}
+
+
+def _contents(log: CheckResult | LogRecovery) -> str:
+    return f"{counted(log.messages, 'message')} in {counted(log.chunks, 'chunk')}"

@@ -19,7 +19,7 @@ from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Called, parameters_of
 from mcaptrack.cli.help import LAST_PANELS
-from mcaptrack.cli.text import is_json, say, stdout_to_stderr
+from mcaptrack.cli.text import counted, is_json, say, stdout_to_stderr
 from mcaptrack.environment import variable, whole_number
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
@@ -299,7 +299,7 @@ def _summarise(done: FleetResult[Any], talk: common.Talk) -> None:
     counts = [f"{count} {state}" for state, count in done.counts.items()]
     rate = len(done.outcomes) / max(done.seconds, 1e-3)
     count = len(done.outcomes)
-    line = f"{count} log{'' if count == 1 else 's'} in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
+    line = f"{counted(count, 'log')} in {done.seconds:.1f} s ({rate:.1f} a second): {', '.join(counts)}"
     if done.peak_bytes:
         ran = [outcome for outcome in done.outcomes if outcome.tries]
         used = done.cpu_seconds / max(1, len(ran))

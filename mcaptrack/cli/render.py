@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mcaptrack.api.rendering import default_suffix
 from mcaptrack.cli import common
 from mcaptrack.cli.many import EachLog
+from mcaptrack.cli.text import counted
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Render(EachLog["RenderResult"]):
             return f"where people of {', '.join(done.views)} spend their time"
         drawn = f" with {', '.join(done.views)}" if done.views else ""
         hidden = f", people hidden in {', '.join(done.blurred)}" if done.blurred else ""
-        return f"{done.pictures} picture{'' if done.pictures == 1 else 's'}{drawn}{hidden}"
+        return f"{counted(done.pictures, 'picture')}{drawn}{hidden}"
 
     def data(self, done: RenderResult) -> dict[str, Any]:
         """Return the result as values of JSON."""

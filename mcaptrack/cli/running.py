@@ -14,7 +14,7 @@ from mcaptrack.cli.chosen import configured
 from mcaptrack.cli.command import settings_of
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import stdout_to_stderr
+from mcaptrack.cli.text import counted, stdout_to_stderr
 from mcaptrack.cli.zones import zones_in_short
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.location import Location
@@ -235,13 +235,13 @@ def _line_of(result: RunResult, shows_events: bool) -> str:
     """Return the result for one of many logs in one line."""
     parts = [_did(result)]
     if result.cameras:
-        parts.append(f"{sum(not camera.is_scene for camera in result.cameras.values())} cameras")
+        parts.append(counted(sum(not camera.is_scene for camera in result.cameras.values()), "camera"))
     if shows_events:
         counts = Counter({kind: n for kinds in result.events.values() for kind, n in kinds.items() if n})
         parts.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
     summary = result.summary
     if summary is not None and summary.tracks is not None:
-        parts.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
+        parts.append(counted(summary.tracks, "track"))
     if result.continued is not None:
         parts.append(result.continued.words()[-1])
     if codes := dict.fromkeys(notice.code for notice in result.warnings):
@@ -278,7 +278,7 @@ def _line_of_camera(camera: CameraResult) -> str:
     if summary.boxes is not None:
         parts.append(f"{summary.boxes:,} boxes")
     if summary.tracks is not None:
-        parts.append(f"{summary.tracks:,} {'track' if summary.tracks == 1 else 'tracks'}")
+        parts.append(counted(summary.tracks, "track"))
     if summary.repair is not None:
         parts.append(f"{summary.repair.tracks:,} after re-tracking")
     if summary.appearance is not None:
@@ -302,15 +302,14 @@ def _lines_of_summary(summary: Summary) -> Iterator[tuple[str, str]]:
         count, tracks, pictures = summary.corrected.boxes, summary.corrected.tracks, summary.corrected.pictures
         yield "corrected", f"{count:,} boxes of {tracks:,} tracks by people, in {pictures:,} pictures"
     if summary.repair is not None:
-        done = (("joined", "gaps closed"), ("parted", "split"), ("left_out", "left out"))
-        text = ", ".join(f"{getattr(summary.repair, name):,} {word}" for name, word in done)
-        count = summary.repair.tracks
-        yield "re-tracked", f"{count:,} {'track' if count == 1 else 'tracks'}: {text}"
+        repair = summary.repair
+        text = f"{counted(repair.joined, 'gap')} closed, {repair.parted:,} split, {repair.left_out:,} left out"
+        yield "re-tracked", f"{counted(repair.tracks, 'track')}: {text}"
     if summary.appearance is not None and summary.appearance.separation is None:
         yield "colours", "not compared: too few people were seen well before and after gaps"
     elif summary.appearance is not None:
         looks, share = summary.appearance, f"{summary.appearance.separation:.0%}"
-        over = f"{looks.tracks:,} {'track' if looks.tracks == 1 else 'tracks'}"
+        over = counted(looks.tracks, "track")
         text = f"compared: two people differ more than one does in {share} of cases ({over})"
         no = f"not compared: two people differ more than one does in only {share} of cases ({over})"
         yield "colours", text if looks.used else no

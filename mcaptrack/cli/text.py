@@ -46,6 +46,11 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
+def counted(count: int, singular: str) -> str:
+    """A count with its noun: 1 track, 2 tracks, 1,000 tracks."""
+    return f"{count:,} {singular}{'' if count == 1 else 's'}"
+
+
 def show(*lines: str) -> None:
     """Print lines to stdout: the answer of a command."""
     print("\n".join(map(printable, lines)), flush=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import mcaptrack
 from mcaptrack.cli import common
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import print_table, say, show_left_out
+from mcaptrack.cli.text import counted, print_table, say, show_left_out
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -72,7 +72,7 @@ def zones_in_short(result: RunResult) -> str:
     zones = len({total.zone for totals in result.zones.values() for total in totals})
     topics = len(result.zones)
     named = "zone or line" if zones == 1 else "zones and lines"
-    return f"{zones} {named}, of {topics} channel{'' if topics == 1 else 's'} of tracks"
+    return f"{zones} {named}, of {counted(topics, 'channel')} of tracks"
 
 
 def print_zones(result: RunResult) -> None:

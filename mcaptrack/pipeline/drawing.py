@@ -77,8 +77,8 @@ def find_views(opened: log.Log, prefix: str, topics: Sequence[str] = ()) -> Show
         return Shown(_best(opened, prefix, views.SUFFIX + pictures_topic), pictures_topic)
     if best := _best(opened, prefix, views.SCENE_SUFFIX):
         return Shown(best, "")
-    lack = f"{opened.path} has no pictures of {prefix} to draw on, and no scenes"
-    raise McaptrackError(f"{lack}; {call('info', opened.path)} shows what it has")
+    lack = f"{opened.path} has no pictures of {prefix} to draw on, and no scenes of tracks yet"
+    raise McaptrackError(f"{lack}; {call('run', opened.path)} makes them")
 
 
 def views_from_above(opened: log.Log, prefix: str) -> list[str]:

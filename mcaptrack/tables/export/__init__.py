@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack import __version__, log, tables
 from mcaptrack.choices import TableFormat
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import place_of, publish_bytes, sweep
 from mcaptrack.location import Location, Url, is_remote, local_name, parse
 from mcaptrack.log.messages import Span
@@ -386,7 +386,9 @@ class _Job:
             self._note_left_out(channel.topic, ", ".join(".".join(path) for path in channel.messages.left_out))
 
     def _note_left_out(self, topic: str, left_out: str) -> None:
-        self.done.notes += [f"{topic}: {left_out} left out, bytes; `blobs=True` keeps them"] if left_out else []
+        if left_out:
+            keep = call("export", self.contents.opened.path, topic=topic, blobs=True)
+            self.done.notes.append(f"{topic}: {left_out} left out, bytes; {keep} keeps them")
 
     def _stands(self, name: str, path: Path, source: str) -> bool:
         """Whether a table is up to date and may stay."""
