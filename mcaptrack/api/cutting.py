@@ -150,8 +150,6 @@ def cut(
         raise McaptrackError("`around=` and `start_s=` or `end_s=` both say what to cut; leave one out")
     if around is not None and len(paths) > 1:
         raise McaptrackError("`around=` is an event of one log; give one log")
-    if start_s is not None and end_s is not None and start_s >= end_s:
-        raise McaptrackError(f"`end_s={end_s:g}` isn't after `start_s={start_s:g}`")
     with collected() as warnings, ExitStack() as stack:
         opened = [stack.enter_context(logs.read(path)) for path in paths]
         for part in (part for each in opened for part in each.parts):
@@ -162,9 +160,11 @@ def cut(
         if around is not None:
             start_s, end_s = _around(opened[0], around, margin_s)
         length_s = (max(each.end_ns for each in opened) - zero_ns) / NS_PER_S
+        start_ns, end_ns = (None if s is None else zero_ns + round(s * NS_PER_S) for s in (start_s, end_s))
+        if end_s is not None and end_ns is not None and end_ns <= (zero_ns if start_ns is None else start_ns):
+            raise McaptrackError(f"`end_s={end_s:g}` isn't after `start_s={start_s or 0:g}`")
         if start_s is not None and start_s > length_s:
             raise McaptrackError(f"{paths[0]} lasts {length_s:.3f} s; there is nothing from {start_s:g} s on")
-        start_ns, end_ns = (None if s is None else zero_ns + round(s * NS_PER_S) for s in (start_s, end_s))
         topics = _chosen(opened, names_of(topic), names_of(exclude))
         done = write(opened, target, topics, (start_ns, end_ns), progress)
     return CutResult(

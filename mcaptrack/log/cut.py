@@ -46,14 +46,14 @@ class Part(NamedTuple):
 
 
 def copy_messages(
-    writer: LogWriter, parts: Sequence[Part], end_ns: int | None = None, progress: Progress = lambda *_: None
+    writer: LogWriter, parts: Sequence[Part], end_ns: int, progress: Progress = lambda *_: None
 ) -> list[str]:
     """Copy the messages of parts of logs before a time; the channels are added to the new log already.
 
     Returns a line for each chunk that is lost because it is damaged. Raises McaptrackError if a log changes meanwhile.
     """
     lost: list[str] = []
-    copies = [_Copy(writer, part, LOG_MAX_NS if end_ns is None else end_ns - 1) for part in parts]
+    copies = [_Copy(writer, part, end_ns - 1) for part in parts]
     todo = sorted((t_ns, number, place) for number, copy in enumerate(copies) for t_ns, place in copy.places())
     for done, (_, number, place) in enumerate(todo):
         try:
