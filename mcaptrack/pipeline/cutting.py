@@ -202,7 +202,7 @@ class _Cut:
 
     def _own_starts(self, members: Sequence[_Member]) -> list[int]:
         """From when on the messages of each log count: what logs have that are parts of one is taken once."""
-        digests = [_read_digest(member.how.digest if member.how else "") for member in members]
+        digests = [_read_digest(it.how.digest or it.how.input_digest if it.how else "") for it in members]
         if digests[0][0] and len({whole for whole, _ in digests}) == 1:
             starts, until = [0] * len(members), 0
             for place in sorted(range(len(members)), key=lambda place: digests[place][1]):
