@@ -6,7 +6,7 @@ chunk is opened, so that damage is found here and not by those who read the copy
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,8 +41,8 @@ class Part(NamedTuple):
     """The channels of a file to copy: for each its id in the new log, and the time of the first message to copy."""
 
     log: Log
-    ids: Mapping[int, int]
-    since_ns: Mapping[int, int]
+    ids: dict[int, int]
+    since_ns: dict[int, int]
 
 
 def copy_messages(

@@ -11,9 +11,9 @@ import heapq
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from hashlib import sha256
 from itertools import combinations, islice
 from pathlib import Path
@@ -21,12 +21,12 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.geometry.clocks import parse_ns
 from mcaptrack.log.records import Damaged
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.staleness import planes_to_json, read_planes
 from mcaptrack.schema import GROUND_PLANE
 from mcaptrack.schema.names import plain_name
+from mcaptrack.schema.parts import ALL, NO_END, Span, joined, limits_of, part_digest, read_digest, span_of, within
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import CALIBRATIONS_READ
@@ -37,8 +37,6 @@ from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
 
 Progress = Callable[[str, int, int], None]
-#: From a time until before another, in ns.
-Span = tuple[int, int]
 
 #: The metadata record of a log that was cut out of a longer one: ``start_ns`` and ``end_ns``, as far as it is shorter.
 CUT: Final = "mcaptrack.cut"
@@ -52,18 +50,15 @@ _SEARCHED: Final = 2000
 #: In the profiles of publishers, as rosbag2 writes them (in numbers before Iron): those that are latched, and how many.
 _LATCHING: Final = re.compile(r"durability:\s*(?:1\b|transient_local)")
 _DEPTH: Final = re.compile(r"depth:\s*(\d{1,6})")
-_END: Final = 2**64
-_ALL: Final = (0, _END)
 
 
-@dataclass
-class CutReport:
+class CutReport(NamedTuple):
     """The result of ``cut``: messages, topics, how many messages of each are from before the start; and losses."""
 
-    messages: int = 0
-    topics: tuple[str, ...] = ()
-    earlier: Counter[str] = field(default_factory=Counter)
-    lost: list[str] = field(default_factory=list)
+    messages: int
+    topics: tuple[str, ...]
+    earlier: Mapping[str, int]
+    lost: Sequence[str]
 
 
 class _Member(NamedTuple):
@@ -73,38 +68,6 @@ class _Member(NamedTuple):
     part: log.Log
     channel: log.Channel
     how: Provenance | None
-
-
-def _span(start_ns: str, end_ns: str) -> Span:
-    """The span that texts are the limits of, "" for none."""
-    return parse_ns(start_ns) or 0, parse_ns(end_ns) or _END
-
-
-def _read_digest(digest: str) -> tuple[str, Span]:
-    """The digest of a whole channel, and which part of it a channel is."""
-    whole, _, limits = digest.partition("@")
-    start_ns, _, end_ns = limits.partition("-")
-    return whole, _span(start_ns, end_ns)
-
-
-def _part_digest(whole: str, span: Span) -> str:
-    """The digest of a part of a channel: that of the whole with the limits, so that parts can be joined again."""
-    return f"{whole}@{'-'.join(_limits(span))}" if whole and span != _ALL else whole
-
-
-def _limits(span: Span) -> tuple[str, str]:
-    """The limits of a span as texts; "" for none."""
-    return str(span[0] or ""), "" if span[1] == _END else str(span[1])
-
-
-def _within(before: Span, span: Span) -> Span:
-    return max(before[0], span[0]), min(before[1], span[1])
-
-
-def _joined(spans: Iterable[Span]) -> Span:
-    """The span from the first start to the last end."""
-    starts, ends = zip(*spans, strict=True)
-    return min(starts), max(ends)
 
 
 def cut(
@@ -118,8 +81,7 @@ def cut(
 
     Raises McaptrackError if a log can't be read, or changes meanwhile.
     """
-    start_ns, end_ns = span
-    work = _Cut(logs, topics, (start_ns or 0, _END if end_ns is None else end_ns))
+    work = _Cut(logs, topics, (span[0] or 0, NO_END if span[1] is None else span[1]))
     is_same = len({log.header(opened)[0] for opened in logs}) == 1
     header = bytes(logs[0].snapshot.record(len(log.MAGIC))) if is_same else None
     with log.create(output, header=header) as writer:
@@ -137,9 +99,9 @@ class _Cut:
         self._taken, self._earlier = list[Span](), list[Span]()
         for opened in logs:
             start_ns, end_ns = span
-            self._taken.append((start_ns * (start_ns > opened.start_ns), end_ns if end_ns <= opened.end_ns else _END))
+            self._taken.append((start_ns * (start_ns > opened.start_ns), end_ns if end_ns <= opened.end_ns else NO_END))
             cut = opened.metadata(CUT) or {}
-            self._earlier.append(_span(*(cut.get(name, "") for name in _NAMES)))
+            self._earlier.append(span_of(*(cut.get(name, "") for name in _NAMES)))
         topics = {*topics} - _conflicts(logs, topics)
         self._channels: dict[tuple[Any, ...], list[_Member]] = {}
         for number, opened in enumerate(logs):
@@ -159,24 +121,21 @@ class _Cut:
 
     def write(self, writer: log.LogWriter, progress: Progress) -> CutReport:
         """Write the new log."""
-        report = CutReport(topics=tuple(sorted({topic for topic, *_ in self._channels})))
-        since: dict[log.Log, dict[int, int]] = {part: {} for opened in self._logs for part in opened.parts}
-        ids: dict[log.Log, dict[int, int]] = {part: {} for part in since}
+        parts = {part: log.Part(part, {}, {}) for opened in self._logs for part in opened.parts}
         held = [self._from_before(members) for members in self._channels.values()]
         self._held_ns = max(min((start_ns for start_ns, _ in held), default=0) - 1, 0)
-        earlier, mixed = list[tuple[int, log.Message]](), set[str]()
+        earlier, mixed = list[tuple[str, int, log.Message]](), set[str]()
         for (key, members), (start_ns, before) in zip(self._channels.items(), held, strict=True):
             (topic, schema, encoding, *_), first = key, members[0]
             wanted = (first.channel.id, first.part.index.channels[first.channel.id].schema_id)
             new = writer.add_channel(topic, schema, encoding, self._metadata(members), another=True, ids=wanted)
-            earlier += ((new, message) for message in before)
-            report.earlier += Counter({topic: len(before)})
+            earlier += ((topic, new, message) for message in before)
             spans = []
             for member, own_start in zip(members, self._own_starts(members), strict=True):
-                if own_start == _END:
+                if own_start == NO_END:
                     continue  # another log has all of it
-                ids[member.part][member.channel.id] = new
-                since[member.part][member.channel.id] = max(start_ns, own_start)
+                parts[member.part].ids[member.channel.id] = new
+                parts[member.part].since_ns[member.channel.id] = max(start_ns, own_start)
                 opened = self._logs[member.number]
                 spans.append((max(opened.start_ns, own_start), opened.end_ns))
             mixed |= {topic for pair in combinations(spans, 2) if max(a for a, _ in pair) <= min(b for _, b in pair)}
@@ -185,31 +144,31 @@ class _Cut:
             warn(f"{len(self._logs)} logs have {list_names(sorted(mixed))} {text}", "other")
         writer.write_description(*writer.channels)
         copied: set[bytes] = set()
-        for part in ids:
+        for part in parts:
             for record in log.private_records(part):
                 writer.write(record)
             log.copy_attachments_and_metadata(part, writer, without=[CUT], copied=copied)
-        limits = _limits(_joined(map(_within, self._earlier, self._taken)))
+        limits = limits_of(joined(map(within, self._earlier, self._taken)))
         if any(limits):
             writer.add_metadata(CUT, {name: text for name, text in zip(_NAMES, limits, strict=True) if text})
-        for new, message in sorted(earlier, key=lambda pair: pair[1].t_ns):
+        for _, new, message in sorted(earlier, key=lambda held: held[2].t_ns):
             writer.add_message(new, self._held_ns, message.sequence, message.payload, message.publish_ns)
         writer.close_chunks()
-        parts = [log.Part(part, ids[part], since[part]) for part in ids if ids[part]]
-        report.lost = self._lost + log.copy_messages(writer, parts, self._span[1], progress)
-        report.messages = sum(writer.counts.values())
-        return report
+        lost = log.copy_messages(writer, [part for part in parts.values() if part.ids], self._span[1], progress)
+        topics = tuple(sorted({topic for topic, *_ in self._channels}))
+        counts = Counter(topic for topic, *_ in earlier)
+        return CutReport(sum(writer.counts.values()), topics, counts, self._lost + lost)
 
     def _own_starts(self, members: Sequence[_Member]) -> list[int]:
         """From when on the messages of each log count: what logs have that are parts of one is taken once."""
-        digests = [_read_digest(it.how.digest or it.how.input_digest if it.how else "") for it in members]
+        digests = [read_digest(it.how.digest or it.how.input_digest if it.how else "") for it in members]
         if digests[0][0] and len({whole for whole, _ in digests}) == 1:
             starts, until = [0] * len(members), 0
             for place in sorted(range(len(members)), key=lambda place: digests[place][1]):
                 starts[place], until = until, max(until, digests[place][1][1])
             return starts
         spans = [self._earlier[member.number] for member in members]
-        cuts = [span for span in spans if span != _ALL]  # another one has what was kept from before the start
+        cuts = [span for span in spans if span != ALL]  # another one has what was kept from before the start
         return [start * any(cut[0] < start <= cut[1] for cut in cuts) for start, _ in spans]
 
     def _metadata(self, members: Sequence[_Member]) -> Mapping[str, str]:
@@ -221,13 +180,11 @@ class _Cut:
         if len(origins) < len(members):
             return first
         how, made_from = origins[0], [origin.made_from() for origin in origins]
-        parameters = dict(how.parameters)
-        if "ground_planes" in parameters:
-            parameters["ground_planes"] = self._planes(members, origins)
+        planes = {"ground_planes": self._planes(members, origins)} if "ground_planes" in how.parameters else {}
         digests = {name: self._digest(members, [names.get(name, "") for names in made_from]) for name in made_from[0]}
         now = replace(
             how,
-            parameters=parameters,
+            parameters={**how.parameters, **planes},
             digest=self._digest(members, [origin.digest for origin in origins]),
             input_digest=digests[how.input],
             references={name: digests[name] for name in how.references},
@@ -237,11 +194,11 @@ class _Cut:
 
     def _digest(self, members: Sequence[_Member], digests: Sequence[str]) -> str:
         """The digest of what is left of a channel that these logs have with these digests."""
-        wholes, spans = zip(*map(_read_digest, digests), strict=True)
-        left = [_within(span, self._taken[member.number]) for span, member in zip(spans, members, strict=True)]
+        wholes, spans = zip(*map(read_digest, digests), strict=True)
+        left = [within(span, self._taken[member.number]) for span, member in zip(spans, members, strict=True)]
         if len({*wholes}) == 1:
-            return _part_digest(wholes[0], _joined(left))
-        return sha256("".join(map(_part_digest, wholes, left)).encode()).hexdigest()
+            return part_digest(wholes[0], joined(left))
+        return sha256("".join(map(part_digest, wholes, left)).encode()).hexdigest()
 
     def _planes(self, members: Sequence[_Member], origins: Sequence[Provenance]) -> list[Any]:
         """The ground planes that a channel should name, if those that it names are those of its logs."""
@@ -267,7 +224,6 @@ class _Cut:
         opened, topic = self._logs[members[0].number], members[0].channel.topic
         channel, latest = opened.channel(topic), dict[object, log.Message]()
         kind = plain_name(channel.schema_name)
-        before = self._before(members, start_ns)
         if foreign.holds_pictures(channel):
             return self._first_picture_ns(members, start_ns), []
         searched = max(_latched(member.channel.metadata) for member in members)
@@ -277,7 +233,7 @@ class _Cut:
             key = _decoder(opened, topic, edges_of)
         elif kind in (*_HELD, _SCENE):
             searched = searched or 1
-        for message in islice(before, searched):
+        for message in islice(self._before(members, start_ns), searched):
             latest.setdefault(key(message.payload), message)
         if kind == _SCENE:
             is_lasting = _decoder(opened, topic, lambda message: any(map(_is_lasting, message.entities)))
@@ -315,11 +271,10 @@ def _conflicts(logs: Sequence[log.Log], topics: Collection[str]) -> set[str]:
             if (how := provenance_of(opened, topic)) and how.transform != INGEST:
                 origins.setdefault(topic, []).append(how)
     out: set[str] = set()
-    more = {topic for topic, those in origins.items() if len({_read_digest(how.digest)[0] for how in those}) > 1}
-    while more:
+    more = {topic for topic, those in origins.items() if len({read_digest(how.digest)[0] for how in those}) > 1}
+    while not more <= out:
         out |= more
-        made = {topic for topic, those in origins.items() if any(not out.isdisjoint(how.made_from()) for how in those)}
-        more = made - out
+        more = {topic for topic, those in origins.items() if any(not out.isdisjoint(how.made_from()) for how in those)}
     if out:
         text = "are left out: each log has its own, with its own ids; `mcaptrack run` makes those of all"
         warn(f"results of {len(logs)} logs in {list_names(sorted(out))} {text}", "left-out")

@@ -58,8 +58,7 @@ class Provenance:
     ``columns`` are those of a schema of a user's own (see ``schema.own``). ``scores`` say what scores of its input were
     taken for where these are no likelihoods: by the name of a class, SCORE:LIKELIHOOD of points with straight lines
     between them. ``boxes`` say how boxes of other software in its input were read: their clock, classes, scale and
-    fields, and what a user chose. In a log that was cut out of a longer one, digests are those of the whole channels,
-    with the limits of the part in ns: DIGEST@START-END.
+    fields, and what a user chose. In a log that was cut out of a longer one, digests name parts (see ``parts``).
     """
 
     transform: str
