@@ -67,7 +67,7 @@ class _Member(NamedTuple):
     number: int
     part: log.Log
     channel: log.Channel
-    how: Provenance | None
+    origin: Provenance | None
 
 
 def cut(
@@ -122,26 +122,7 @@ class _Cut:
     def write(self, writer: log.LogWriter, progress: Progress) -> CutReport:
         """Write the new log."""
         parts = {part: log.Part(part, {}, {}) for opened in self._logs for part in opened.parts}
-        held = [self._from_before(members) for members in self._channels.values()]
-        self._held_ns = max(min((start_ns for start_ns, _ in held), default=0) - 1, 0)
-        earlier, mixed = list[tuple[str, int, log.Message]](), set[str]()
-        for (key, members), (start_ns, before) in zip(self._channels.items(), held, strict=True):
-            (topic, schema, encoding, *_), first = key, members[0]
-            wanted = (first.channel.id, first.part.index.channels[first.channel.id].schema_id)
-            new = writer.add_channel(topic, schema, encoding, self._metadata(members), another=True, ids=wanted)
-            earlier += ((topic, new, message) for message in before)
-            spans = []
-            for member, own_start in zip(members, self._own_starts(members), strict=True):
-                if own_start == NO_END:
-                    continue  # another log has all of it
-                parts[member.part].ids[member.channel.id] = new
-                parts[member.part].since_ns[member.channel.id] = max(start_ns, own_start)
-                opened = self._logs[member.number]
-                spans.append((max(opened.start_ns, own_start), opened.end_ns))
-            mixed |= {topic for pair in combinations(spans, 2) if max(a for a, _ in pair) <= min(b for _, b in pair)}
-        if mixed:
-            text = "from the same time in several logs: their messages alternate"
-            warn(f"{len(self._logs)} logs have {list_names(sorted(mixed))} {text}", "other")
+        earlier = self._add_channels(writer, parts)
         writer.write_description(*writer.channels)
         copied: set[bytes] = set()
         for part in parts:
@@ -159,9 +140,37 @@ class _Cut:
         counts = Counter(topic for topic, *_ in earlier)
         return CutReport(sum(writer.counts.values()), topics, counts, self._lost + lost)
 
+    def _add_channels(
+        self, writer: log.LogWriter, parts: Mapping[log.Log, log.Part]
+    ) -> list[tuple[str, int, log.Message]]:
+        """Add the channels to the new log, and their numbers to the parts that they are copied from.
+
+        Returns the messages from before the start that hold there, with topic and channel.
+        """
+        held = [self._from_before(members) for members in self._channels.values()]
+        self._held_ns = max(min((start_ns for start_ns, _ in held), default=0) - 1, 0)
+        earlier, mixed = list[tuple[str, int, log.Message]](), set[str]()
+        for (key, members), (start_ns, before) in zip(self._channels.items(), held, strict=True):
+            (topic, schema, encoding, *_), first = key, members[0]
+            wanted = (first.channel.id, first.part.index.channels[first.channel.id].schema_id)
+            new = writer.add_channel(topic, schema, encoding, self._metadata(members), another=True, ids=wanted)
+            earlier += ((topic, new, message) for message in before)
+            spans = []
+            for member, own_start in zip(members, self._own_starts(members), strict=True):
+                if own_start < NO_END:  # else another log has all of it
+                    parts[member.part].ids[member.channel.id] = new
+                    parts[member.part].since_ns[member.channel.id] = max(start_ns, own_start)
+                    opened = self._logs[member.number]
+                    spans.append((max(opened.start_ns, own_start), opened.end_ns))
+            mixed |= {topic for pair in combinations(spans, 2) if max(a for a, _ in pair) <= min(b for _, b in pair)}
+        if mixed:
+            text = "from the same time in several logs: their messages alternate"
+            warn(f"{len(self._logs)} logs have {list_names(sorted(mixed))} {text}", "other")
+        return earlier
+
     def _own_starts(self, members: Sequence[_Member]) -> list[int]:
         """From when on the messages of each log count: what logs have that are parts of one is taken once."""
-        digests = [read_digest(it.how.digest or it.how.input_digest if it.how else "") for it in members]
+        digests = [read_digest(it.origin.digest or it.origin.input_digest if it.origin else "") for it in members]
         if digests[0][0] and len({whole for whole, _ in digests}) == 1:
             starts, until = [0] * len(members), 0
             for place in sorted(range(len(members)), key=lambda place: digests[place][1]):
@@ -176,7 +185,7 @@ class _Cut:
 
         Since all digests get the limits, what was out of date stays so, and what wasn't doesn't become so.
         """
-        first, origins = members[0].channel.metadata, [member.how for member in members if member.how]
+        first, origins = members[0].channel.metadata, [member.origin for member in members if member.origin]
         if len(origins) < len(members):
             return first
         how, made_from = origins[0], [origin.made_from() for origin in origins]
