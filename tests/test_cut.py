@@ -127,6 +127,7 @@ CHANNELS = {
     "/old": ("std_msgs/Int8", {"latching": "1"}, 1),
     "/camera_info": ("sensor_msgs/msg/CameraInfo", {"offered_qos_profiles": QOS.format(depth=9, durability=2)}, 1),
     "/calibration": ("foxglove.CameraCalibration", {}, 1),
+    "/all": ("std_msgs/msg/Int8", {"offered_qos_profiles": "- history: keep_all\n  durability: volatile"}, 0),
     "/imu": ("sensor_msgs/msg/Imu", {"offered_qos_profiles": QOS.format(depth=5, durability=2)}, 0),
 }
 

@@ -507,7 +507,7 @@ class MotionEstimator:
                 key = latest
         cell_px = self._size[0] / picture.copy.shape[1]
         if (fit is None or shift_px(fit[0], *self._size) > cell_px) and _is_same(key.picture, picture):
-            return self._posed(key.to_reference, 0)  # nor do those whose few features are of what moves by itself
+            return self._posed(key.to_reference, 0)  # nor if its few features are of what moves by itself
         if fit is None:
             return self._unknown(before, picture, hidden)
         matrix, inliers = fit

@@ -61,6 +61,10 @@ class CutReport(NamedTuple):
     lost: Sequence[str]
 
 
+#: A message from before the start: topic, number of the channel in the new log, message.
+_Held = tuple[str, int, log.Message]
+
+
 class _Member(NamedTuple):
     """A channel of a log: the number of the log, its file, and how mcaptrack made the channel, if it did."""
 
@@ -83,8 +87,7 @@ def cut(
     """
     work = _Cut(logs, topics, (span[0] or 0, NO_END if span[1] is None else span[1]))
     is_same = len({log.header(opened)[0] for opened in logs}) == 1
-    header = bytes(logs[0].snapshot.record(len(log.MAGIC))) if is_same else None
-    with log.create(output, header=header) as writer:
+    with log.create(output, header=bytes(logs[0].snapshot.record(len(log.MAGIC))) if is_same else None) as writer:
         return work.write(writer, progress)
 
 
@@ -136,20 +139,17 @@ class _Cut:
             writer.add_message(new, self._held_ns, message.sequence, message.payload, message.publish_ns)
         writer.close_chunks()
         lost = log.copy_messages(writer, [part for part in parts.values() if part.ids], self._span[1], progress)
-        topics = tuple(sorted({topic for topic, *_ in self._channels}))
-        counts = Counter(topic for topic, *_ in earlier)
-        return CutReport(sum(writer.counts.values()), topics, counts, self._lost + lost)
+        counts, topics = Counter(topic for topic, *_ in earlier), {key[0] for key in self._channels}
+        return CutReport(sum(writer.counts.values()), tuple(sorted(topics)), counts, self._lost + lost)
 
-    def _add_channels(
-        self, writer: log.LogWriter, parts: Mapping[log.Log, log.Part]
-    ) -> list[tuple[str, int, log.Message]]:
+    def _add_channels(self, writer: log.LogWriter, parts: Mapping[log.Log, log.Part]) -> list[_Held]:
         """Add the channels to the new log, and their numbers to the parts that they are copied from.
 
         Returns the messages from before the start that hold there, with topic and channel.
         """
         held = [self._from_before(members) for members in self._channels.values()]
         self._held_ns = max(min((start_ns for start_ns, _ in held), default=0) - 1, 0)
-        earlier, mixed = list[tuple[str, int, log.Message]](), set[str]()
+        earlier, mixed = list[_Held](), set[str]()
         for (key, members), (start_ns, before) in zip(self._channels.items(), held, strict=True):
             (topic, schema, encoding, *_), first = key, members[0]
             wanted = (first.channel.id, first.part.index.channels[first.channel.id].schema_id)
@@ -332,6 +332,6 @@ def _latched(metadata: Mapping[str, str]) -> int:
     """The most messages that a late subscriber gets: the last ones; 0 if the channel isn't latched."""
     profiles = metadata.get("offered_qos_profiles", "")
     publishers = len(_LATCHING.findall(profiles)) + (metadata.get("latching") == "1")
-    if publishers > 1 or "keep_all" in profiles:
-        return _SEARCHED
-    return min(max(1, *map(int, _DEPTH.findall(profiles)), 1), _SEARCHED) if publishers else 0
+    is_every = publishers > 1 or re.search(r"history:\s*(2\b|keep_all)", profiles)
+    depth = _SEARCHED if is_every else max(1, *map(int, _DEPTH.findall(profiles)), 1)
+    return min(depth, _SEARCHED) if publishers else 0

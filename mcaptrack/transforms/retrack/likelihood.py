@@ -117,7 +117,7 @@ class InputNoise:
 
 #: Predictions that are made at once: more take memory, fewer take time.
 _BATCH: Final = 4096
-#: Tracks whose products of matrices are computed at once: more would start threads that wait for each other.
+#: Products of matrices are computed at once for so many tracks: more would start threads that wait for each other.
 _BLOCK: Final = 32
 
 
