@@ -73,6 +73,8 @@ def offer(name: str, names: Iterable[str], has: str = "it has") -> str:
     --------
     >>> offer("/lidar/box", ["/lidar/boxes", "/imu"])
     'did you mean /lidar/boxes? it has /lidar/boxes, /imu'
+    >>> offer("boxs", ["/lidar/boxes"])
+    'did you mean /lidar/boxes? it has /lidar/boxes'
     """
     every = list(names)
     question = did_you_mean(name, every)
