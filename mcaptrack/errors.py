@@ -37,7 +37,7 @@ def similar(name: str, names: Iterable[str], least: float = 0.6) -> str:
 
     It is the same but for capitals, slashes around it, and dashes for other marks; or nearly the same; or the only one
     that ends or begins with it, as a topic and an option with a unit do; or the most similar one, if ``least`` of it,
-    as ``difflib`` counts, is the same.
+    as ``difflib`` counts, is the same; or the first one with nearly the same end, as of a topic.
     """
     from difflib import SequenceMatcher, get_close_matches
 
@@ -46,6 +46,9 @@ def similar(name: str, names: Iterable[str], least: float = 0.6) -> str:
         return plain.get(wanted, "")
     ends = [each for each in plain if each.endswith(f"/{wanted}") or each.startswith(f"{wanted}-")]
     nearly, close = (get_close_matches(wanted, list(plain), 1, cutoff) for cutoff in (_NEARLY, least))
+    tails = {each.split("/", each.count("/") - wanted.count("/"))[-1]: each for each in reversed(plain) if "/" in each}
+    if not nearly and not ends and (tail := get_close_matches(wanted, list(tails), 1, cutoff=_NEARLY)):
+        return plain[tails[tail[0]]]
     meant = (nearly or (ends if len(ends) == 1 else close) or [""])[0]
     # names below one folder are alike by that alone
     shared = os.path.commonprefix([wanted, meant]).rfind("/") + 1  # noqa: RUF071  # characters are meant
@@ -70,6 +73,8 @@ def offer(name: str, names: Iterable[str], has: str = "it has") -> str:
     --------
     >>> offer("/lidar/box", ["/lidar/boxes", "/imu"])
     'did you mean /lidar/boxes? it has /lidar/boxes, /imu'
+    >>> offer("boxs", ["/lidar/boxes"])
+    'did you mean /lidar/boxes? it has /lidar/boxes'
     """
     every = list(names)
     question = did_you_mean(name, every)

@@ -111,8 +111,7 @@ def test_topics_with_other_schemas_stay_apart(tmp_path):
     with log.create(tmp_path / "b.mcap") as writer:
         number = writer.add_channel("a", ("another", "jsonschema", b"{}"), "json", {})
         writer.add_message(number, 1000, 1, b"{}")
-    with pytest.warns(mcaptrack.McaptrackWarning, match="several layouts"):
-        cut_ns([tmp_path / "a.mcap", tmp_path / "b.mcap"], out := tmp_path / "c.mcap")
+    cut_ns([tmp_path / "a.mcap", tmp_path / "b.mcap"], out := tmp_path / "c.mcap")
     with out.open("rb") as stream:
         schemas = {(c.topic, s.name) for s, c, _ in make_reader(stream).iter_messages()}
     assert {("a", "test.Thing"), ("a", "another")} <= schemas
@@ -128,6 +127,7 @@ CHANNELS = {
     "/old": ("std_msgs/Int8", {"latching": "1"}, 1),
     "/camera_info": ("sensor_msgs/msg/CameraInfo", {"offered_qos_profiles": QOS.format(depth=9, durability=2)}, 1),
     "/calibration": ("foxglove.CameraCalibration", {}, 1),
+    "/all": ("std_msgs/msg/Int8", {"offered_qos_profiles": "- history: keep_all\n  durability: volatile"}, 0),
     "/imu": ("sensor_msgs/msg/Imu", {"offered_qos_profiles": QOS.format(depth=5, durability=2)}, 0),
 }
 
@@ -287,8 +287,22 @@ def test_parts_of_results_make_the_whole(finished, tmp_path):
         assert {*(opened.metadata(CUT) or {})} == {"start_ns", "end_ns"}
 
 
+def test_of_parts_that_overlap_results_are_taken_once(finished, tmp_path):
+    for name, span in {"a": ["--end-s", "2"], "b": ["--start-s", "1"]}.items():
+        done("cut", finished, "-o", tmp_path / f"{name}.mcap", *span)
+    for names in (["a", "b"], ["b", "a", "b"]):
+        merged = mcaptrack.cut([tmp_path / f"{name}.mcap" for name in names], tmp_path / "all.mcap", force=True)
+        results = {topic for topic, metadata in described(finished).items() if "mcaptrack.digest" in metadata}
+        assert {"/camera/tracks", "/camera/retracks"} <= results <= {*merged.topics}
+        messages = [stock_messages(path) for path in (finished, tmp_path / "all.mcap")]
+        whole, joined = (sorted(message for message in each if message[0] in results) for each in messages)
+        assert whole == joined
+        assert described(tmp_path / "all.mcap") == described(finished)
+
+
 def test_results_of_several_logs_are_left_out(finished, tmp_path):
-    done("run", finished, "-o", other := tmp_path / "other.mcap", "--tracker", "bytetrack", "-q")
+    done("track", finished, "-o", tmp_path / "tracked.mcap", "--tracker", "bytetrack", "--min-hits-s", "0.9", "-q")
+    done("run", tmp_path / "tracked.mcap", "-o", other := tmp_path / "other.mcap", "-q")
     merged = mcaptrack.cut([finished, other], tmp_path / "all.mcap")
     assert "/camera/tracks" not in merged.topics
     assert {"/camera/video", "/camera/truth", "/camera/detections"} <= {*merged.topics}
@@ -351,6 +365,7 @@ def test_a_damaged_chunk_is_left_out_and_named(tmp_path):
 
 REFUSED = {
     "later than the log": (["--start-s", "9"], "lasts 0.000 s; there is nothing from 9 s on"),
+    "empty": (["--end-s", "0"], "--end-s 0 isn't after --start-s 0"),
     "backwards": (["--start-s", "2", "--end-s", "1"], "--end-s 1 isn't after --start-s 2"),
     "no such topic": (["--topic", "/d"], "has no channel /d; it has a, b, c"),
     "nothing left": (["--exclude", "*"], "all channels are excluded"),

@@ -388,6 +388,14 @@ class TestReading:
         assert "2 of 2 messages are left out" in warnings[-1].message
         assert "no transform connects lidar with map" in warnings[-1].message
 
+    def test_good_messages_are_kept_however_many_are_damaged(self, tmp_path):
+        kind, payload = MESSAGES["TFMessage of ROS 2"]
+        messages = [(START_NS + at, payload if at % 10 == 9 else payload[:40]) for at in range(3000)]
+        with log.read(write(tmp_path / "a.mcap", ("/tf", kind, messages))) as opened:
+            read = fixed_frame.read_frames(opened)
+        assert read.tree.frames() == ["map", "robot"]
+        assert "2700 of 3000 messages are like this" in read.unread[0]
+
     def test_another_clock_than_the_boxes(self, tmp_path):
         kind, _ = MESSAGES["FrameTransform"]
         messages = []

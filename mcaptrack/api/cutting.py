@@ -83,9 +83,9 @@ def cut(
     each written again just before the start; and video from its key picture on. Results stay up to date with what they
     were made from. Attachments and metadata are kept.
 
-    Several logs become one: channels with the same topic and schema are one channel. Results that each log has of its
-    own are left out, since their ids mean other people; parts that were cut out of one log are joined with their
-    results.
+    Several logs become one: channels with the same topic, schema and metadata are one channel. Results that each log
+    has of its own are left out, since their ids mean other people; parts that were cut out of one log are joined with
+    their results.
 
     Parameters
     ----------
@@ -146,27 +146,18 @@ def cut(
     if output is None and len(paths) > 1:
         raise McaptrackError(f"the log made of {len(paths)} logs needs a name; give one with `output=`")
     target = local_name(paths[0], ".cut.mcap") if output is None else log_output(output)
-    if around is not None and (start_s is not None or end_s is not None):
-        raise McaptrackError("`around=` and `start_s=` or `end_s=` both say what to cut; leave one out")
-    if around is not None and len(paths) > 1:
-        raise McaptrackError("`around=` is an event of one log; give one log")
-    if start_s is not None and end_s is not None and start_s >= end_s:
-        raise McaptrackError(f"`end_s={end_s:g}` isn't after `start_s={start_s:g}`")
+    _refuse_two_moments(around, start_s, end_s, len(paths))
     with collected() as warnings, ExitStack() as stack:
         opened = [stack.enter_context(logs.read(path)) for path in paths]
         for part in (part for each in opened for part in each.parts):
             if is_same_file(target, part.path):
                 raise McaptrackError(f"{part.path} is both input and output; give another name with `output=`")
         refuse_overwrite(target, force)
-        zero_ns = min((each.start_ns for each in opened if each.channels), default=0)
         if around is not None:
             start_s, end_s = _around(opened[0], around, margin_s)
-        length_s = (max(each.end_ns for each in opened) - zero_ns) / NS_PER_S
-        if start_s is not None and start_s > length_s:
-            raise McaptrackError(f"{paths[0]} lasts {length_s:.3f} s; there is nothing from {start_s:g} s on")
-        start_ns, end_ns = (None if s is None else zero_ns + round(s * NS_PER_S) for s in (start_s, end_s))
+        span = _span(opened, start_s, end_s)
         topics = _chosen(opened, names_of(topic), names_of(exclude))
-        done = write(opened, target, topics, (start_ns, end_ns), progress)
+        done = write(opened, target, topics, span, progress)
     return CutResult(
         tuple(paths),
         target,
@@ -179,6 +170,25 @@ def cut(
         target.stat().st_size,
         tuple(dict.fromkeys(warnings)),
     )
+
+
+def _refuse_two_moments(around: int | None, start_s: float | None, end_s: float | None, logs: int) -> None:
+    if around is not None and (start_s is not None or end_s is not None):
+        raise McaptrackError("`around=` and `start_s=` or `end_s=` both say what to cut; leave one out")
+    if around is not None and logs > 1:
+        raise McaptrackError("`around=` is an event of one log; give one log")
+
+
+def _span(opened: Sequence[Log], start_s: float | None, end_s: float | None) -> tuple[int | None, int | None]:
+    """Return the times in ns between which messages are taken. Raises McaptrackError if there are none."""
+    zero_ns = min((each.start_ns for each in opened if each.channels), default=0)
+    length_s = (max(each.end_ns for each in opened) - zero_ns) / NS_PER_S
+    start_ns, end_ns = (None if s is None else zero_ns + round(s * NS_PER_S) for s in (start_s, end_s))
+    if end_s is not None and end_ns is not None and end_ns <= (start_ns or zero_ns):
+        raise McaptrackError(f"`end_s={end_s:g}` isn't after `start_s={start_s or 0:g}`")
+    if start_s is not None and start_s > length_s:
+        raise McaptrackError(f"{opened[0].path} lasts {length_s:.3f} s; there is nothing from {start_s:g} s on")
+    return start_ns, end_ns
 
 
 def _around(opened: Log, number: int, margin_s: float) -> tuple[float, float]:

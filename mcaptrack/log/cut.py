@@ -6,7 +6,7 @@ chunk is opened, so that damage is found here and not by those who read the copy
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,19 +41,19 @@ class Part(NamedTuple):
     """The channels of a file to copy: for each its id in the new log, and the time of the first message to copy."""
 
     log: Log
-    ids: Mapping[int, int]
-    since_ns: Mapping[int, int]
+    ids: dict[int, int]
+    since_ns: dict[int, int]
 
 
 def copy_messages(
-    writer: LogWriter, parts: Sequence[Part], end_ns: int | None = None, progress: Progress = lambda *_: None
+    writer: LogWriter, parts: Sequence[Part], end_ns: int, progress: Progress = lambda *_: None
 ) -> list[str]:
     """Copy the messages of parts of logs before a time; the channels are added to the new log already.
 
     Returns a line for each chunk that is lost because it is damaged. Raises McaptrackError if a log changes meanwhile.
     """
     lost: list[str] = []
-    copies = [_Copy(writer, part, LOG_MAX_NS if end_ns is None else end_ns - 1) for part in parts]
+    copies = [_Copy(writer, part, end_ns - 1) for part in parts]
     todo = sorted((t_ns, number, place) for number, copy in enumerate(copies) for t_ns, place in copy.places())
     for done, (_, number, place) in enumerate(todo):
         try:

@@ -12,21 +12,21 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import replace
 from hashlib import sha256
-from itertools import chain, islice, pairwise
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.geometry.clocks import parse_ns
-from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.log.records import Damaged
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.staleness import planes_to_json, read_planes
 from mcaptrack.schema import GROUND_PLANE
 from mcaptrack.schema.names import plain_name
+from mcaptrack.schema.parts import ALL, NO_END, Span, joined, limits_of, part_digest, read_digest, span_of, within
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import CALIBRATIONS_READ
@@ -34,13 +34,13 @@ from mcaptrack.sources.cameras import camera_at, chain_of, name_above, provenanc
 from mcaptrack.sources.fixed_frame import LATCHED, TRANSFORMS_READ, edges_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.foreign.flatten import message_type_of
-from mcaptrack.sources.video import is_video_codec, read_head
+from mcaptrack.sources.pictures import Pictures
 
 Progress = Callable[[str, int, int], None]
-Span = tuple[int | None, int | None]
 
 #: The metadata record of a log that was cut out of a longer one: ``start_ns`` and ``end_ns``, as far as it is shorter.
 CUT: Final = "mcaptrack.cut"
+_NAMES: Final = ("start_ns", "end_ns")
 #: Schemas of messages of which each holds until the next one, and is all that is to be seen.
 _HELD: Final = (*CALIBRATIONS_READ, GROUND_PLANE.name, "nav_msgs/OccupancyGrid", "foxglove.Grid", "foxglove.GeoJSON")
 _SCENE: Final = "foxglove.SceneUpdate"
@@ -52,84 +52,42 @@ _LATCHING: Final = re.compile(r"durability:\s*(?:1\b|transient_local)")
 _DEPTH: Final = re.compile(r"depth:\s*(\d{1,6})")
 
 
-@dataclass
-class CutReport:
+class CutReport(NamedTuple):
     """The result of ``cut``: messages, topics, how many messages of each are from before the start; and losses."""
 
-    messages: int = 0
-    topics: tuple[str, ...] = ()
-    earlier: dict[str, int] = field(default_factory=dict)
-    lost: list[str] = field(default_factory=list)
+    messages: int
+    topics: tuple[str, ...]
+    earlier: Mapping[str, int]
+    lost: Sequence[str]
+
+
+#: A message from before the start: topic, number of the channel in the new log, message.
+_Held = tuple[str, int, log.Message]
 
 
 class _Member(NamedTuple):
-    """A channel of a log: the number of the log, and its file."""
+    """A channel of a log: the number of the log, its file, and how mcaptrack made the channel, if it did."""
 
     number: int
     part: log.Log
     channel: log.Channel
-
-
-class _Piece(NamedTuple):
-    """A part of a channel: the digest of the whole, and from when and before when it is, if that is shorter."""
-
-    digest: str
-    start_ns: int | None = None
-    end_ns: int | None = None
-
-    @classmethod
-    def of(cls, cut: Mapping[str, str], span: Span, digest: str = "") -> _Piece:
-        """The part of an earlier cut within a span."""
-        before = (parse_ns(cut.get("start_ns", "")), parse_ns(cut.get("end_ns", "")))
-        starts, ends = ([t for t in pair if t is not None] for pair in zip(before, span, strict=True))
-        return cls(cut.get("digest", digest), max(starts, default=None), min(ends, default=None))
-
-    def holds(self, t_ns: int) -> bool:
-        """Whether a time is within it."""
-        is_after = self.start_ns is None or t_ns >= self.start_ns
-        return is_after and (self.end_ns is None or t_ns < self.end_ns)
-
-    @property
-    def texts(self) -> dict[str, str]:
-        """Its limits as metadata."""
-        return {name: str(t_ns) for name in ("start_ns", "end_ns") if (t_ns := getattr(self, name)) is not None}
-
-    def described(self) -> tuple[str, dict[str, str]]:
-        """The digest of the messages that are left, and ``Provenance.cut``."""
-        if not self.texts or not self.digest:
-            return self.digest, self.texts
-        cut = {"digest": self.digest, **self.texts}
-        return sha256(repr(sorted(cut.items())).encode()).hexdigest(), cut
-
-
-def _joined(pieces: Collection[_Piece]) -> _Piece | None:
-    """The pieces as one, if they are of the same whole and without a gap between them."""
-    in_order = sorted(pieces, key=lambda piece: -1 if piece.start_ns is None else piece.start_ns)
-    digests = {piece.digest for piece in in_order}
-    until = in_order[0].end_ns
-    for piece in in_order[1:]:
-        if until is not None and piece.start_ns is not None and piece.start_ns > until:
-            return None
-        until = None if until is None or piece.end_ns is None else max(until, piece.end_ns)
-    return _Piece(digests.pop(), in_order[0].start_ns, until) if len(digests) == 1 else None
+    origin: Provenance | None
 
 
 def cut(
     logs: Sequence[log.Log],
     output: Path,
     topics: Collection[str],
-    span: Span = (None, None),
+    span: tuple[int | None, int | None] = (None, None),
     progress: Progress = lambda *_: None,
 ) -> CutReport:
     """Write the messages of topics of logs in a half-open span of times to a new log.
 
     Raises McaptrackError if a log can't be read, or changes meanwhile.
     """
-    work = _Cut(logs, topics, span)
-    headers = {log.header(opened)[0] for opened in logs}
-    is_one = len(logs) == 1 and logs[0].results is None
-    header = bytes(logs[0].snapshot.record(len(log.MAGIC))) if is_one else None
-    with log.create(output, headers.pop() if len(headers) == 1 else "", header=header) as writer:
+    work = _Cut(logs, topics, (span[0] or 0, NO_END if span[1] is None else span[1]))
+    is_same = len({log.header(opened)[0] for opened in logs}) == 1
+    with log.create(output, header=bytes(logs[0].snapshot.record(len(log.MAGIC))) if is_same else None) as writer:
         return work.write(writer, progress)
 
 
@@ -139,16 +97,14 @@ class _Cut:
     def __init__(self, logs: Sequence[log.Log], topics: Collection[str], span: Span) -> None:
         self._logs, self._span, self._lost = logs, span, list[str]()
         self._held_ns = 0  # the time at which messages from before the start are written
-        #: The part that is taken of each log, without limits that leave nothing out.
-        self._spans: list[Span] = []
+        #: The part that is taken of each log, without limits that leave nothing out; and the part of a longer log that
+        #: it is already.
+        self._taken, self._earlier = list[Span](), list[Span]()
         for opened in logs:
             start_ns, end_ns = span
-            is_late = start_ns is not None and start_ns > opened.start_ns
-            is_early = end_ns is not None and end_ns <= opened.end_ns
-            self._spans.append((start_ns if is_late else None, end_ns if is_early else None))
-        cuts = [opened.metadata(CUT) for opened in logs]
-        self._is_cut = [cut is not None for cut in cuts]
-        self._pieces = [_Piece.of(cut or {}, part) for cut, part in zip(cuts, self._spans, strict=True)]
+            self._taken.append((start_ns * (start_ns > opened.start_ns), end_ns if end_ns <= opened.end_ns else NO_END))
+            cut = opened.metadata(CUT) or {}
+            self._earlier.append(span_of(*(cut.get(name, "") for name in _NAMES)))
         topics = {*topics} - _conflicts(logs, topics)
         self._channels: dict[tuple[Any, ...], list[_Member]] = {}
         for number, opened in enumerate(logs):
@@ -159,144 +115,126 @@ class _Cut:
                         continue
                     schema = part.index.schemas.get(part.index.channels[channel.id].schema_id)
                     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
-                    key = (channel.topic, fields, channel.message_encoding)
+                    how = Provenance.from_metadata(channel.metadata)
+                    recorded = None if how else frozenset(channel.metadata.items())
+                    key = (channel.topic, fields, channel.message_encoding, recorded)
                     repeats[key] += 1  # each publisher may have a channel
-                    member = _Member(number, part, channel)
+                    member = _Member(number, part, channel, how)
                     self._channels.setdefault((*key, repeats[key]), []).append(member)
-        self._logs_of: dict[str, set[int]] = {}
-        for (topic, *_), members in self._channels.items():
-            self._logs_of.setdefault(topic, set()).update(member.number for member in members)
 
     def write(self, writer: log.LogWriter, progress: Progress) -> CutReport:
         """Write the new log."""
-        self._warn()
-        report = CutReport(topics=tuple(sorted(self._logs_of)))
-        ids: dict[log.Log, dict[int, int]] = {part: {} for opened in self._logs for part in opened.parts}
-        since: dict[log.Log, dict[int, int]] = {part: {} for part in ids}
-        earlier: list[tuple[int, log.Message]] = []
-        held = [self._from_before(key[0], members) for key, members in self._channels.items()]
-        self._held_ns = max(min((since_ns for since_ns, _ in held), default=0) - 1, 0)
-        for ((topic, schema, encoding, _), members), (start_ns, before) in zip(
-            self._channels.items(), held, strict=True
-        ):
-            first = members[0].channel.id
-            metadata = self._metadata(topic, members)
-            wanted = (first, members[0].part.index.channels[first].schema_id)
-            new = writer.add_channel(topic, schema, encoding, metadata, another=True, ids=wanted)
-            earlier += ((new, message) for message in before)
-            report.earlier[topic] = report.earlier.get(topic, 0) + len(before)
-            for member in members:
-                ids[member.part][member.channel.id] = new
-                own = self._own_start(member, members)
-                since[member.part][member.channel.id] = max(start_ns, own)
-        report.earlier = {topic: count for topic, count in report.earlier.items() if count}
+        parts = {part: log.Part(part, {}, {}) for opened in self._logs for part in opened.parts}
+        earlier = self._add_channels(writer, parts)
         writer.write_description(*writer.channels)
         copied: set[bytes] = set()
-        for part in ids:
-            unknown = [*log.private_records(part)]
-            for record in unknown:
+        for part in parts:
+            for record in log.private_records(part):
                 writer.write(record)
-            if unknown:
-                text = f"{len(unknown)} records of kinds that MCAP doesn't define are copied as they are"
-                warn(f"{part.path}: {text}", "other")
             log.copy_attachments_and_metadata(part, writer, without=[CUT], copied=copied)
-        if (whole := _joined(self._pieces)) and whole.texts:
-            writer.add_metadata(CUT, whole.texts)
-        for new, message in sorted(earlier, key=lambda pair: pair[1].t_ns):
+        limits = limits_of(joined(map(within, self._earlier, self._taken)))
+        if any(limits):
+            writer.add_metadata(CUT, {name: text for name, text in zip(_NAMES, limits, strict=True) if text})
+        for _, new, message in sorted(earlier, key=lambda held: held[2].t_ns):
             writer.add_message(new, self._held_ns, message.sequence, message.payload, message.publish_ns)
         writer.close_chunks()
-        parts = [log.Part(part, ids[part], since[part]) for part in ids if ids[part]]
-        report.lost = self._lost + log.copy_messages(writer, parts, self._span[1], progress)
-        report.messages = sum(writer.counts.values())
-        return report
+        lost = log.copy_messages(writer, [part for part in parts.values() if part.ids], self._span[1], progress)
+        counts, topics = Counter(topic for topic, *_ in earlier), {key[0] for key in self._channels}
+        return CutReport(sum(writer.counts.values()), tuple(sorted(topics)), counts, self._lost + lost)
 
-    def _own_start(self, member: _Member, members: Sequence[_Member]) -> int:
-        """The start of a log that was cut, if another one has what it kept from before: the first message to take."""
-        piece = self._pieces[member.number]
-        if not self._is_cut[member.number] or piece.start_ns is None:
-            return 0
-        others = {other.number for other in members if other.number != member.number and self._is_cut[other.number]}
-        return piece.start_ns if any(self._pieces[number].holds(piece.start_ns - 1) for number in others) else 0
+    def _add_channels(self, writer: log.LogWriter, parts: Mapping[log.Log, log.Part]) -> list[_Held]:
+        """Add the channels to the new log, and their numbers to the parts that they are copied from.
 
-    def _metadata(self, topic: str, members: Sequence[_Member]) -> Mapping[str, str]:
-        """The metadata of a channel: those of the first, with digests that hold for what is left of results.
-
-        What was out of date stays so, and what wasn't doesn't become so.
+        Returns the messages from before the start that hold there, with topic and channel.
         """
-        first = members[0].channel.metadata
-        origins = [how for member in members if (how := Provenance.from_metadata(member.channel.metadata))]
+        held = [self._from_before(members) for members in self._channels.values()]
+        self._held_ns = max(min((start_ns for start_ns, _ in held), default=0) - 1, 0)
+        earlier, mixed = list[_Held](), set[str]()
+        for (key, members), (start_ns, before) in zip(self._channels.items(), held, strict=True):
+            (topic, schema, encoding, *_), first = key, members[0]
+            wanted = (first.channel.id, first.part.index.channels[first.channel.id].schema_id)
+            new = writer.add_channel(topic, schema, encoding, self._metadata(members), another=True, ids=wanted)
+            earlier += ((topic, new, message) for message in before)
+            spans = []
+            for member, own_start in zip(members, self._own_starts(members), strict=True):
+                if own_start < NO_END:  # else another log has all of it
+                    parts[member.part].ids[member.channel.id] = new
+                    parts[member.part].since_ns[member.channel.id] = max(start_ns, own_start)
+                    opened = self._logs[member.number]
+                    spans.append((max(opened.start_ns, own_start), opened.end_ns))
+            mixed |= {topic for pair in combinations(spans, 2) if max(a for a, _ in pair) <= min(b for _, b in pair)}
+        if mixed:
+            text = "from the same time in several logs: their messages alternate"
+            warn(f"{len(self._logs)} logs have {list_names(sorted(mixed))} {text}", "other")
+        return earlier
+
+    def _own_starts(self, members: Sequence[_Member]) -> list[int]:
+        """From when on the messages of each log count: what logs have that are parts of one is taken once."""
+        digests = [read_digest(it.origin.digest or it.origin.input_digest if it.origin else "") for it in members]
+        if digests[0][0] and len({whole for whole, _ in digests}) == 1:
+            starts, until = [0] * len(members), 0
+            for place in sorted(range(len(members)), key=lambda place: digests[place][1]):
+                starts[place], until = until, max(until, digests[place][1][1])
+            return starts
+        spans = [self._earlier[member.number] for member in members]
+        cuts = [span for span in spans if span != ALL]  # another one has what was kept from before the start
+        return [start * any(cut[0] < start <= cut[1] for cut in cuts) for start, _ in spans]
+
+    def _metadata(self, members: Sequence[_Member]) -> Mapping[str, str]:
+        """The metadata of a channel: those of the first, where digests have the limits of what is left.
+
+        Since all digests get the limits, what was out of date stays so, and what wasn't doesn't become so.
+        """
+        first, origins = members[0].channel.metadata, [member.origin for member in members if member.origin]
         if len(origins) < len(members):
             return first
-        how = origins[0]
-        digest, cut = self._digest(topic)
-        made_from = {name: self._digest_then(name, members, origins) for name in how.made_from()}
-        parameters = dict(how.parameters)
-        if "ground_planes" in parameters:
-            parameters["ground_planes"] = self._planes_then(topic, members, origins)
+        how, made_from = origins[0], [origin.made_from() for origin in origins]
+        planes = {"ground_planes": self._planes(members, origins)} if "ground_planes" in how.parameters else {}
+        digests = {name: self._digest(members, [names.get(name, "") for names in made_from]) for name in made_from[0]}
         now = replace(
             how,
-            parameters=parameters,
-            digest=digest,
-            cut=cut,
-            input_digest=made_from[how.input],
-            references={name: made_from[name] for name in how.references},
+            parameters={**how.parameters, **planes},
+            digest=self._digest(members, [origin.digest for origin in origins]),
+            input_digest=digests[how.input],
+            references={name: digests[name] for name in how.references},
         )
         before = how.to_metadata()
         return first if now == how else {k: v for k, v in first.items() if k not in before} | now.to_metadata()
 
-    def _digest(self, topic: str) -> tuple[str, dict[str, str]]:
-        """The digest of what is left of a channel of results, and ``Provenance.cut``."""
-        pieces = [
-            _Piece.of(how.cut, self._spans[number], how.digest)
-            for number in sorted(self._logs_of[topic])
-            if (how := provenance_of(self._logs[number], topic))  # None: its messages have another schema
-        ]
-        whole = _joined(pieces)
-        if whole is None:
-            return sha256("".join(piece.described()[0] for piece in pieces).encode()).hexdigest(), {}
-        return whole.described()
+    def _digest(self, members: Sequence[_Member], digests: Sequence[str]) -> str:
+        """The digest of what is left of a channel that these logs have with these digests."""
+        wholes, spans = zip(*map(read_digest, digests), strict=True)
+        left = [within(span, self._taken[member.number]) for span, member in zip(spans, members, strict=True)]
+        if len({*wholes}) == 1:
+            return part_digest(wholes[0], joined(left))
+        return sha256("".join(map(part_digest, wholes, left)).encode()).hexdigest()
 
-    def _digest_then(self, name: str, members: Sequence[_Member], origins: Sequence[Provenance]) -> str:
-        """The digest that a channel should name of one that it was made from: the new one, if it was up to date."""
-        before = origins[0].made_from()[name]
-        if not self._logs_of.get(name, {-1}) <= {member.number for member in members}:
-            return before
-        for member, origin in zip(members, origins, strict=True):
-            how = provenance_of(self._logs[member.number], name)
-            if how is None or how.digest != origin.made_from().get(name):
-                return before
-        return self._digest(name)[0]
-
-    def _planes_then(self, topic: str, members: Sequence[_Member], origins: Sequence[Provenance]) -> list[Any]:
+    def _planes(self, members: Sequence[_Member], origins: Sequence[Provenance]) -> list[Any]:
         """The ground planes that a channel should name, if those that it names are those of its logs."""
-        planes: dict[int, GroundPlane] = {}
-        for member, origin in zip(members, origins, strict=True):
+        planes: dict[int, Any] = {}
+        for member, own_start, how in zip(members, self._own_starts(members), origins, strict=True):
             opened = self._logs[member.number]
-            of_camera = read_planes(opened, name_above(chain_of(opened, topic)[-1])) or ()
-            before: list[Any] = origin.parameters["ground_planes"]
-            if planes_to_json(of_camera) != before:
-                return before
-            own_start = self._own_start(member, members)
+            of_camera = read_planes(opened, name_above(chain_of(opened, member.channel.topic)[-1])) or ()
+            named: list[Any] = how.parameters["ground_planes"]
+            if planes_to_json(of_camera) != named:
+                return named
             planes |= {t_ns: plane for t_ns, plane in of_camera if t_ns >= own_start}
         start_ns, end_ns = self._span
-        earlier = [plane for t_ns, plane in sorted(planes.items()) if start_ns is not None and t_ns < start_ns][-1:]
-        piece = _Piece("", start_ns, end_ns)
-        kept = [(t_ns, plane) for t_ns, plane in sorted(planes.items()) if piece.holds(t_ns)]
-        return planes_to_json([(self._held_ns, plane) for plane in earlier] + kept)
+        left = {self._held_ns if t_ns < start_ns else t_ns: planes[t_ns] for t_ns in sorted(planes) if t_ns < end_ns}
+        return planes_to_json([*left.items()])
 
     # From before the start
 
-    def _from_before(self, topic: str, members: Sequence[_Member]) -> tuple[int, list[log.Message]]:
+    def _from_before(self, members: Sequence[_Member]) -> tuple[int, list[log.Message]]:
         """The time of the first message of a channel to take, and messages from before the start that hold there."""
         start_ns = self._span[0]
-        if start_ns is None:
+        if not start_ns:
             return 0, []
-        opened = self._logs[members[0].number]
+        opened, topic = self._logs[members[0].number], members[0].channel.topic
         channel, latest = opened.channel(topic), dict[object, log.Message]()
         kind = plain_name(channel.schema_name)
-        before = self._before(members, start_ns)
         if foreign.holds_pictures(channel):
-            return self._first_picture_ns(opened, topic, members, start_ns), []
+            return self._first_picture_ns(members, start_ns), []
         searched = max(_latched(member.channel.metadata) for member in members)
         key: Callable[[bytes], object] = bytes
         if kind in TRANSFORMS_READ:
@@ -304,7 +242,7 @@ class _Cut:
             key = _decoder(opened, topic, edges_of)
         elif kind in (*_HELD, _SCENE):
             searched = searched or 1
-        for message in islice(before, searched):
+        for message in islice(self._before(members, start_ns), searched):
             latest.setdefault(key(message.payload), message)
         if kind == _SCENE:
             is_lasting = _decoder(opened, topic, lambda message: any(map(_is_lasting, message.entities)))
@@ -314,8 +252,7 @@ class _Cut:
     def _before(self, members: Sequence[_Member], start_ns: int) -> Iterator[log.Message]:
         """The messages of a channel before a time, the latest first."""
 
-        def of(member: _Member) -> Iterator[log.Message]:
-            own_start = self._own_start(member, members)
+        def of(member: _Member, own_start: int) -> Iterator[log.Message]:
             try:
                 for message in member.part.snapshot.messages.before(member.channel.id, start_ns):
                     if message.t_ns >= own_start:
@@ -324,59 +261,15 @@ class _Cut:
                 where = f"{member.part.path}: {error}"
                 self._lost.append(f"{where}; messages of {member.channel.topic} from before the start are left out")
 
-        return heapq.merge(*map(of, members), key=lambda message: message.t_ns, reverse=True)
+        return heapq.merge(*map(of, members, self._own_starts(members)), key=lambda message: message.t_ns, reverse=True)
 
-    def _first_picture_ns(self, opened: log.Log, topic: str, members: Sequence[_Member], start_ns: int) -> int:
+    def _first_picture_ns(self, members: Sequence[_Member], start_ns: int) -> int:
         """The time of the picture that decoding of the first one after the start begins with."""
-        try:
-            read = foreign.picture_reader(opened, topic)
-            streams = (m.part.snapshot.messages.by_time([m.channel.id], (start_ns, self._span[1])) for m in members)
-            first = [*islice(heapq.merge(*streams, key=lambda message: message.t_ns), 1)]
-        except McaptrackError:  # copying says so, or viewers
-            return start_ns
-        is_key = False
-        for message in islice(chain(first, self._before(members, start_ns)), _SEARCHED if first else 0):
-            try:
-                picture = read(message)
-            except McaptrackError:
-                continue
-            if not is_video_codec(picture.format):
-                return start_ns
-            head = read_head(picture.format, picture.data)
-            is_key |= head.is_key
-            if is_key and head.has_parameter_sets:
-                return min(message.t_ns, start_ns)
-        if first:
-            text = "there is no key picture before the start: the first pictures can't be decoded"
-            warn(f"{opened.path}: {topic}: {text}", "pictures")
-        return start_ns
-
-    def _warn(self) -> None:
-        """Warn of channels of several logs that may not fit."""
-        schemas: dict[str, set[tuple[Any, ...]]] = {}
-        differing, mixed = [], []
-        for (topic, *layout, repeat), members in self._channels.items():
-            if repeat == 1:
-                schemas.setdefault(topic, set()).add(tuple(layout))
-            plain = {tuple(sorted(member.channel.metadata.items())) for member in members}
-            differing += [topic] if len(plain) > 1 and not Provenance.from_metadata(members[0].channel.metadata) else []
-            spans = sorted(self._times_of(number) for number in {member.number for member in members})
-            mixed += [topic] if any(later[0] < before[1] for before, later in pairwise(spans)) else []
-        several = [topic for topic, layouts in schemas.items() if len(layouts) > 1]
-        where = f"{len(self._logs)} logs"
-        for topics, text in (
-            (several, "in messages of several layouts: they stay in channels of their own"),
-            (differing, "with other metadata in each log: those of the first are taken"),
-            (mixed, "from the same time in several logs: their messages alternate"),
-        ):
-            if topics and len(self._logs) > 1:
-                warn(f"{where} have {list_names(sorted({*topics}))} {text}", "other")
-
-    def _times_of(self, number: int) -> tuple[int, int]:
-        """The time of the first message of a log that counts, and the end."""
-        opened, piece = self._logs[number], self._pieces[number]
-        start_ns = piece.start_ns if self._is_cut[number] and piece.start_ns is not None else opened.start_ns
-        return start_ns, opened.end_ns + 1
+        first_ns = [start_ns]
+        for member in members:
+            with suppress(McaptrackError):  # copying says so, or viewers
+                first_ns.append(Pictures(self._logs[member.number], member.channel.topic).entry_ns(start_ns))
+        return min(first_ns)
 
 
 def _conflicts(logs: Sequence[log.Log], topics: Collection[str]) -> set[str]:
@@ -387,14 +280,10 @@ def _conflicts(logs: Sequence[log.Log], topics: Collection[str]) -> set[str]:
             if (how := provenance_of(opened, topic)) and how.transform != INGEST:
                 origins.setdefault(topic, []).append(how)
     out: set[str] = set()
-    more = {topic for topic, those in origins.items() if len({how.cut.get("digest", how.digest) for how in those}) > 1}
-    while more:
+    more = {topic for topic, those in origins.items() if len({read_digest(how.digest)[0] for how in those}) > 1}
+    while not more <= out:
         out |= more
-        more = {
-            topic
-            for topic, those in origins.items()
-            if topic not in out and any(not out.isdisjoint(how.made_from()) for how in those)
-        }
+        more = {topic for topic, those in origins.items() if any(not out.isdisjoint(how.made_from()) for how in those)}
     if out:
         text = "are left out: each log has its own, with its own ids; `mcaptrack run` makes those of all"
         warn(f"results of {len(logs)} logs in {list_names(sorted(out))} {text}", "left-out")
@@ -405,33 +294,32 @@ def needed(opened: log.Log, topics: Collection[str]) -> set[str]:
     """Return topics with those that tell whether results in them are up to date: what they were compared with, and the
     ground planes; of rows only, without pictures.
     """
-    out, new = {*topics}, {*topics}
-    while new:
-        names: set[str] = set()
-        for topic in new:
-            how = provenance_of(opened, topic)
-            names |= {*how.references} if how else set()
-            if how and "ground_planes" in how.parameters:
-                names.add(camera_at(opened, name_above(chain_of(opened, topic)[-1])).ground_plane)
-        new = {name for name in names - out if name in opened.channels and opened.channels[name].schema is not None}
-        out |= new
-    return out
+    out, todo = set[str](), [*topics]
+    while todo:
+        topic = todo.pop()
+        channel = opened.channels.get(topic)
+        if topic in out or channel is None or not (channel.schema or topic in topics):
+            continue
+        out.add(topic)
+        how = Provenance.from_metadata(channel.metadata)
+        todo += how.references if how else ()
+        if how and "ground_planes" in how.parameters:
+            todo.append(camera_at(opened, name_above(chain_of(opened, topic)[-1])).ground_plane)
+    return {*topics} | out
 
 
 def _decoder(opened: log.Log, topic: str, convert: Callable[[Any], object]) -> Callable[[bytes], object]:
     """A function that decodes messages of a channel; of those that can't be decoded it returns the bytes."""
-    try:
+    with suppress(McaptrackError):
         decode = decoder_with_errors(message_type_of(opened, topic), convert)
-    except McaptrackError:
-        return bytes
 
-    def decoded(payload: bytes) -> object:
-        try:
-            return decode(payload)
-        except McaptrackError:
+        def decoded(payload: bytes) -> object:
+            with suppress(McaptrackError):
+                return decode(payload)
             return payload
 
-    return decoded
+        return decoded
+    return bytes
 
 
 def _is_lasting(entity: Any) -> bool:
@@ -444,6 +332,6 @@ def _latched(metadata: Mapping[str, str]) -> int:
     """The most messages that a late subscriber gets: the last ones; 0 if the channel isn't latched."""
     profiles = metadata.get("offered_qos_profiles", "")
     publishers = len(_LATCHING.findall(profiles)) + (metadata.get("latching") == "1")
-    if publishers > 1 or "keep_all" in profiles:
-        return _SEARCHED
-    return min(max(1, *map(int, _DEPTH.findall(profiles)), 1), _SEARCHED) if publishers else 0
+    is_every = publishers > 1 or re.search(r"history:\s*(2\b|keep_all)", profiles)
+    depth = _SEARCHED if is_every else max(1, *map(int, _DEPTH.findall(profiles)), 1)
+    return min(depth, _SEARCHED) if publishers else 0

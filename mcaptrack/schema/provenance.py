@@ -58,8 +58,7 @@ class Provenance:
     ``columns`` are those of a schema of a user's own (see ``schema.own``). ``scores`` say what scores of its input were
     taken for where these are no likelihoods: by the name of a class, SCORE:LIKELIHOOD of points with straight lines
     between them. ``boxes`` say how boxes of other software in its input were read: their clock, classes, scale and
-    fields, and what a user chose. ``cut`` says which part of a longer channel it is: from ``start_ns`` until before
-    ``end_ns``, as far as that is shorter, with the ``digest`` of the whole.
+    fields, and what a user chose. In a log that was cut out of a longer one, digests name parts (see ``parts``).
     """
 
     transform: str
@@ -82,7 +81,6 @@ class Provenance:
     columns: str = ""
     boxes: Mapping[str, str] = field(default_factory=dict)
     scores: Mapping[str, str] = field(default_factory=dict)
-    cut: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def written_by(self) -> str:
@@ -126,10 +124,8 @@ class Provenance:
             "continued": json.dumps(dict(self.continued), sort_keys=True),
             "scores": json.dumps(dict(self.scores), ensure_ascii=False),
             "boxes": json.dumps(dict(self.boxes), sort_keys=True),
-            "cut": json.dumps(dict(self.cut), sort_keys=True),
         }
         names = (
-            "cut",
             "scores",
             "boxes",
             "continued",
@@ -152,7 +148,7 @@ class Provenance:
         if "transform" not in values:
             return None
         parameters, references = (_read(values.pop(key, ""), dict) for key in ("parameters", "references"))
-        names = ("classes", "zones", "model", "continued", "scores", "boxes", "cut")
+        names = ("classes", "zones", "model", "continued", "scores", "boxes")
         texts = {key: read_texts(values.pop(key, "")) for key in names}
         plugins = _plugins(values)
         warnings = [warning for warning in _read(values.pop("warnings", ""), list) if _is_warning(warning)]

@@ -158,6 +158,12 @@ class Pictures:
             left_out = f"{len(errors)} of {len(wanted)} pictures of {self._topic} can't be decoded and are left out"
             warn(f"{self._opened.path}: {left_out}, the first: {errors[0]}", "lost")
 
+    def entry_ns(self, t_ns: int) -> int:
+        """The time of the message at which decoding of the first picture from a time on begins, or else that time."""
+        number = int(np.searchsorted(self.t_ns, t_ns))
+        entry = self._entry(number) if number < len(self.t_ns) else None
+        return t_ns if entry is None else int(self.t_ns[entry])
+
     def _entry(self, number: int) -> int | None:
         """Return the message at which decoding of a picture begins: its key picture, or the parameter sets of that.
 

@@ -149,7 +149,7 @@ class TypedMessages:
         self.schema, self.left_out = self._rows.schema, list(reader.left_out)
 
     def rows(self, batch: Payloads) -> Any:
-        """The next batch as a table. Raises McaptrackError if most messages so far can't be read."""
+        """The next batch as a table. Raises McaptrackError if none can be read."""
         self.unread.count(len(batch.t_ns))
         return self._rows.table(batch, _read(self.reader, batch, self.types, self.source.flatten, self.unread))
 

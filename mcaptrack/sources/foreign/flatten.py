@@ -33,8 +33,8 @@ Path = tuple[str, ...]
 
 _MAX_DEPTH: Final = 32
 _LIMIT_NS: Final = 2**63
-#: If more messages of a channel can't be read, and more than half, it is of another type.
-_MOST_UNREAD: Final = 100
+#: If none of the first messages of a channel can be read, and these are more, it is of another type.
+_MOST_UNREAD: Final = 10_000
 #: Times in protobuf, and the field names of those in ROS 1, ROS 2 and JSON of bridges.
 _OF_PROTOBUF: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 _TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
@@ -87,10 +87,10 @@ class UnreadMessages:
         self._seen += messages
 
     def add(self, t_ns: int, why: str) -> None:
-        """Add a message. Raises McaptrackError if most are of another type."""
+        """Add a message. Raises McaptrackError if no message can be read, or none of the first ones."""
         self._first = min(self._first, (t_ns, why)) if self._unread else (t_ns, why)
         self._unread += 1
-        if self._unread == self._total or (self._unread > _MOST_UNREAD and 2 * self._unread > self._seen):
+        if self._unread == self._total or _MOST_UNREAD < self._unread == self._seen:
             raise McaptrackError(str(self))
 
     def lose(self, messages: int, why: str) -> None:

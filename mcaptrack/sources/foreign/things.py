@@ -213,7 +213,7 @@ def read_channel(
     """Read the messages of a channel: those of a batch together, if ``paths`` says which fields are read, as columns
     where they can be. Others, and those of a batch in which some can't be read, are read each for itself.
 
-    Raises McaptrackError, with topic and time, if messages of this type can't be read, or if most of them can't.
+    Raises McaptrackError, with topic and time, if messages of this type can't be read, or if none of them can.
     """
     unread = UnreadMessages(f"{opened.path}: {topic}", opened.channel(topic).messages)
     decode = payload_decoder(opened, topic, lambda kind: decoder_with_errors(kind, lambda one: read(Things([one]))))

@@ -37,7 +37,7 @@ class ChannelFile:
         self._writing: Future[None] | None = None
 
     def add(self, batch: Payloads) -> Iterator[Any]:
-        """Add messages; gives the pieces that are whole. Raises McaptrackError if most can't be read."""
+        """Add messages; gives the pieces that are whole. Raises McaptrackError if none can be read."""
         return self.waiting.add(self.messages.rows(batch))
 
     def write(self, piece: Any, threads: Executor | None) -> Future[None] | None:
