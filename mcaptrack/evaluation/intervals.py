@@ -43,10 +43,10 @@ class Interval(NamedTuple):
         return {"median": self.median, "from": self.low, "to": self.high}
 
     def words(self, digits: int = 0, unit: str = "") -> str:
-        """As text: the median, and the interval in brackets; none for none."""
+        """As text: the median, of counts also a half, and the interval in brackets; none for none."""
         if self.median is None:
             return ""
-        middle = f"{self.median:.{digits}f}"
+        middle = f"{self.median:.{digits}f}" if digits else f"{self.median:.12g}"
         return middle + ("" if self.low is None else f" ({self.low:.{digits}f} to {self.high:.{digits}f})") + unit
 
 

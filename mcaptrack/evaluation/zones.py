@@ -583,8 +583,9 @@ def _positions_in_worlds(positions: TrackPositions, t_ns: Ints, worlds: JoinedFr
     rows, frames = worlds.rows, len(t_ns) + 1
     begin = np.searchsorted(t_ns, worlds.row_ns)
     (source, first), which = np.unique(np.stack([rows["source_id"], begin]), axis=1, return_inverse=True)
-    track = np.full((rows["world"].max(), len(source)), -1)
-    track[rows["world"] - 1, which.ravel()] = np.where(rows["kept"], rows["track_id"], -1)
+    numbers, world = np.unique(rows["world"], return_inverse=True)
+    track = np.full((len(numbers), len(source)), -1)
+    track[world, which.ravel()] = np.where(rows["kept"], rows["track_id"], -1)
     end = np.zeros(len(source), np.int64)
     until_ns = worlds.row_ns + (rows["duration_s"] * NS_PER_S).astype(np.int64) + _ROUNDED_NS
     end[which.ravel()] = np.searchsorted(t_ns, until_ns, "right")
