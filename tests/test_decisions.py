@@ -126,7 +126,7 @@ def test_the_least_likely_tracks_come_first_and_sure_ones_not_at_all():
     found = find_doubtful_tracks([Frame(0, 0, rows)])
     assert [one.text("a person").replace("\N{NO-BREAK SPACE}", " ") for one in found] == [
         "the tracker's 7 is left out, seen for 7.0 s: the probability of being a person is 45 %, "
-        "15 % for one whom no other track follows",
+        "15 % for an additional one",
         "track 2 is kept, seen for 8.0 s: the probability of being a person is 60 %",
     ]
 

@@ -14,7 +14,7 @@ from mcaptrack import notices
 WIDER: Final = 0.12
 
 
-class Interval(NamedTuple):
+class WorldInterval(NamedTuple):
     """The median of a number in all worlds, and an interval of 90 %, given what was detected; None for none."""
 
     median: float | None
@@ -22,7 +22,7 @@ class Interval(NamedTuple):
     high: float | None
 
     @classmethod
-    def of(cls, values: ArrayLike, is_count: bool = False, has_none: bool = False) -> Interval:
+    def of(cls, values: ArrayLike, is_count: bool = False, has_none: bool = False) -> WorldInterval:
         """Find the interval of the ``values`` of all worlds (W,), NaN for none; that of a count has whole ends.
 
         With ``has_none`` there is the median alone.

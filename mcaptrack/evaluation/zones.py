@@ -14,7 +14,7 @@ import numpy as np
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import Interval, is_people
+from mcaptrack.evaluation.intervals import WorldInterval, is_people
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
@@ -55,9 +55,9 @@ class ZoneInWorlds:
     """
 
     worlds: int
-    tracks: Interval
-    mean_dwell_s: Interval | None
-    then: Mapping[str, Interval]
+    tracks: WorldInterval
+    mean_dwell_s: WorldInterval | None
+    then: Mapping[str, WorldInterval]
 
     def to_json(self) -> dict[str, Any]:
         """As values of JSON."""
@@ -293,8 +293,7 @@ def find_zone_events(
     stays: list[_Stays] = []
     passes: list[_Passes] = []
     for placed in zones:
-        paths, rows = _paths(positions, placed, options, name)
-        margin = placed.shape.margin(_margin(positions, placed.units, options))
+        paths, rows, margin = _paths(positions, placed, options, name)
         if placed.zone.is_line:
             row, sign = crossings(paths, placed.shape, margin)
             passes.append(_Passes(placed.zone.number, rows[row], sign * placed.forward > 0))
@@ -311,13 +310,8 @@ def find_zone_events(
     )
 
 
-def _margin(positions: TrackPositions, units: Units, options: ZoneOptions) -> float:
-    """The margin in the units that a zone is compared in."""
-    return options.margin_m if units == "metres" else options.margin_m / PERSON_HEIGHT_M * positions.height_px
-
-
-def _paths(positions: TrackPositions, placed: PlacedZone, options: ZoneOptions, name: str) -> tuple[Paths, Ints]:
-    """The paths of tracks in the units of a zone, and the row of each of their points."""
+def _paths(positions: TrackPositions, placed: PlacedZone, options: ZoneOptions, name: str) -> tuple[Paths, Ints, float]:
+    """The paths of tracks in the units of a zone, the row of each of their points, and the margin in these units."""
     points = positions.at[placed.units]
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(points) and not len(rows):
@@ -325,7 +319,9 @@ def _paths(positions: TrackPositions, placed: PlacedZone, options: ZoneOptions, 
         raise McaptrackError(f"{name} has no {where}, which zone {placed.zone.name} in {placed.zone.units} needs")
     rows = rows[is_counted(positions, placed.zone)[rows]]
     gap_ns = seconds_to_ns(options.max_gap_s)
-    return Paths.of(points[rows], positions.t_ns[rows], positions.track[rows], gap_ns), rows
+    margin = options.margin_m if placed.units == "metres" else options.margin_m / PERSON_HEIGHT_M * positions.height_px
+    paths = Paths.of(points[rows], positions.t_ns[rows], positions.track[rows], gap_ns)
+    return paths, rows, placed.shape.margin(margin)
 
 
 def _far_away(placed: PlacedZone, points: Floats, name: str) -> Iterator[str]:
@@ -537,8 +533,7 @@ def zones_in_worlds(
         arrivals = []
         people.append(len(np.unique(of_world.track)))
         for placed in zones:
-            paths, rows = _paths(of_world, placed, options, "worlds")
-            margin = placed.shape.margin(_margin(positions, placed.units, options))
+            paths, rows, margin = _paths(of_world, placed, options, "worlds")
             stay = _Stays.of(placed, margin, rows, of_world, paths)
             arrivals.append(_Arrivals.of(of_world, stay))
             dwell_s.append(stay.dwell_s.mean() if len(stay.dwell_s) else np.nan)
@@ -552,9 +547,9 @@ def zones_in_worlds(
         others = ((other, np.array(then)[:, number, to]) for to, other in enumerate(zones) if to != number)
         out[placed.zone.name] = ZoneInWorlds(
             size,
-            Interval.of(tracks, is_count=True, has_none=has_none),
-            None if np.isnan(dwell[:, number]).any() else Interval.of(dwell[:, number]),
-            {other.zone.name: Interval.of(values, is_count=True) for other, values in others},
+            WorldInterval.of(tracks, is_count=True, has_none=has_none),
+            None if np.isnan(dwell[:, number]).any() else WorldInterval.of(dwell[:, number]),
+            {other.zone.name: WorldInterval.of(values, is_count=True) for other, values in others},
         )
     return out
 

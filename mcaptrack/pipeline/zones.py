@@ -229,7 +229,7 @@ def counted_zones(opened: log.Log, prefix: str, with_worlds: bool = False) -> li
 
 
 def _in_worlds(state: RunState, zones: Sequence[Zone], options: ZoneOptions) -> dict[str, ZoneInWorlds]:
-    """What worlds of re-tracking say of zones, by the names of these; nothing without worlds."""
+    """Find what worlds of re-tracking say of zones, by the names of these; nothing without worlds."""
     topic = f"{state.prefix}/retracks/worlds"
     worlds, how = join_frames(WORLDS, state.frames(topic, WORLDS)), state.provenance(topic)
     if not len(worlds.rows) or how is None or is_outdated(state, (topic,)):

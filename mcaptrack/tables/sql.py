@@ -20,7 +20,7 @@ import numpy as np
 
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call, did_you_mean
-from mcaptrack.evaluation.intervals import Interval, is_people
+from mcaptrack.evaluation.intervals import WorldInterval, is_people
 from mcaptrack.files import place_of
 from mcaptrack.location import Location, distinct_names, join
 from mcaptrack.log.recording_files import results_path
@@ -285,7 +285,7 @@ class Database:
             has_none = counts and is_people(name, sums, people)
             missing = [0] * len(answers) if counts else []
             values = (row + missing[len(row) :] for row in found[name].to_pylist())
-            intervals = [Interval.of(np.array(row, float), counts, has_none) for row in values]
+            intervals = [WorldInterval.of(np.array(row, float), counts, has_none) for row in values]
             middle, low, high = zip(*intervals, strict=True) if intervals else ((), (), ())
             kind = pa.int64() if counts else pa.float64()
             columns |= {name: pa.array(middle, pa.float64())}

@@ -98,9 +98,10 @@ def draw_worlds(
 
 
 def additional_share(worlds: Worlds, track: Ints, kept: Bools) -> Floats:
-    """Of the probability of each track (P,) to be a person, the share for one whom no track that was ``kept`` follows.
+    """Of the probability that each track (P,) is a person, the share for an additional one.
 
-    Others are followed already: before, after or beside. ``track`` (K,) is that of each tracklet as it was decided.
+    No track that was ``kept`` (P,) follows it, before, after or beside. ``track`` (K,) is that of each tracklet as it
+    was decided.
     """
     of = np.unique(track, return_inverse=True)[1]
     counts = np.zeros((2, len(kept)))

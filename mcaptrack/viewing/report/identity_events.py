@@ -307,7 +307,7 @@ class DoubtfulTrack(NamedTuple):
         done = f"{track} is {'kept' if is_kept else 'left out'}, {seen}"
         but = ": the" if is_kept == (chance >= _EVEN) else ", although the"
         more = float(row["additional"])
-        split = "" if np.isnan(more) else f", {percent(more, 0)} for one whom no other track follows"
+        split = "" if np.isnan(more) else f", {percent(more, 0)} for an additional one"
         return f"{done}{but} probability of being {noun} is {percent(chance, 0)}{split}"
 
 
