@@ -49,9 +49,8 @@ class ZoneOptions:
 class ZoneInWorlds:
     """Of a zone in so many worlds of re-tracking, given the same detections: medians and intervals of 90 %.
 
-    ``tracks`` are the different tracks that visited it, ``mean_dwell_s`` is the mean of their visits, None where it
-    was not visited in all worlds. ``then`` has by the name of each other zone the tracks that came here first, and
-    there after.
+    ``tracks`` are the different tracks that visited it, ``mean_dwell_s`` is the mean of their visits, over the worlds
+    that have any. ``then`` has by the name of each other zone the tracks that came here first, and there after.
     """
 
     worlds: int
@@ -548,7 +547,7 @@ def zones_in_worlds(
         out[placed.zone.name] = ZoneInWorlds(
             size,
             WorldInterval.of(tracks, is_count=True, has_none=has_none),
-            None if np.isnan(dwell[:, number]).any() else WorldInterval.of(dwell[:, number]),
+            None if np.isnan(dwell[:, number]).all() else WorldInterval.of(dwell[:, number]),
             {other.zone.name: WorldInterval.of(values, is_count=True) for other, values in others},
         )
     return out
