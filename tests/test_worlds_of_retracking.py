@@ -281,8 +281,8 @@ def test_logs_without_worlds_are_refused(template):
         mcaptrack.query(template, "select count(*) as n from tracks", worlds=True)
 
 
-RIGHT = {"type": "Polygon", "coordinates": [[[0, -99], [99, -99], [99, 99], [0, 99], [0, -99]]]}
-LEFT = {"type": "Polygon", "coordinates": [[[0, -99], [-99, -99], [-99, 99], [0, 99], [0, -99]]]}
+RIGHT = {"type": "Polygon", "coordinates": [[[2, -99], [99, -99], [99, 99], [2, 99], [2, -99]]]}
+LEFT = {"type": "Polygon", "coordinates": [[[2, -99], [-99, -99], [-99, 99], [2, 99], [2, -99]]]}
 SIDES = {
     "type": "FeatureCollection",
     "units": "metres",
@@ -293,8 +293,8 @@ SIDES = {
 }
 #: The visits of the right side in each world, the mean of their times, and the tracks that went from right to left.
 OF_SIDES = """
-with steps as (select world, track_id, x_m >= 0 as is_in, t_ns, lead(t_ns) over track as next_ns,
-                      coalesce(lag(x_m >= 0) over track, x_m < 0) != (x_m >= 0) as is_new
+with steps as (select world, track_id, x_m >= 2 as is_in, t_ns, lead(t_ns) over track as next_ns,
+                      coalesce(lag(x_m >= 2) over track, x_m < 2) != (x_m >= 2) as is_new
                from world_tracks window track as (partition by world, track_id order by t_ns)),
      stays as (select world, track_id, min(t_ns) filter (is_in and is_new) as first_in,
                       max(t_ns) filter (not is_in and is_new) as last_out,
@@ -307,11 +307,12 @@ select world, count(*) filter (visits > 0) as tracks, coalesce(sum(s) / sum(visi
 
 def test_zones_have_the_medians_and_intervals_of_what_sql_counts_in_each_world(drawn, tmp_path):
     there = Path(shutil.copyfile(drawn, tmp_path / "log.mcap"))
-    made = mcaptrack.zones(there, zones=SIDES, margin_m=0, max_gap_s=1e6).zones["/camera/retracks"]
+    made = mcaptrack.zones(there, zones=SIDES, margin_m=0, max_gap_s=1.3).zones["/camera/retracks"]
     (right,) = (total.in_worlds for total in made if total.zone == "right")
     wanted = mcaptrack.query(there, OF_SIDES).to_pydict()
     assert len(set(wanted["tracks"])) > 1
     assert len(set(wanted["stay"])) > 1
+    assert len(set(wanted["then_left"])) > 1
     for found, name, is_count in (
         (right.tracks, "tracks", True),
         (right.mean_dwell_s, "stay", False),

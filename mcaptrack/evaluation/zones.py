@@ -598,9 +598,9 @@ def _filled(positions: TrackPositions, t_ns: Ints) -> TrackPositions:
     """Positions with rows on a straight line in the frames between those of a track."""
     starts = run_starts(positions.track)
     low, high = positions.frame[starts], positions.frame[run_ends(starts)]
-    key = (np.cumsum(starts) - 1) * len(t_ns) + positions.frame
-    frame = ragged_range(low, high - low + 1)
-    wanted = group_index(high - low + 1) * len(t_ns) + frame
+    frame, seconds = ragged_range(low, high - low + 1), (t_ns - t_ns[0]) / NS_PER_S
+    key = (np.cumsum(starts) - 1) * (seconds[-1] + 1) + seconds[positions.frame]  # one track after the other
+    wanted = group_index(high - low + 1) * (seconds[-1] + 1) + seconds[frame]
     filled = _rows_of(positions, np.searchsorted(key, wanted, "right") - 1)
     at = {
         unit: np.stack([np.interp(wanted, key, xy[:, axis]) for axis in (0, 1)], axis=1) if len(key) else xy

@@ -232,7 +232,7 @@ def _in_worlds(state: RunState, zones: Sequence[Zone], options: ZoneOptions) -> 
     """Find what worlds of re-tracking say of zones, by the names of these; nothing without worlds."""
     topic = f"{state.prefix}/retracks/worlds"
     worlds, how = join_frames(WORLDS, state.frames(topic, WORLDS)), state.provenance(topic)
-    if not len(worlds.rows) or how is None or is_outdated(state, (topic,)):
+    if not len(worlds.rows) or how is None or not state.frames(how.input) or is_outdated(state, (topic,)):
         return {}
     samples = filtered_rows(TRACKS, state.frames(how.input), lambda joined: joined.rows["observed"])
     path, _ = path_with(state, how.input)
