@@ -12,6 +12,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,8 @@ import mcaptrack
 from mcaptrack import fleet
 from mcaptrack.api.upkeep import LogCheck, LogRecovery
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.zones import ZoneTotals
+from mcaptrack.evaluation.intervals import WorldInterval
+from mcaptrack.evaluation.zones import ZoneInWorlds, ZoneTotals
 from mcaptrack.fleet import FleetResult, LogOutcome
 from mcaptrack.log.check import CheckResult
 from mcaptrack.log.check_summary import Finding
@@ -181,6 +183,14 @@ def of_zones(to: Transcript) -> None:
     to.run("zones x.mcap --zones z", zones=run_result(zones=counted, stages=("zones",), written_because="ROS reads it"))
     to.run("zones x.mcap --zones z", zones=run_result(zones={"/a": [door]}, written_to=None, written_because="why"))
     to.run("zones x.mcap --zones z --json -q", zones=run_result(zones={"/a": [room]}, stages=("zones",)))
+    ways = {"hall": WorldInterval(2.5, 1.0, 4.0), "roof": WorldInterval(0.0, 0.0, 0.0)}
+    sure = replace(
+        room, in_worlds=ZoneInWorlds(50, WorldInterval(3.0, 2.0, 5.0), WorldInterval(12.54, 9.0, 17.26), ways)
+    )
+    alone = replace(room, zone="hall", in_worlds=ZoneInWorlds(50, WorldInterval(3.0, None, None), None, {}))
+    counted = run_result(zones={"/a": [sure, alone, door]}, stages=("zones",))
+    for more in ("", "--json"):
+        to.run(f"zones x.mcap --zones z -q {more}".strip(), zones=counted)
     to.run("run x.mcap", run=run_result(zones={"/a": [room]}, summary=Summary()))
 
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.intervals import WIDER
 from mcaptrack.notices import collected
-from mcaptrack.schema import TRACKS, WORLDS, Frame
-from mcaptrack.tables.sql import WIDER
+from mcaptrack.schema import TRACKS, WORLDS, DecisionKind, Frame
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import offline, worlds
 from tests.commands import done
@@ -44,7 +44,7 @@ def rows_of(frames: list[Frame]) -> list[tuple]:
 
 @given(seed=SEEDS)
 @settings(max_examples=4, phases=QUICK)
-def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_no_other_output_changes(seed):
+def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_others_only_get_the_share_of_additional_people(seed):
     frames = scene(seed)
     five, again = outputs_of(frames, worlds=5), outputs_of(frames, worlds=5)
     two, none = outputs_of(frames, worlds=2), outputs_of(frames)
@@ -53,7 +53,22 @@ def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_no_other_output_
     assert "worlds" not in none
     for name, wanted in none.items():
         for found, frame in zip(five[name], wanted, strict=True):
+            if name == "decisions":
+                more = found.rows["additional"]
+                assert (np.isfinite(more) == (found.rows["kind"] == DecisionKind.LEFT_OUT)).all()
+                assert not (more > 1 - found.rows["probability"]).any()
+                found.rows["additional"] = np.nan
             assert_same_rows(found.rows, frame.rows)
+
+
+def test_a_track_that_worlds_join_to_a_kept_one_is_seldom_an_additional_person():
+    """Two tracklets of a kept track, and three tracks that were left out: one joined, one alone, one never kept."""
+    decided, kept = np.array([0, 0, 1, 2, 3]), np.array([True, False, False, False])
+    drawn = worlds.Worlds(np.tile([0, 0, 0, 2, 3], (50, 1)), np.tile([True, True, True, True, False], (50, 1)))
+    _, joined, alone, never = worlds.additional_share(drawn, decided, kept)
+    assert 0 < joined < never < alone < 1
+    parted = drawn._replace(track=np.tile([0, 0, 1, 2, 3], (50, 1)))
+    assert worlds.additional_share(parted, decided, kept)[1] == alone
 
 
 @given(seed=SEEDS)
@@ -264,3 +279,58 @@ def test_what_worlds_do_not_change_is_refused(drawn, query, message):
 def test_logs_without_worlds_are_refused(template):
     with pytest.raises(McaptrackError, match="has no worlds"):
         mcaptrack.query(template, "select count(*) as n from tracks", worlds=True)
+
+
+RIGHT = {"type": "Polygon", "coordinates": [[[2, -99], [99, -99], [99, 99], [2, 99], [2, -99]]]}
+LEFT = {"type": "Polygon", "coordinates": [[[2, -99], [-99, -99], [-99, 99], [2, 99], [2, -99]]]}
+SIDES = {
+    "type": "FeatureCollection",
+    "units": "metres",
+    "features": [
+        {"type": "Feature", "properties": {"name": name}, "geometry": shape}
+        for name, shape in (("right", RIGHT), ("left", LEFT))
+    ],
+}
+#: The visits of the right side in each world, the mean of their times, and the tracks that went from right to left.
+OF_SIDES = """
+with steps as (select world, track_id, x_m >= 2 as is_in, t_ns, lead(t_ns) over track as next_ns,
+                      coalesce(lag(x_m >= 2) over track, x_m < 2) != (x_m >= 2) as is_new
+               from world_tracks window track as (partition by world, track_id order by t_ns)),
+     stays as (select world, track_id, min(t_ns) filter (is_in and is_new) as first_in,
+                      max(t_ns) filter (not is_in and is_new) as last_out,
+                      sum(next_ns - t_ns) filter (is_in) / 1e9 as s, count(*) filter (is_in and is_new) as visits
+               from steps group by all)
+select world, count(*) filter (visits > 0) as tracks, coalesce(sum(s) / sum(visits), 'nan') as stay,
+       count(*) filter (first_in < last_out) as then_left from stays group by world order by world
+"""
+
+
+def test_zones_have_the_medians_and_intervals_of_what_sql_counts_in_each_world(drawn, tmp_path):
+    there = Path(shutil.copyfile(drawn, tmp_path / "log.mcap"))
+    made = mcaptrack.zones(there, zones=SIDES, margin_m=0, max_gap_s=1.3).zones["/camera/retracks"]
+    (right,) = (total.in_worlds for total in made if total.zone == "right")
+    wanted = mcaptrack.query(there, OF_SIDES).to_pydict()
+    assert len(set(wanted["tracks"])) > 1
+    assert len(set(wanted["stay"])) > 1
+    assert len(set(wanted["then_left"])) > 1
+    for found, name, is_count in (
+        (right.tracks, "tracks", True),
+        (right.mean_dwell_s, "stay", False),
+        (right.then["left"], "then_left", True),
+    ):
+        low, middle, high = np.percentile(wanted[name], [5, 50, 95])
+        ends = max(low - WIDER * middle, 0), high + WIDER * middle
+        ends = (np.floor(ends[0]), np.ceil(ends[1])) if is_count else ends
+        assert found == pytest.approx((middle, *ends)), name
+
+
+def test_zones_of_all_people_have_no_interval_and_those_of_logs_without_worlds_say_nothing(drawn, tmp_path):
+    everywhere = {"type": "Polygon", "coordinates": [[[-99, -99], [99, -99], [99, 99], [-99, 99], [-99, -99]]]}
+    there = Path(shutil.copyfile(drawn, tmp_path / "log.mcap"))
+    with collected() as warnings:
+        (total,) = mcaptrack.zones(there, zones=everywhere | {"units": "metres"}).zones["/camera/retracks"]
+    assert (total.in_worlds.tracks.low, total.in_worlds.tracks.high) == (None, None)
+    assert ["no interval" in warning.message for warning in warnings] == [True]
+    done("retrack", there, "-q")
+    (total,) = mcaptrack.zones(there).zones["/camera/retracks"]
+    assert (total.in_worlds, "in_worlds" in total.to_json()) == (None, False)

@@ -5,7 +5,8 @@
 
 ``signs`` makes five trackers of each scene (``crowds.py``), with faults of their own or with those of the tracker that
 the reference is re-tracked from, and prints how often better and worse are right, by the difference that is seen.
-``worlds`` prints how often the intervals of ``query --worlds`` hold the true number, and how wide they are.
+``worlds`` prints how often the intervals of ``query --worlds`` and of ``zones`` hold the true number, and how wide they
+are.
 """
 
 from __future__ import annotations
@@ -90,15 +91,25 @@ def signs(seeds: list[int], count: int) -> None:
               f"decided {decided.sum():5}, of these right {of_decided}")  # fmt: skip
 
 
-def questions(low: Rows, size: Rows) -> dict[str, str]:
-    """What is asked of a scene of this size: in two rectangles, which are A and B."""
-    places = [np.array([0.1, 0.2, 0.6, 0.7]), np.array([0.45, 0.55, 0.9, 0.95])]
-    a, b = (
-        "x_m between {} and {} and y_m between {} and {}".format(
-            *(low[axis] + share * size[axis] for axis, share in ((0, p[0]), (0, p[2]), (1, p[1]), (1, p[3])))
-        )
-        for p in places
-    )
+def rectangles(low: Rows, size: Rows) -> dict[str, list[float]]:
+    """Two zones in a scene of this size: x from and to, y from and to, in m."""
+    shares = {"A": (0.1, 0.6, 0.2, 0.7), "B": (0.45, 0.9, 0.55, 0.95)}
+    return {name: [low[at // 2] + some[at] * size[at // 2] for at in range(4)] for name, some in shares.items()}
+
+
+def geometry(zones: dict[str, list[float]]) -> dict:
+    """The same as GeoJSON."""
+    rings = {name: [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]] for name, (x0, x1, y0, y1) in zones.items()}
+    shapes = [
+        {"type": "Feature", "properties": {"name": name}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+        for name, ring in rings.items()
+    ]
+    return {"type": "FeatureCollection", "units": "metres", "features": shapes}
+
+
+def questions(zones: dict[str, list[float]]) -> dict[str, str]:
+    """What is asked of zones A and B."""
+    a, b = ("x_m between {} and {} and y_m between {} and {}".format(*zone) for zone in zones.values())
     return {
         "people": "select count(distinct track_id) from tracks",
         "visitors of A": f"select count(distinct track_id) from tracks where {a}",
@@ -109,8 +120,15 @@ def questions(low: Rows, size: Rows) -> dict[str, str]:
     }
 
 
+#: The tracks that visited A before they came to B.
+_THEN = """
+select count(*) as n from (select min(t_ns) filter (zone = 'A') as a, max(t_ns) filter (zone = 'B') as b
+                           from zone_visits group by track_id) where a < b
+"""
+
+
 def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, list[float]]]:
-    """What was asked, the true answer, and that of worlds: from, median, to."""
+    """What was asked, the true answer, and that of worlds: median, from, to."""
     for seed in seeds:
         for number, truth in enumerate(scenes(seed, STEPS, count)):
             rng = np.random.default_rng([seed, number, 8])
@@ -121,17 +139,31 @@ def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, list[flo
                         log.write("/camera/tracks", [frame for frame in frames(rows) if len(frame.rows)])
                 mcaptrack.retrack(Path(folder, "scene.mcap"), worlds=50)
                 low = truth[:, 2:].min(axis=0)
-                asked = questions(low, truth[:, 2:].max(axis=0) - low)
+                zones = rectangles(low, truth[:, 2:].max(axis=0) - low)
+                asked = questions(zones)
                 query = "select " + ", ".join(f'({part}) as "{name}"' for name, part in asked.items())
                 (true,) = mcaptrack.query(Path(folder, "true.mcap"), query).to_pylist()
                 (found,) = mcaptrack.query(Path(folder, "scene.mcap"), query, worlds=True).to_pylist()
                 for name in asked:
-                    yield name, true[name], [found[name + end] for end in ("_from", "", "_to")]
+                    yield name, true[name], [found[name + end] for end in ("", "_from", "_to")]
+                yield from zone_answers(Path(folder), geometry(zones))
+
+
+def zone_answers(folder: Path, zones: dict) -> Iterator[tuple[str, float, list[float]]]:
+    """As ``answers``, from ``zones``."""
+    true = mcaptrack.zones(folder / "true.mcap", zones=zones).zones["/camera/tracks"]
+    (then,) = mcaptrack.query(folder / "true.mcap", _THEN)["n"].to_pylist()
+    retracked = mcaptrack.zones(folder / "scene.mcap", zones=zones).zones["/camera/retracks/full"]
+    found = {total.zone: total.in_worlds for total in retracked}
+    for total in true:
+        yield f"zones: tracks in {total.zone}", total.tracks, found[total.zone].tracks
+        yield f"zones: stay in {total.zone}", total.mean_dwell_s, found[total.zone].mean_dwell_s or (None,) * 3
+    yield "zones: A -> B", then, found["A"].then["B"]
 
 
 def worlds(seeds: list[int], count: int) -> None:
     table = defaultdict(list)
-    for name, true, (low, middle, high) in answers(seeds, count):
+    for name, true, (middle, low, high) in answers(seeds, count):
         if true and low is not None:
             table[name].append((low <= true <= high, (high - low) / true, middle / true))
     for name, rows in table.items():

@@ -325,7 +325,9 @@ def _say_stale(target: Location, report: pipeline.Report, is_open: bool) -> None
 def _zones_counted(target: Location, done: Sequence[Done]) -> dict[str, list[ZoneTotals]]:
     """Return the totals of zones in a log by the topic of the tracks."""
     with logs.read(target) as opened:
-        counted = (channel for camera in done for channel in pipeline.counted_zones(opened, camera.prefix))
+        counted = (
+            channel for camera in done for channel in pipeline.counted_zones(opened, camera.prefix, with_worlds=True)
+        )
         return {channel.topic: channel.totals for channel in counted}
 
 

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any, Final
 import mcaptrack
 from mcaptrack.cli import common
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import counted, print_table, say, show_left_out
+from mcaptrack.cli.text import counted, print_table, say, show, show_left_out
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from mcaptrack import RunResult
+    from mcaptrack.evaluation.zones import ZoneInWorlds
 
 #: The word before a log that is drawn on.
 _DRAW: Final = "draw"
@@ -95,3 +96,21 @@ def print_zones(result: RunResult) -> None:
                 rows.append((name, topic, *map(str, cells)))
         if rows:
             show_left_out(print_table(head, rows, head[2:], head[:1:-1], ruled=True))
+    for topic, totals in result.zones.items():
+        _print_worlds(topic, [(total.zone, total.in_worlds) for total in totals if total.in_worlds])
+
+
+def _print_worlds(topic: str, zones: Sequence[tuple[str, ZoneInWorlds]]) -> None:
+    """Print what worlds of re-tracking say of zones, by their names."""
+    if not zones:
+        return
+    show(f"{topic} in {zones[0][1].worlds} worlds: medians, and intervals of 90 % given these detections")
+    head = ("zone", "tracks", "mean stay")
+    rows = [
+        (name, zone.tracks.words(), zone.mean_dwell_s.words(1, " s") if zone.mean_dwell_s else "")
+        for name, zone in zones
+    ]
+    show_left_out(print_table(head, rows, head[1:], ruled=True))
+    ways = [(name, to, tracks.words()) for name, zone in zones for to, tracks in zone.then.items() if tracks.high]
+    if ways:
+        show_left_out(print_table(("from", "then to", "tracks"), ways, ("tracks",), ruled=True))

@@ -6,7 +6,7 @@ Letters: F frames, N rows, V visits, C crossings, Z zones and lines.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from math import isnan
 from typing import Any, Final, NamedTuple
 
@@ -14,20 +14,24 @@ import numpy as np
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation.intervals import WorldInterval, is_people
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import PERSON_HEIGHT_M, GroundPlane, Planes
-from mcaptrack.geometry.zones import Paths, Shape, Units, Visits, Zone, crossings, visits
+from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_ends, run_starts
+from mcaptrack.geometry.zones import Paths, Shape, Units, Zone, crossings, visits
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Rows
 from mcaptrack.schema.classes import class_name, is_person
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
-from mcaptrack.schema.framing import frame_numbers, frame_times, joined_parts, split_rows
+from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, joined_parts, split_rows
 
 #: Frames of counts that are made at once.
 _FRAMES_AT_ONCE: Final = 4096
 _SIZES: Final = {"metres": "m", "pixels": "px"}
+#: Durations in rows are rounded by less than this.
+_ROUNDED_NS: Final = 1000
 
 
 @dataclass(frozen=True)
@@ -42,13 +46,33 @@ class ZoneOptions:
 
 
 @dataclass(frozen=True)
+class ZoneInWorlds:
+    """Of a zone in so many worlds of re-tracking, given the same detections: medians and intervals of 90 %.
+
+    ``tracks`` are the different tracks that visited it, ``mean_dwell_s`` is the mean of their visits, over the worlds
+    that have any. ``then`` has by the name of each other zone the tracks that came here first, and there after.
+    """
+
+    worlds: int
+    tracks: WorldInterval
+    mean_dwell_s: WorldInterval | None
+    then: Mapping[str, WorldInterval]
+
+    def to_json(self) -> dict[str, Any]:
+        """As values of JSON."""
+        dwell, then = self.mean_dwell_s, {name: interval.to_json() for name, interval in self.then.items()}
+        values = {"worlds": self.worlds, "tracks": self.tracks.to_json(), "then": then}
+        return values | {"mean_dwell_s": dwell and dwell.to_json()}
+
+
+@dataclass(frozen=True)
 class ZoneTotals:
     """The totals of one zone or line for one channel of tracks.
 
     ``tracks`` are the different tracks that visited or crossed it. Of a zone: ``visits``, of which ``entered`` and
     ``left`` over its edge, the others began or ended inside; ``dwell_s`` of all visits together, their mean and
     median; the most tracks inside at a time, and their mean over time. Of a line: crossings ``forward`` and
-    ``backward``.
+    ``backward``. ``in_worlds`` is what worlds of re-tracking say of a zone, None without them.
     """
 
     zone: str
@@ -64,10 +88,15 @@ class ZoneTotals:
     mean_inside: float | None = None
     forward: int = 0
     backward: int = 0
+    in_worlds: ZoneInWorlds | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The totals as values of JSON; of a zone without crossings, of a line without visits."""
-        values = asdict(self)
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.in_worlds is None:
+            del values["in_worlds"]
+        else:
+            values["in_worlds"] = self.in_worlds.to_json()
         lines = ("forward", "backward")
         kept = {"zone", "is_line", "tracks", *lines} if self.is_line else values.keys() - set(lines)
         return {name: value for name, value in values.items() if name in kept}
@@ -263,15 +292,12 @@ def find_zone_events(
     stays: list[_Stays] = []
     passes: list[_Passes] = []
     for placed in zones:
-        paths, rows = _paths(positions, placed, options, name)
-        margin = placed.shape.margin(_margin(positions, placed.units, options))
+        paths, rows, margin = _paths(positions, placed, options, name)
         if placed.zone.is_line:
             row, sign = crossings(paths, placed.shape, margin)
             passes.append(_Passes(placed.zone.number, rows[row], sign * placed.forward > 0))
         else:
-            depth = placed.shape.depth(paths.points, margin)
-            some = visits(paths, depth, margin)
-            stays.append(_Stays.of(placed.zone.number, some, rows, positions, paths))
+            stays.append(_Stays.of(placed, margin, rows, positions, paths))
         notes += _far_away(placed, paths.points, name)
         notes += missing_classes(positions, placed.zone, name)
     t_ns, numbers = frame_times(frames), frame_numbers(frames)
@@ -283,13 +309,8 @@ def find_zone_events(
     )
 
 
-def _margin(positions: TrackPositions, units: Units, options: ZoneOptions) -> float:
-    """The margin in the units that a zone is compared in."""
-    return options.margin_m if units == "metres" else options.margin_m / PERSON_HEIGHT_M * positions.height_px
-
-
-def _paths(positions: TrackPositions, placed: PlacedZone, options: ZoneOptions, name: str) -> tuple[Paths, Ints]:
-    """The paths of tracks in the units of a zone, and the row of each of their points."""
+def _paths(positions: TrackPositions, placed: PlacedZone, options: ZoneOptions, name: str) -> tuple[Paths, Ints, float]:
+    """The paths of tracks in the units of a zone, the row of each of their points, and the margin in these units."""
     points = positions.at[placed.units]
     rows = np.flatnonzero(np.isfinite(points).all(axis=1))
     if len(points) and not len(rows):
@@ -297,7 +318,9 @@ def _paths(positions: TrackPositions, placed: PlacedZone, options: ZoneOptions, 
         raise McaptrackError(f"{name} has no {where}, which zone {placed.zone.name} in {placed.zone.units} needs")
     rows = rows[is_counted(positions, placed.zone)[rows]]
     gap_ns = seconds_to_ns(options.max_gap_s)
-    return Paths.of(points[rows], positions.t_ns[rows], positions.track[rows], gap_ns), rows
+    margin = options.margin_m if placed.units == "metres" else options.margin_m / PERSON_HEIGHT_M * positions.height_px
+    paths = Paths.of(points[rows], positions.t_ns[rows], positions.track[rows], gap_ns)
+    return paths, rows, placed.shape.margin(margin)
 
 
 def _far_away(placed: PlacedZone, points: Floats, name: str) -> Iterator[str]:
@@ -326,12 +349,13 @@ class _Stays(NamedTuple):
     dwell_s: Floats
 
     @classmethod
-    def of(cls, number: int, some: Visits, rows: Ints, positions: TrackPositions, paths: Paths) -> _Stays:
+    def of(cls, placed: PlacedZone, margin: float, rows: Ints, positions: TrackPositions, paths: Paths) -> _Stays:
+        some = visits(paths, placed.shape.depth(paths.points, margin), margin)
         ended = some.left < 0
         until = np.where(ended, some.last, some.left)
         dwell = (paths.t_ns[until] - paths.t_ns[some.first]) / NS_PER_S
         after = positions.frame[rows[until]] + ended
-        return cls(number, rows[some.first], rows[some.last], after, some.began, ended, dwell)
+        return cls(placed.zone.number, rows[some.first], rows[some.last], after, some.began, ended, dwell)
 
 
 class _Passes(NamedTuple):
@@ -466,6 +490,130 @@ def _insides(zones: Sequence[Zone], counts: Sequence[Frame]) -> dict[int, tuple[
             most[number] = max(most[number], int(inside.max(initial=0)))
             total[number] += int(inside.sum())
     return {number: (most[number], total[number] / len(counts) if len(counts) else None) for number in most}
+
+
+# Zones in worlds of re-tracking.
+#
+# Letters: W worlds, K tracklets, N rows.
+
+
+def moved_to(positions: TrackPositions, smoothed: JoinedFrames) -> TrackPositions:
+    """Positions of input tracks at the places in metres that re-tracking gave them; the others stay."""
+    at = find_rows((smoothed.rows["source_id"], smoothed.row_ns), (positions.track, positions.t_ns))
+    metres = positions.at["metres"].copy()
+    metres[at >= 0] = np.stack([smoothed.rows[name][at[at >= 0]] for name in ("x_m", "y_m")], axis=1)
+    return positions._replace(at={**positions.at, "metres": metres})
+
+
+def zones_in_worlds(
+    positions: TrackPositions, t_ns: Ints, worlds: JoinedFrames, zones: Sequence[PlacedZone], options: ZoneOptions
+) -> dict[str, ZoneInWorlds]:
+    """Find what worlds say of zones, by the names of these.
+
+    Parameters
+    ----------
+    positions : TrackPositions
+        Of the observed samples that were re-tracked.
+    t_ns : (F,) of int
+        The times of their frames.
+    worlds : JoinedFrames
+        Rows of Worlds.
+    zones : sequence of PlacedZone
+    options : ZoneOptions
+
+    Returns
+    -------
+    dict of str to ZoneInWorlds
+        Lines have none.
+    """
+    zones = [placed for placed in zones if not placed.zone.is_line]
+    people, counts, dwell_s, then = [], [], [], []
+    for of_world in _positions_in_worlds(positions, t_ns, worlds):
+        arrivals = []
+        people.append(len(np.unique(of_world.track)))
+        for placed in zones:
+            paths, rows, margin = _paths(of_world, placed, options, "worlds")
+            stay = _Stays.of(placed, margin, rows, of_world, paths)
+            arrivals.append(_Arrivals.of(of_world, stay))
+            dwell_s.append(stay.dwell_s.mean() if len(stay.dwell_s) else np.nan)
+        counts.append([len(arrival.track) for arrival in arrivals])
+        then.append([[a.before(b) for b in arrivals] for a in arrivals])
+    size, dwell = len(people), np.array(dwell_s).reshape(len(people), len(zones))
+    out = {}
+    for number, placed in enumerate(zones):
+        tracks = np.array(counts)[:, number]
+        has_none = is_people(f"tracks in {placed.zone.name}", tracks, people)
+        others = ((other, np.array(then)[:, number, to]) for to, other in enumerate(zones) if to != number)
+        out[placed.zone.name] = ZoneInWorlds(
+            size,
+            WorldInterval.of(tracks, is_count=True, has_none=has_none),
+            None if np.isnan(dwell[:, number]).all() else WorldInterval.of(dwell[:, number]),
+            {other.zone.name: WorldInterval.of(values, is_count=True) for other, values in others},
+        )
+    return out
+
+
+class _Arrivals(NamedTuple):
+    """The tracks that visited a zone, rising, and the frames in which they came first and last."""
+
+    track: Ints
+    first: Ints
+    last: Ints
+
+    @classmethod
+    def of(cls, positions: TrackPositions, stay: _Stays) -> _Arrivals:
+        track, at = np.unique(positions.track[stay.first], return_index=True)
+        came = positions.frame[stay.first]
+        return cls(track, came[at], came[np.append(at[1:], len(came))[: len(at)] - 1])
+
+    def before(self, other: _Arrivals) -> int:
+        """The number of tracks that came here before they came there."""
+        _, here, there = np.intersect1d(self.track, other.track, assume_unique=True, return_indices=True)
+        return int((self.first[here] < other.last[there]).sum())
+
+
+def _positions_in_worlds(positions: TrackPositions, t_ns: Ints, worlds: JoinedFrames) -> Iterator[TrackPositions]:
+    """The positions of the tracks that each world keeps, with gaps filled straight."""
+    rows, frames = worlds.rows, len(t_ns) + 1
+    begin = np.searchsorted(t_ns, worlds.row_ns)
+    (source, first), which = np.unique(np.stack([rows["source_id"], begin]), axis=1, return_inverse=True)
+    numbers, world = np.unique(rows["world"], return_inverse=True)
+    track = np.full((len(numbers), len(source)), -1)
+    track[world, which.ravel()] = np.where(rows["kept"], rows["track_id"], -1)
+    end = np.zeros(len(source), np.int64)
+    until_ns = worlds.row_ns + (rows["duration_s"] * NS_PER_S).astype(np.int64) + _ROUNDED_NS
+    end[which.ravel()] = np.searchsorted(t_ns, until_ns, "right")
+    sources = np.unique(source)
+    begins = np.searchsorted(sources, source) * frames + first
+    own = np.searchsorted(begins, np.searchsorted(sources, positions.track) * frames + positions.frame, "right") - 1
+    is_own = (own >= 0) & (source[own] == positions.track) & (positions.frame < end[own])
+    for of_world in track:
+        name = np.where(is_own, of_world[own], -1)
+        kept = np.flatnonzero(name >= 0)
+        kept = kept[np.lexsort((positions.frame[kept], name[kept]))]
+        yield _filled(_rows_of(positions, kept)._replace(track=name[kept]), t_ns)
+
+
+def _filled(positions: TrackPositions, t_ns: Ints) -> TrackPositions:
+    """Positions with rows on a straight line in the frames between those of a track."""
+    starts = run_starts(positions.track)
+    low, high = positions.frame[starts], positions.frame[run_ends(starts)]
+    frame, seconds = ragged_range(low, high - low + 1), (t_ns - t_ns[0]) / NS_PER_S
+    key = (np.cumsum(starts) - 1) * (seconds[-1] + 1) + seconds[positions.frame]  # one track after the other
+    wanted = group_index(high - low + 1) * (seconds[-1] + 1) + seconds[frame]
+    filled = _rows_of(positions, np.searchsorted(key, wanted, "right") - 1)
+    at = {
+        unit: np.stack([np.interp(wanted, key, xy[:, axis]) for axis in (0, 1)], axis=1) if len(key) else xy
+        for unit, xy in positions.at.items()
+    }
+    return filled._replace(at=at, frame=frame, t_ns=t_ns[frame])
+
+
+def _rows_of(positions: TrackPositions, rows: Ints) -> TrackPositions:
+    """Some rows of positions."""
+    at = {unit: xy[rows] for unit, xy in positions.at.items()}
+    names = ("picture_px", "track", "frame", "t_ns", "low_m", "class_id")
+    return positions._replace(at=at, **{name: getattr(positions, name)[rows] for name in names})
 
 
 # Visits of zones and crossings of lines as text, for the log panel of viewers.

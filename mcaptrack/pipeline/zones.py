@@ -22,14 +22,17 @@ from mcaptrack.evaluation.event_text import SUFFIX
 from mcaptrack.evaluation.zones import (
     PlacedZone,
     TrackPositions,
+    ZoneInWorlds,
     ZoneOptions,
     ZoneTotals,
     find_zone_events,
     ground_height_m,
+    moved_to,
     place_zone,
     positions_of,
     zone_messages,
     zone_totals,
+    zones_in_worlds,
 )
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views import zones as drawn_zones
@@ -40,9 +43,10 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import may_add
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
 from mcaptrack.pipeline.scene_views import PictureClock, picture_clock
-from mcaptrack.pipeline.staleness import is_outdated, planes_to_json
+from mcaptrack.pipeline.staleness import is_outdated, planes_to_json, read_planes
 from mcaptrack.pipeline.write import DrawnMessages, Made, RunState
-from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS
+from mcaptrack.schema import TRACKS, WORLDS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS
+from mcaptrack.schema.framing import filtered_rows, frame_times, join_frames
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.zones import zones_from_json, zones_to_json
@@ -202,8 +206,11 @@ def _shape(placed: PlacedZone, positions: TrackPositions) -> drawn_zones.ZoneSha
     return drawn_zones.ZoneShape(placed.zone, placed.zone.shape(), ground, placed.forward, height_m)
 
 
-def counted_zones(opened: log.Log, prefix: str) -> list[CountedZones]:
-    """Return the totals of all channels of a camera's tracks that zones were counted of, in order of their topics."""
+def counted_zones(opened: log.Log, prefix: str, with_worlds: bool = False) -> list[CountedZones]:
+    """Return the totals of all channels of a camera's tracks that zones were counted of, in order of their topics.
+
+    Those of re-tracked tracks have intervals ``with_worlds``, where the log has worlds.
+    """
     state, out = RunState(opened, prefix, {}), []
     for topic in _with_counts(opened, prefix):
         names = [topic + _BELOW + name for name in _SCHEMAS]
@@ -213,8 +220,28 @@ def counted_zones(opened: log.Log, prefix: str) -> list[CountedZones]:
         provenance = provenance_of(opened, names[0])
         zones = zones_from_json(provenance.parameters.get("zones")) if provenance else ()
         rows = [opened.frame_columns(name, schema) for name, schema in zip(names, schemas, strict=True)]
-        out.append(CountedZones(topic, zones, zone_totals(zones, *rows)))
+        totals = zone_totals(zones, *rows)
+        if with_worlds and topic.removesuffix(FULL) == f"{prefix}/retracks" and provenance:
+            found = _in_worlds(state, zones, _options_in(provenance.parameters))
+            totals = [replace(total, in_worlds=found.get(total.zone)) for total in totals]
+        out.append(CountedZones(topic, zones, totals))
     return out
+
+
+def _in_worlds(state: RunState, zones: Sequence[Zone], options: ZoneOptions) -> dict[str, ZoneInWorlds]:
+    """Find what worlds of re-tracking say of zones, by the names of these; nothing without worlds."""
+    topic = f"{state.prefix}/retracks/worlds"
+    worlds, how = join_frames(WORLDS, state.frames(topic, WORLDS)), state.provenance(topic)
+    if not len(worlds.rows) or how is None or not state.frames(how.input) or is_outdated(state, (topic,)):
+        return {}
+    samples = filtered_rows(TRACKS, state.frames(how.input), lambda joined: joined.rows["observed"])
+    path, _ = path_with(state, how.input)
+    still = scene_planes(read_planes(state.opened, state.prefix) or (), path)
+    positions = positions_of(samples, still, path, state.classes(how.input))
+    positions = moved_to(positions, join_frames(TRACKS, state.frames(f"{state.prefix}/retracks")))
+    return zones_in_worlds(
+        positions, frame_times(samples), worlds, [place_zone(zone, still) for zone in zones], options
+    )
 
 
 class _Before(NamedTuple):
@@ -231,14 +258,19 @@ def _before(opened: log.Log, prefix: str) -> _Before:
         provenance = provenance_of(opened, topic + _BELOW + next(iter(_SCHEMAS)))
         zones = zones_from_json(provenance.parameters.get("zones")) if provenance else ()
         if provenance and zones:
-            values = {field.name: provenance.parameters.get(field.name) for field in fields(ZoneOptions)}
-            numbers = {
-                name: float(value)
-                for name, value in values.items()
-                if isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
-            }
-            return _Before(topics, zones, ZoneOptions(**numbers))
+            return _Before(topics, zones, _options_in(provenance.parameters))
     return _Before(topics)
+
+
+def _options_in(parameters: Mapping[str, Any]) -> ZoneOptions:
+    """The options of counting in the parameters of a channel."""
+    values = {field.name: parameters.get(field.name) for field in fields(ZoneOptions)}
+    numbers = {
+        name: float(value)
+        for name, value in values.items()
+        if isinstance(value, int | float) and not isinstance(value, bool) and value >= 0
+    }
+    return ZoneOptions(**numbers)
 
 
 def _with_counts(opened: log.Log, prefix: str) -> list[str]:

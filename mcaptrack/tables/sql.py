@@ -16,8 +16,11 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
-from mcaptrack import log, notices, tables
+import numpy as np
+
+from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call, did_you_mean
+from mcaptrack.evaluation.intervals import WorldInterval, is_people
 from mcaptrack.files import place_of
 from mcaptrack.location import Location, distinct_names, join
 from mcaptrack.log.recording_files import results_path
@@ -83,9 +86,6 @@ create or replace temp table tracks as
 select * exclude (world) from world_tracks where world = ? order by recording, topic, track_id, t_ns
 """
 _PEOPLE: Final = "select count(distinct (recording, topic, track_id)) from tracks"
-#: Intervals from worlds are wider by this share of the median on both sides, because worlds lack rows that no detector
-#: gave: so they hold in nine of ten drawn scenes (``tools/without_truth.py``).
-WIDER: Final = 0.12
 _MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
 
 
@@ -274,25 +274,23 @@ class Database:
                 "worlds have several rows with the same texts and times, so that their numbers can't be put together; "
                 "name each row by a text, as in `track_id::text`, or ask for one row"
             )
-        columns = list(keys)
-        for name in (f.name for f in schema if is_number[f.name]):
-            column, counted = _quoted(name), pa.types.is_integer(schema.field(name).type)
-            values = f"list_resize(list({column}), {len(answers)}, 0)" if counted else f"list({column})"
-            least, low, middle, high = (f"list_aggregate({values}, 'quantile_cont', {q})" for q in (0, 0.05, 0.5, 0.95))
-            low, high = f"{low} - {WIDER} * abs({middle})", f"{high} + {WIDER} * abs({middle})"
-            low = f"if({least} < 0, {low}, greatest({low}, 0))"
-            if counted:
-                low, high = f"floor({low})::bigint", f"ceil({high})::bigint"
-            if counted and [pc.sum(answer[name]).as_py() or 0 for answer in answers] == list(people):
-                notices.warn(
-                    f"{name}: the number of people has no interval; worlds hold it too seldom, because they lack "
-                    "people that no detector saw, and take those who come back late for others", "not-compared"
-                )  # fmt: skip
-                low = high = "null"
-            columns += [f"{middle} as {column}"]
-            columns += [f"{low} as {_quoted(name + '_from')}", f"{high} as {_quoted(name + '_to')}"]
-        over_all = rows.aggregate(", ".join([*columns, "count(*) as worlds"]), ", ".join(keys))
-        return (over_all.order(", ".join(keys)) if keys else over_all.limit(len(whole))).to_arrow_table()
+        numbers = [name for name in schema.names if is_number[name]]
+        lists = [f"list({_quoted(name)}) as {_quoted(name)}" for name in numbers]
+        over_all = rows.aggregate(", ".join([*keys, *lists, "count(*) as worlds"]), ", ".join(keys))
+        found = (over_all.order(", ".join(keys)) if keys else over_all.limit(len(whole))).to_arrow_table()
+        columns = {name: found[name] for name in schema.names if not is_number[name]}
+        for name in numbers:
+            counts = pa.types.is_integer(schema.field(name).type)
+            sums = [pc.sum(answer[name]).as_py() or 0 for answer in answers]
+            has_none = counts and is_people(name, sums, people)
+            missing = [0] * len(answers) if counts else []
+            values = (row + missing[len(row) :] for row in found[name].to_pylist())
+            intervals = [WorldInterval.of(np.array(row, float), counts, has_none) for row in values]
+            middle, low, high = zip(*intervals, strict=True) if intervals else ((), (), ())
+            kind = pa.int64() if counts else pa.float64()
+            columns |= {name: pa.array(middle, pa.float64())}
+            columns |= {name + end: pa.array(side).cast(kind) for end, side in (("_from", low), ("_to", high))}
+        return pa.table(columns | {"worlds": found["worlds"]})
 
     def _run(self, statement: Any) -> Any:
         """The answer of a statement, Arrow or None; loads the tables that it names, and those that DuckDB then

@@ -17,7 +17,7 @@ from mcaptrack.evaluation.aligned import has_positions, resample_frames
 from mcaptrack.evaluation.event_text import PEOPLE, nouns_of
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.evaluation.people import PersonScores, person_scores
-from mcaptrack.evaluation.zones import ZoneTotals
+from mcaptrack.evaluation.zones import ZoneInWorlds, ZoneTotals
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
 from mcaptrack.geometry.zones import Zone
@@ -153,6 +153,7 @@ _ROLES: Final = {"tracks": "tracks", "retracks": "offline", f"retracks{FULL}": "
 _CHARTS: Final = 12
 _OF_ZONES: Final = ("tracks", "visits", "entered", "left", "mean stay", "median stay", "most inside", "mean inside")
 _OF_LINES: Final = ("tracks", "forward", "backward")
+_IN_WORLDS: Final = ("tracks", "mean stay", "tracks that went on to")
 
 
 def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict[str, Any]:
@@ -160,7 +161,7 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
 
     Nothing was counted if ``rows`` and ``lines`` are empty. ``data`` are the totals as values of JSON.
     """
-    counted = pipeline.counted_zones(opened, prefix)
+    counted = pipeline.counted_zones(opened, prefix, with_worlds=True)
     if not counted:
         return {"columns": _OF_ZONES, "rows": [], "line_columns": _OF_LINES, "lines": [], "figures": [], "data": {}}
     shown = [(channel, _ROLES.get(channel.topic.removeprefix(prefix + "/"), "samples")) for channel in counted]
@@ -178,6 +179,12 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
             if (total.zone, total.is_line) == (zone.name, zone.is_line)
         ]
         groups[zone.is_line].append({"zone": zone.name, "rows": rows})
+    in_worlds = [
+        {"zone": total.zone, "rows": [_in_worlds(total.in_worlds, called[channel.topic], role, channel.topic)]}
+        for channel, role in shown
+        for total in channel.totals
+        if total.in_worlds
+    ]
     some = [zone for zone in zones if not zone.is_line][:_CHARTS]
     inside = {channel.topic: _inside(opened, channel.topic, channel.zones) for channel in counted}
     figures = []
@@ -194,10 +201,19 @@ def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict
         "rows": groups[False],
         "line_columns": _OF_LINES,
         "lines": groups[True],
+        "world_columns": _IN_WORLDS,
+        "in_worlds": in_worlds,
         "figures": figures,
         "left_out": left,
         "data": {channel.topic: [total.to_json() for total in channel.totals] for channel in counted},
     }
+
+
+def _in_worlds(zone: ZoneInWorlds, name: str, role: str, topic: str) -> dict[str, Any]:
+    """A row of medians and intervals."""
+    stay = zone.mean_dwell_s.words(1, " s") if zone.mean_dwell_s else NONE
+    then = "; ".join(f"{to}: {tracks.words()}" for to, tracks in zone.then.items() if tracks.high)
+    return {"name": name, "role": role, "topic": topic, "cells": [zone.tracks.words(), stay, then or NONE]}
 
 
 def _cells(totals: ZoneTotals) -> list[str]:
