@@ -180,8 +180,9 @@ class Scene:
 SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/group.py:resolve_command:info": lambda s: s.says("LOG"),
     "cli/files.py:logs:drop": lambda s: s.says("drop", "/camera/video", "LOG"),
-    "pipeline/drawing.py:find_views:info": lambda s: s.without("/camera/video", "/camera/*/view/scene").says(
-        "render", "LOG"
+    "sources/ingest/labels/format.py:unknown:ingest": lambda s: s.says("ingest", "plane.txt", "-o", "b.mcap"),
+    "tables/export/__init__.py:_note_left_out:export": lambda s: s.says(
+        "export", "LOG", "--topic", "/camera/video", "-o", "tables"
     ),
     "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says(

@@ -285,7 +285,7 @@ def _conflicts(logs: Sequence[log.Log], topics: Collection[str]) -> set[str]:
         out |= more
         more = {topic for topic, those in origins.items() if any(not out.isdisjoint(how.made_from()) for how in those)}
     if out:
-        text = "are left out: each log has its own, with its own ids; `mcaptrack run` makes those of all"
+        text = "are left out: each log has its own, with its own ids; run the new log to make those of all"
         warn(f"results of {len(logs)} logs in {list_names(sorted(out))} {text}", "left-out")
     return out
 
