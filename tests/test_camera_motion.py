@@ -306,6 +306,22 @@ def test_noise_in_which_nothing_is_found_is_no_cut():
     assert all(one.from_previous is IDENTITY for one in found)
 
 
+def test_a_camera_above_a_plain_floor_stands_still_while_people_walk():
+    """What little there is to find again are people: without the floor itself nearly all pictures would be lost."""
+    rng = np.random.default_rng(5)
+    floor = cv2.GaussianBlur(rng.integers(70, 180, (240, 320), np.uint8), (0, 0), 6)
+    camera = MotionEstimator()
+    for number in range(90):
+        image = floor.copy()
+        for k in range(6):
+            x, y = (7 * number * (1 if k % 2 else -1) // 3 + 60 * k) % 400 - 40, 60 + 28 * k
+            cv2.ellipse(image, (x, y), (8, 20), 0, 0, 360, 30 + 35 * k, -1)
+            cv2.circle(image, (x, y - 26), 6, 220, -1)
+        pose = camera.step(np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8))
+        assert pose.verdict is Verdict.STILL
+        np.testing.assert_array_equal(pose.to_reference, IDENTITY)
+
+
 def test_leaves_that_sway_in_half_of_the_picture_are_no_motion_of_the_camera():
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
     share, image = np.clip((0.6 * HEIGHT - y) / 20, 0, 1), picture(SCENE, pose())
