@@ -494,15 +494,15 @@ def _differences(
 
 def _refuse_own(opened: logs.Log, prefix: str, ground_truth: Sequence[Frame]) -> None:
     """Raise McaptrackError if the ground truth of a log is its own re-tracking."""
-    stage = STAGES["retrack"]
+    full, retracked, samples = (
+        f"{prefix}/{name}" for name in (FULL, STAGES["retrack"].output_topic, STAGES["retrack"].input_topic)
+    )
 
-    def is_truth(name: str) -> bool:
-        topic = f"{prefix}/{name}"
+    def is_truth(topic: str) -> bool:
         return topic in opened.channels and repeats(ground_truth, opened.frames(topic, TRACKS))
 
-    for name in (FULL, stage.output_topic):
-        topic = f"{prefix}/{name}"
-        if is_truth(name) and not is_truth(stage.input_topic):  # of a drawn scene without noise both may be
+    for topic in (full, retracked):
+        if is_truth(topic) and not is_truth(samples):  # of a drawn scene without noise both may be
             raise McaptrackError(
                 f"{opened.path}: the ground truth is {topic} itself, row by row, so scores would say nothing; "
                 "`against=` compares other trackers by it"

@@ -43,7 +43,6 @@ _OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
 _MAX_BYTES: Final = 200
 
 
-_FIELDS_LISTED: Final = 30
 #: Words that readers of partitions do not take for text.
 _NO_TEXT: Final = ("nan", "inf", "infinity", "true", "false", "null", "none")
 
