@@ -52,7 +52,7 @@ def test_rows_outside_of_the_picture_are_left_out_unless_observed():
     with collected() as warnings:
         found = without_unseen({"/a/retracks": (TRACKS, frames)}, lambda: SIZE)
     assert [(notice.code, notice.message) for notice in warnings] == [
-        ("left-out", "/a/retracks: 2 rows are left out, outside of the picture and without a detection")
+        ("left-out", "/a/retracks: left out 2 predicted rows outside of the picture, where nothing can be detected")
     ]
     assert ids(found, "/a/retracks") == [[1, 2]] * 20 + [[1, 2, 3, 6, 7]]
     assert [(frame.t_ns, frame.index) for frame in found["/a/retracks"][1]] == [(k, k) for k in range(21)]

@@ -211,7 +211,7 @@ def drop(
     Parameters
     ----------
     in_place : bool, default False
-        Also change a recording in place that ROS tools may have to read.
+        Also remove recorded channels in place, which nothing can make again.
 
     Returns
     -------
@@ -221,7 +221,7 @@ def drop(
     Raises
     ------
     McaptrackError
-        If no channel fits one of the topics, or for a recording that ROS tools read.
+        If no channel fits one of the topics, or for recorded channels in place.
 
     Examples
     --------
@@ -247,7 +247,7 @@ def drop(
             dropped = _with_descriptions(opened, fitting_topics([opened], patterns))
             parts, before = [Path(part.path) for part in opened.parts], sum(part.size for part in opened.parts)
             if copy is None and not in_place:
-                _refuse_for_ros_tools(opened, dropped)
+                _refuse_recorded(opened, dropped)
         targets = parts
         if copy is not None:
             targets = [copy, logs.results_path(copy)][: len(parts)]
@@ -258,17 +258,16 @@ def drop(
     return DropResult(targets[0], tuple(sorted(dropped)), messages, before, after, tuple(dict.fromkeys(warnings)))
 
 
-def _refuse_for_ros_tools(opened: logs.Log, dropped: set[str]) -> None:
-    """Raise McaptrackError if ROS tools may have to read recorded channels among those to remove."""
+def _refuse_recorded(opened: logs.Log, dropped: set[str]) -> None:
+    """Raise McaptrackError if channels that no command of this package made are among those to remove."""
     from mcaptrack.schema.provenance import Provenance
-    from mcaptrack.sources.sidecar import recording_of
 
     own = [channel for channel in opened.parts[0].recorded if channel.topic in dropped]
     recorded = sorted({channel.topic for channel in own if Provenance.from_metadata(channel.metadata) is None})
-    if recorded and (recording := recording_of(opened)):
+    if recorded:
         raise McaptrackError(
-            f"{opened.path} is {recording}, which ROS tools read; `output=` writes a copy without "
-            f"{', '.join(recorded)}, `in_place=True` changes it all the same"
+            f"{opened.path}: {', '.join(recorded)} {'was' if len(recorded) == 1 else 'were'} recorded, and can't be "
+            "made again; `output=` writes a copy without, `in_place=True` removes it all the same"
         )
 
 

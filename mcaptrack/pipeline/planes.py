@@ -313,8 +313,8 @@ def without_unseen(channels: Channels, picture_size: Callable[[], PictureSize]) 
         if unseen is None:
             continue
         is_seen, count = unseen
-        rows = "row is" if count == 1 else "rows are"
-        warn(f"{topic}: {count:,} {rows} left out, outside of the picture and without a detection", "left-out")
+        rows = "predicted row" if count == 1 else "predicted rows"
+        warn(f"{topic}: left out {count:,} {rows} outside of the picture, where nothing can be detected", "left-out")
         stem, _, name = topic.rpartition("/")
         predictions = f"{stem}/predictions"
         if name == "online" and predictions in channels:
