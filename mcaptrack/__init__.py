@@ -30,7 +30,6 @@ _PARTS = {
     "scoring": ["Scores", "evaluate"],
     "reading": ["FetchedMessage"],
     "stages": ["detect", "motion", "predict", "retrack", "sample", "stage", "track"],
-    "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
     "viewing": ["LogServer", "view"],
     "zones": ["draw_zones", "zones"],

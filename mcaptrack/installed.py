@@ -62,7 +62,7 @@ def declared() -> Declared:
 
 
 def missing_extension(name: str) -> str:
-    """What to do about a name of mcaptrack that is of an extension which isn't installed; "" for other names.
+    """Say what to do about a name of mcaptrack that is of an extension which isn't installed; "" for other names.
 
     The stub for type checkers says which names those are: it alone names extensions from outside.
     """

@@ -113,7 +113,6 @@ _LISTED: Final = (
     ("evaluate", _RESULTS, "evaluate:Evaluate"),
     ("events", _RESULTS, "running:Events"),
     ("zones", _RESULTS, "zones:Zones"),
-    ("tune", _IMPROVE, "tune:Tune"),
     ("calibrate", _IMPROVE, "calibrate:Calibrate"),
     ("check", _IMPROVE, "files:Check"),
     ("recover", _IMPROVE, "files:Recover"),

@@ -63,7 +63,7 @@ _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares.
 _COMMANDS: Final = (
     "ingest demo run detect motion track sample predict retrack fuse models info view render report query export "
-    "evaluate events zones calibrate tune check recover cut drop doctor"
+    "evaluate events zones calibrate check recover cut drop doctor"
 )
 #: Kinds that only entry points name.
 _BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "name")
