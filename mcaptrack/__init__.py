@@ -20,7 +20,6 @@ _PARTS = {
     "ingesting": ["IngestResult", "ingest"],
     "messages": ["DecodedMessage"],
     "notebook": ["Player"],
-    "outputs": ["ReportResult", "report"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["Recording", "open"],
     "rendering": ["RenderResult", "render"],

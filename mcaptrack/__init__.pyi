@@ -24,8 +24,6 @@ from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.messages import DecodedMessage as DecodedMessage
 from mcaptrack.api.notebook import Player as Player
-from mcaptrack.api.outputs import ReportResult as ReportResult
-from mcaptrack.api.outputs import report as report
 from mcaptrack.api.querying import ColumnInfo as ColumnInfo
 from mcaptrack.api.querying import TableInfo as TableInfo
 from mcaptrack.api.querying import TableList as TableList
@@ -60,6 +58,8 @@ from mcaptrack.api.viewing import view as view
 from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.extensions.report.api import ReportResult as ReportResult
+from mcaptrack.extensions.report.api import report as report
 from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
