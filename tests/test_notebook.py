@@ -22,7 +22,7 @@ import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.viewing.links import LinkedEvent
 from tests.commands import done
-from tests.test_report import Reader
+from tests.reader import Reader
 
 CLOSED, PAIRS = 0, 2
 

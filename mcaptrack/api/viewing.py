@@ -7,7 +7,7 @@ import re
 import threading
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -26,12 +26,13 @@ from mcaptrack.files import unreadable
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
+from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.tables import exchange, export
-from mcaptrack.viewing import links, report
+from mcaptrack.viewing import links
+from mcaptrack.viewing.formatting import policy, render
 from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, rerun_link, viewer_links
-from mcaptrack.viewing.report.formatting import policy, render
-from mcaptrack.viewing.serving import LOOPBACK, Page, Server
+from mcaptrack.viewing.serving import LOOPBACK, LogPage, Page, Server
 
 #: Headings in the help.
 _OPENED: Final = "What is opened"
@@ -99,8 +100,27 @@ def _player(camera: str, is_above: bool, opened: logs.Log) -> bytes:
     return shown.page.encode()
 
 
-def _report(opened: logs.Log) -> bytes:
-    return report.page([report.gather(opened, None)]).encode()
+def _page_names() -> list[str]:
+    """The names of the pages beside the player: those of entry points, and our own."""
+    return [name for name in (*others("page"), *BUILT_IN["page"]) if re.fullmatch(r"\w[\w-]*", name)]
+
+
+def _log_page(name: str) -> LogPage:
+    """A page by its name. Raises McaptrackError if that of another package can't be made."""
+    entry = find("page", name)
+    with blamed(entry, "could not be made") if not entry.is_built_in else nullcontext():
+        page: LogPage = entry.cls()
+    return page if entry.is_built_in else page._replace(make=partial(_made_by, entry, page.make))
+
+
+def _made_by(entry: Entry, make: Callable[[logs.Log], bytes], opened: logs.Log) -> bytes:
+    with blamed(entry, "failed"):
+        return make(opened)
+
+
+def tables_page() -> LogPage:
+    """The page with the tables of a log."""
+    return LogPage(partial(_tables, "{}.csv".format), policy())
 
 
 def _tables(address: Callable[[str], str], opened: logs.Log) -> bytes:
@@ -197,8 +217,9 @@ class LogServer:
             f"{_FOLDER}/player-{number}.html": Page(made(partial(_player, camera, is_above)), policy("player.js"))
             for number, (_, camera, is_above) in enumerate(contents.views)
         }
-        pages[f"{_FOLDER}/report.html"] = Page(made(_report), policy("report.js"))
-        pages[f"{_FOLDER}/tables.html"] = Page(made(partial(_tables, "{}.csv".format)), policy())
+        for name in _page_names():
+            page = _log_page(name)
+            pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
         for name in tables.TABLES:
             pages[f"{_FOLDER}/{name}.csv"] = Page(made(partial(_csv, name)), kind="text/csv; charset=utf-8")
         if not contents.rerun:
@@ -225,8 +246,7 @@ class LogServer:
                 {"name": name, "address": f"{place}player-{number}.html"}
                 for number, (name, *_) in enumerate(contents.views)
             ],
-            "report": f"{place}report.html",
-            "tables": f"{place}tables.html",
+            "pages": {name: f"{place}{name}.html" for name in _page_names()},
             "best": links.best_tracks(contents.events),
             "events": [
                 {

@@ -28,10 +28,11 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from socketserver import TCPServer
 from time import monotonic
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, NamedTuple
 from urllib.parse import quote, unquote_to_bytes
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.log import Log
 
 LOOPBACK: Final = "127.0.0.1"
 _LOCAL: Final = (LOOPBACK, "localhost")
@@ -87,6 +88,13 @@ class Page:
     policy: str = "default-src 'none'"
     kind: str = "text/html; charset=utf-8"
     is_shared: bool = False
+
+
+class LogPage(NamedTuple):
+    """A page about a log that `mcaptrack view` shows: what makes it of an open log, and its ``policy`` as of a page."""
+
+    make: Callable[[Log], bytes]
+    policy: str
 
 
 #: What is served: a file, the content of one, or a page.

@@ -16,9 +16,9 @@ from markupsafe import Markup
 
 from mcaptrack.foxglove.views import SUFFIXES
 from mcaptrack.transforms import FULL
+from mcaptrack.viewing.formatting import render
 from mcaptrack.viewing.legend import BACKGROUND
 from mcaptrack.viewing.notebook.pictures import Clip
-from mcaptrack.viewing.report.formatting import render
 
 #: The least width of a player in pixels: there is room for what it is controlled with.
 _LEAST_PX: Final = 420
@@ -87,11 +87,6 @@ def _packed(data: Any) -> bytes:
 
 def _base64(data: bytes) -> str:
     return b64encode(data).decode()
-
-
-def framed_html(page: str | None, caption: str) -> str:
-    """Return a page in a frame, without an origin, with a caption; the caption alone without a page."""
-    return str(render("framed.html", page=page or "", caption=caption))
 
 
 # Tables for notebooks: the first and the last rows, with units and the number of rows.
