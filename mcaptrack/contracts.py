@@ -142,6 +142,8 @@ class Exporter(Protocol):
     def write(self, recording: LogReader, path: Path) -> Mapping[str, int]:
         """Write ``path``, which gets its name when it is complete, from a log that is open for reading.
 
-        Return the number of rows of each table, or channel, that was written.
+        Return the number of rows of each table, or channel, that was written. A method with a parameter ``topic`` gets
+        the channel that the user has chosen, or None; one with ``progress`` a function to call with "export", and the
+        steps that are done and all.
         """
         ...

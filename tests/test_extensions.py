@@ -22,7 +22,7 @@ from mcap.writer import Writer
 import mcaptrack
 from mcaptrack import log, testing
 from mcaptrack.api.declared import declared
-from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
+from mcaptrack.choices import BagFormat, BoxFormat, TableFormat
 from mcaptrack.cli.group import _LISTED
 from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
@@ -109,7 +109,7 @@ def test_every_kind_stands_on_the_page_with_an_example_of_at_most_40_lines():
 def test_the_names_of_options_are_those_of_the_registry():
     from typing import get_args
 
-    exporters = (*get_args(TableFormat), *get_args(BagFormat), *get_args(ExchangeFormat))
+    exporters = (*get_args(TableFormat), *get_args(BagFormat), *get_args(BoxFormat))
     assert exporters == tuple(BUILT_IN["exporter"])
     assert set(BUILT_IN["command"]) == {name for name, *_ in _LISTED}
 

@@ -171,7 +171,10 @@ def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
     done("drop", path, "/robot/front/*detections*", "/robot/front/tracks*")  # ours
     result = call("drop", path, "/robot/front/image")
     assert result.code == 1
-    assert "/robot/front/image was recorded, and can't be made again; -o writes a copy without, --in-place removes" in result.err
+    assert (
+        "/robot/front/image was recorded, and can't be made again; -o writes a copy without, --in-place removes"
+        in result.err
+    )
     done("drop", path, "/robot/front/image", "--in-place")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import operator
 import re
 from collections.abc import Mapping, Sequence
@@ -23,9 +24,9 @@ from mcaptrack.api.options import (
     no_progress,
     output,
 )
-from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
+from mcaptrack.choices import BagFormat, BoxFormat, TableFormat
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, place_of, publish, publish_folder, refuse_overwrite
+from mcaptrack.files import place_of, publish, publish_folder, refuse_overwrite
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.location import Location, local_name
 from mcaptrack.notices import Notice, warn
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 #: ROS 2 bags by the format of ``export``.
 _BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
-_BUILT_IN = (*get_args(TableFormat), *get_args(BagFormat), *get_args(ExchangeFormat))
+_OF_TABLES = (*get_args(TableFormat), *get_args(BagFormat))
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,8 @@ def export(
     output: Annotated[PathLike | None, output("LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log")] = None,
     *,
     form: Annotated[
-        TableFormat | BagFormat | ExchangeFormat | str, named("exporter", _BUILT_IN, FILES, "format")
+        TableFormat | BagFormat | BoxFormat | str,
+        named("exporter", (*_OF_TABLES, *get_args(BoxFormat)), FILES, "format"),
     ] = "parquet",
     topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
     all_topics: Annotated[bool, Option(FILES, flag="all")] = False,
@@ -215,12 +217,10 @@ def export(
     path = log_location(log)
     part = _Part(names_of(topic), all_topics, split_names("columns", columns), blobs, start_s, end_s)
     with definitions_of(definitions):
-        if form in get_args(ExchangeFormat):
-            return _export_file(path, optional_path(output), cast("ExchangeFormat", form), part, force, progress)
         if form in _BAGS:
             return _export_bag(path, optional_path(output), _BAGS[form], part, force, progress)
         if form not in get_args(TableFormat):
-            return _export_by_package(path, optional_path(output), form, part, force)
+            return _export_by(_exporter(form), path, optional_path(output), part, force, progress)
         folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
         if folder.exists() and not folder.is_dir():
             raise McaptrackError(f"{folder} is a file; tables go to a folder")
@@ -259,76 +259,54 @@ def _export_bag(
     )
 
 
-def _export_file(
-    path: Location,
-    output: Path | None,
-    form: ExchangeFormat,
-    part: _Part,
-    force: bool,
-    progress: Progress,
-) -> ExportResult:
-    """Write one channel of a log as a file of another program."""
-    from mcaptrack import log as logs
-    from mcaptrack.tables.exchange import default_file, write_boxes
+class FoundExporter(NamedTuple):
+    """An exporter as the registry found it, its object, and what its class says of it.
 
-    topics = part.topics
-    if len(topics) > 1:
-        raise McaptrackError(f"a file of {form} has the boxes of one channel, not of {', '.join(topics)}; give one")
-    target = output or default_file(path, form)
-    with warnings_about(path) as warnings:
-        part.warn_unused("a file of boxes has no tables")
-        with logs.read(path) as opened:
-            if any(is_same_file(file.path, target) for file in opened.parts):
-                raise McaptrackError(f"{target} is a log; give the file another name with `output=`")
-            done = write_boxes(opened, target, form, topics[0] if topics else None, progress, force=force)
-        for note in done.notes:
-            warn(note, "left-out")
-    return ExportResult(
-        path, target, {done.topic: done.rows}, (done.topic,), tuple(dict.fromkeys(warnings)), files=(target,)
-    )
-
-
-class ExporterOfPackage(NamedTuple):
-    """A format of another package, as the registry found it, its object, and what its class says of it."""
+    ``options`` are those of ``topic`` and ``progress`` that its method ``write`` takes.
+    """
 
     entry: Entry
     exporter: Any
     end: str
     is_folder: bool
+    options: frozenset[str]
 
 
-def exporter_of_package(form: str) -> ExporterOfPackage | None:
-    """The format of another package that has this name; None for built-in ones.
+def file_exporter(form: str) -> FoundExporter | None:
+    """The exporter of a format; None for tables and bags. Raises McaptrackError if none works."""
+    return None if form in _OF_TABLES else _exporter(form)
 
-    Raises McaptrackError if there is none, or if it can't be used.
-    """
+
+def _exporter(form: str) -> FoundExporter:
     from mcaptrack.registry import find
 
-    if form in _BUILT_IN:
-        return None
     entry = find("exporter", form)
     return exporter_for(entry, entry.made("write"))
 
 
-def exporter_for(entry: Entry, exporter: Any) -> ExporterOfPackage:
+def exporter_for(entry: Entry, exporter: Any) -> FoundExporter:
     """An exporter with what its class says. Raises McaptrackError for what it can't say."""
     end = getattr(exporter, "end", f".{entry.name.rpartition(':')[2].lower()}")
     if not isinstance(end, str) or not re.fullmatch(r"(\.[\w-]+)+", end):
         raise McaptrackError(
             f"{entry} has end = {end!r:.40}; it is the end of the name of a file, such as '.speeds.csv'"
         )
-    return ExporterOfPackage(entry, exporter, end, bool(getattr(exporter, "is_folder", False)))
+    options = {"topic", "progress"} & inspect.signature(exporter.write).parameters.keys()
+    return FoundExporter(entry, exporter, end, bool(getattr(exporter, "is_folder", False)), frozenset(options))
 
 
-def _export_by_package(path: Location, output: Path | None, form: str, part: _Part, force: bool) -> ExportResult:
-    """Write a log by the exporter of another package."""
+def _export_by(
+    by: FoundExporter, path: Location, output: Path | None, part: _Part, force: bool, progress: Progress
+) -> ExportResult:
+    """Write a log by an exporter."""
     from mcaptrack import log as logs
     from mcaptrack.api.reading import LogReader
 
+    takes_topic = "topic" in by.options
+    if takes_topic and len(part.topics) > 1:
+        raise McaptrackError(f"the {by.entry} writes one channel, not {', '.join(part.topics)}; give one")
     with warnings_about(path) as warnings:
-        by = exporter_of_package(form)
-        assert by is not None
-        part.warn_unused(f"the {by.entry} has no tables of channels", has_topic=True)
+        part.warn_unused(f"the {by.entry} has no tables of channels", has_topic=not takes_topic)
         target = output or local_name(path, by.end)
         if by.is_folder:
             _refuse_folder(by, target, force)
@@ -340,11 +318,11 @@ def _export_by_package(path: Location, output: Path | None, form: str, part: _Pa
             if isinstance(place, Path) and place_of(target) in (place, *place.parents):
                 raise McaptrackError(f"{target} is a log, or holds it; give another name with `output=`")
         with LogReader(path) as recording, (publish_folder if by.is_folder else publish)(target) as new:
-            rows = write_by_package(by, recording, new)
+            rows = write_by(by, recording, new, {"topic": next(iter(part.topics), None), "progress": progress})
     return ExportResult(path, target, rows, tuple(rows), tuple(dict.fromkeys(warnings)), files=(target,))
 
 
-def _refuse_folder(by: ExporterOfPackage, folder: Path, force: bool) -> None:
+def _refuse_folder(by: FoundExporter, folder: Path, force: bool) -> None:
     """Raise McaptrackError for a folder that an exporter may not replace: it may one with the end of its names."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
@@ -354,12 +332,15 @@ def _refuse_folder(by: ExporterOfPackage, folder: Path, force: bool) -> None:
         raise McaptrackError(f"{folder} exists; `force=True` replaces it")
 
 
-def write_by_package(by: ExporterOfPackage, recording: LogReader, part: Path) -> dict[str, int]:
-    """Let an exporter write a file or folder; returns its numbers of rows. Raises McaptrackError for what is wrong."""
+def write_by(by: FoundExporter, recording: LogReader, part: Path, options: Mapping[str, Any]) -> dict[str, int]:
+    """Let an exporter write a file or folder, with those of ``options`` that it takes; returns its numbers of rows.
+
+    Raises McaptrackError for what is wrong.
+    """
     from mcaptrack.registry import blamed
 
     with blamed(by.entry, "failed"):
-        rows = by.exporter.write(recording, part)
+        rows = by.exporter.write(recording, part, **{name: options[name] for name in by.options & options.keys()})
     if not (part.is_dir() if by.is_folder else part.is_file()):
         raise McaptrackError(
             f"{by.entry} wrote no {'folder' if by.is_folder else 'file'}; it has to make the path it gets"

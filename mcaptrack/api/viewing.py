@@ -7,13 +7,11 @@ import re
 import threading
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, Self, TypeVar
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline, tables
@@ -26,13 +24,15 @@ from mcaptrack.files import unreadable
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
-from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
+from mcaptrack.registry import BUILT_IN, Entry, blamed, find, names, others
 from mcaptrack.sources.cameras import cameras
-from mcaptrack.tables import exchange, export
+from mcaptrack.tables import export
 from mcaptrack.viewing import links
 from mcaptrack.viewing.formatting import policy, render
-from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, rerun_link, viewer_links
-from mcaptrack.viewing.serving import LOOPBACK, LogPage, Page, Server
+from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, viewer_links
+from mcaptrack.viewing.serving import LOOPBACK, LogPage, Page, Server, WebViewer
+
+_T = TypeVar("_T")
 
 #: Headings in the help.
 _OPENED: Final = "What is opened"
@@ -51,6 +51,7 @@ _WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
 class _Contents:
     """The contents of a log for viewers: its files, layouts by name (name of the file, content), events, and the time
     at which viewers open. ``views`` are what players show: a name, the camera, and whether it is seen from above.
+    ``viewers`` says why other viewers on the web can't open the log, by their names; "" if they can.
     """
 
     path: Path
@@ -58,7 +59,7 @@ class _Contents:
     layouts: Mapping[str, tuple[str, Path | bytes]]
     events: Sequence[LinkedEvent]
     views: Sequence[tuple[str, str, bool]]
-    rerun: str
+    viewers: Mapping[str, str]
     start_ns: int
     at_ns: int
     notes: tuple[str, ...] = ()
@@ -108,12 +109,20 @@ def _page_names() -> list[str]:
 def _log_page(name: str) -> LogPage:
     """A page by its name. Raises McaptrackError if that of another package can't be made."""
     entry = find("page", name)
-    with blamed(entry, "could not be made") if not entry.is_built_in else nullcontext():
+    with blamed(entry, "could not be made"):
         page: LogPage = entry.cls()
-    return page if entry.is_built_in else page._replace(make=partial(_made_by, entry, page.make))
+    return page._replace(make=partial(_made_by, entry, page.make))
 
 
-def _made_by(entry: Entry, make: Callable[[logs.Log], bytes], opened: logs.Log) -> bytes:
+def _web_viewer(name: str) -> WebViewer:
+    """A viewer on the web by its name. Raises McaptrackError if that of another package can't be made."""
+    entry = find("viewer", name)
+    with blamed(entry, "could not be made"):
+        viewer: WebViewer = entry.cls()
+    return viewer._replace(make=partial(_made_by, entry, viewer.make), why_not=partial(_made_by, entry, viewer.why_not))
+
+
+def _made_by(entry: Entry, make: Callable[[logs.Log], _T], opened: logs.Log) -> _T:
     with blamed(entry, "failed"):
         return make(opened)
 
@@ -133,13 +142,6 @@ def _tables(address: Callable[[str], str], opened: logs.Log) -> bytes:
 
 def _csv(name: str, opened: logs.Log) -> bytes:
     return b"".join(tables.pieces(export.LogTables(opened).table(name), "csv"))
-
-
-def _rerun(opened: logs.Log) -> bytes:
-    with TemporaryDirectory(prefix="mcaptrack-rerun-") as folder:
-        path = Path(folder, f"{opened.path.stem}.rrd")
-        exchange.write_boxes(opened, path, "rerun", None, no_progress)
-        return path.read_bytes()
 
 
 class LogServer:
@@ -222,19 +224,26 @@ class LogServer:
             pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
         for name in tables.TABLES:
             pages[f"{_FOLDER}/{name}.csv"] = Page(made(partial(_csv, name)), kind="text/csv; charset=utf-8")
-        if not contents.rerun:
-            pages[f"{contents.path.stem}.rrd"] = Page(made(_rerun), kind="application/octet-stream", is_shared=True)
+        for name, why_not in contents.viewers.items():
+            if not why_not:
+                viewer = _web_viewer(name)
+                file = Page(made(viewer.make), kind="application/octet-stream", is_shared=True)
+                pages[contents.path.stem + viewer.end] = file
         return pages
 
     def _index(self, contents: _Contents) -> bytes:
         """Return the first page."""
         offline = "needs a connection to the internet, and gets the log from this machine"
-        rerun = rerun_link(self._server.address(f"{contents.path.stem}.rrd")) if not contents.rerun else ""
+        linked = [
+            (name, "" if why_not else viewer.link(self._server.address(contents.path.stem + viewer.end)), why_not)
+            for name, why_not in contents.viewers.items()
+            for viewer in [_web_viewer(name)]
+        ]
         viewers = [
             {"name": name, "address": address, "about": about or f"{name} {offline}"}
             for name, address, about in (
                 *((name, address, "") for name, address in self.links.items()),
-                ("Rerun", rerun, contents.rerun),
+                *linked,
             )
         ]
         place = f"{self._server.path(_FOLDER).decode()}/"
@@ -398,7 +407,8 @@ def view(
                 f"{path}: whoever reaches this machine at {host} can read the log and all that is made of it", "shared"
             )
         contents = _Contents(
-            path, files, layouts, events, _views(shown), _without_rerun(opened), opened.start_ns, at_ns,
+            path, files, layouts, events, _views(shown),
+            {name: _web_viewer(name).why_not(opened) for name in names("viewer")}, opened.start_ns, at_ns,
             tuple(notes), tuple(dict.fromkeys(warnings)),
         )  # fmt: skip
         server = LogServer(contents, port, host, lichtblick, stack.pop_all() if shown is not opened else None)
@@ -418,18 +428,6 @@ def _views(opened: logs.Log) -> list[tuple[str, str, bool]]:
         (names[is_above] if len(of_cameras) == 1 else f"{prefix.lstrip('/')}, {names[is_above]}", prefix, is_above)
         for prefix, is_above in what_there_is
     ]
-
-
-def _without_rerun(opened: logs.Log) -> str:
-    """Return why there is no recording of Rerun; "" if one can be made."""
-    try:
-        version("rerun-sdk")
-        exchange.boxes_topic(opened)
-    except PackageNotFoundError:
-        return 'needs rerun-sdk, which is not installed; install it with: pip install "mcaptrack[rerun]"'
-    except McaptrackError as error:
-        return str(error)
-    return ""
 
 
 def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None, event: int | None) -> tuple[int, str]:

@@ -62,21 +62,17 @@ class Export(EachLog["ExportResult"]):
     @property
     def makes_folders(self) -> bool:  # type: ignore[override]
         """Whether a log becomes a folder: a bag, or what a package makes."""
-        from mcaptrack.api.exporting import exporter_of_package
+        from mcaptrack.api.exporting import file_exporter
 
-        of_package = exporter_of_package(self.values["form"])
-        return self.values["form"].startswith("rosbag2") or (of_package is not None and of_package.is_folder)
+        by = file_exporter(self.values["form"])
+        return self.values["form"].startswith("rosbag2") or (by is not None and by.is_folder)
 
     def suffix(self) -> str:
         """Return the end of the names of bags and files."""
-        from mcaptrack.api.exporting import exporter_of_package
-        from mcaptrack.tables.exchange import ends_with
+        from mcaptrack.api.exporting import file_exporter
 
-        form: str = self.values["form"]
-        of_package = exporter_of_package(form)
-        if of_package is not None:
-            return of_package.end
-        return ".rosbag2" if form.startswith("rosbag2") else ends_with(form)
+        by = file_exporter(self.values["form"])
+        return by.end if by is not None else ".rosbag2" if self.values["form"].startswith("rosbag2") else ""
 
     def show(self, log: Location, done: ExportResult, talk: common.Talk) -> None:
         """Print what was written."""

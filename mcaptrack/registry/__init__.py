@@ -51,6 +51,7 @@ Kind = Literal[
     "exporter",
     "command",
     "page",
+    "viewer",
     "name",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -67,7 +68,7 @@ _COMMANDS: Final = (
     "evaluate events zones calibrate check recover cut drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "name")
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "viewer", "name")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -149,18 +150,15 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
             **dict.fromkeys(("rosbag2", "rosbag2-sqlite3"), "mcaptrack.tables.rosbag2:write_bag"),
-            "mot": "mcaptrack.tables.exchange.text:mot",
-            "kitti": "mcaptrack.tables.exchange.text:kitti",
-            "coco": "mcaptrack.tables.exchange.coco:coco",
-            "cvat": "mcaptrack.tables.exchange.cvat:cvat",
-            "boxes-csv": "mcaptrack.tables.exchange.text:boxes_csv",
-            "rerun": "mcaptrack.tables.exchange.rerun_file:write_recording",
+            "mot": "mcaptrack.tables.box_files:MotFile",
         },
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         "page": {"tables": "mcaptrack.api.viewing:tables_page"},
         # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
         "name": {},
+        # Viewers on the web that `mcaptrack view` links, besides Lichtblick and Foxglove.
+        "viewer": {},
     }
 )
 
@@ -332,8 +330,11 @@ def blamed(entry: Entry, what: str, guard: Guard | None = None) -> Iterator[None
     """Run the code of another package: whatever it raises becomes a McaptrackError that names it.
 
     What it changes in this process is undone, with a warning; ``guard`` remembers that for all calls of one object.
-    Interruptions pass as they are: Ctrl-C, and the exit that a signal asks for.
+    Interruptions pass as they are: Ctrl-C, and the exit that a signal asks for. Nothing is caught of our own code.
     """
+    if entry.is_built_in:
+        yield
+        return
     guard = guard or Guard(str(entry))
     try:
         try:

@@ -15,7 +15,7 @@ import numpy as np
 
 from mcaptrack.api.common import as_path
 from mcaptrack.api.declared import Argument, PythonOnly, about, arguments_of, hints_of, options_of, words_of
-from mcaptrack.api.exporting import exporter_for, write_by_package
+from mcaptrack.api.exporting import exporter_for, write_by
 from mcaptrack.api.options import PathLike
 from mcaptrack.api.reading import LogReader
 from mcaptrack.api.recording import open as open_log
@@ -232,7 +232,7 @@ def check_exporter(exporter: Exporter, log: PathLike) -> None:
     def written(path: Path, file: Path) -> tuple[dict[str, int], Any]:
         file.parent.mkdir()
         with LogReader(path) as recording:
-            rows = write_by_package(by, recording, file)
+            rows = write_by(by, recording, file, {})
         if beside := [other.name for other in file.parent.iterdir() if other != file]:
             raise LawError(f"conforms: it writes {beside[0]}, too; it has to write the path that it gets alone")
         return rows, _content(file)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from importlib.metadata import version
 from typing import Final, NamedTuple
 from urllib.parse import urlencode
 
@@ -26,7 +25,6 @@ from mcaptrack.sources.video import is_video_codec
 
 LICHTBLICK: Final = "https://lichtblick-suite.github.io/lichtblick/"
 FOXGLOVE: Final = "https://app.foxglove.dev/"
-RERUN: Final = "https://app.rerun.io/version/"
 
 
 def viewer_links(
@@ -44,14 +42,6 @@ def viewer_links(
         "Lichtblick": f"{lichtblick.rstrip('/')}/?{urlencode([*with_layout, *time])}",
         "Foxglove": f"{FOXGLOVE}~/view?{urlencode([*sources, *time])}",
     }
-
-
-def rerun_link(recording: str) -> str:
-    """The address that opens a recording in Rerun's web viewer, that of the library which is installed.
-
-    Raises PackageNotFoundError without the library.
-    """
-    return f"{RERUN}{version('rerun-sdk')}/index.html?{urlencode({'url': recording})}"
 
 
 def utc_text(t_ns: int) -> str | None:

@@ -97,6 +97,19 @@ class LogPage(NamedTuple):
     policy: str
 
 
+class WebViewer(NamedTuple):
+    """A viewer on the web that `mcaptrack view` links. It opens a file with a name that ends with ``end``.
+
+    ``make`` makes the file of an open log, ``link`` is the address that opens the file at an address. ``why_not`` says
+    why there is no file of a log; "" if there is one.
+    """
+
+    end: str
+    make: Callable[[Log], bytes]
+    link: Callable[[str], str]
+    why_not: Callable[[Log], str]
+
+
 #: What is served: a file, the content of one, or a page.
 Served = Path | bytes | Page
 

@@ -165,7 +165,7 @@ def near(found: Any, wanted: Any) -> None:
 def test_boxes_positions_and_trails_of_each_picture(rerun, walked):
     stream, result = exported(walked, topic="/camera/tracks")
     assert result.rows == {"/camera/tracks": 6}
-    assert stream.about == ("mcaptrack", "out", False)
+    assert stream.about == ("mcaptrack", "walk", False)
     assert stream.ended == ["flush", "disconnect"]
     assert (walked.parent / "out.rrd").read_bytes() == b"RRF2"
     # Five pictures, five messages of tracks and two of forecasts, of ten that were expected.

@@ -13,26 +13,32 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar, Final
+from urllib.parse import urlencode
 
 import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish
 from mcaptrack.foxglove.palette import colours
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, Frame
 from mcaptrack.schema.classes import PERSON, class_name, class_names
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras
 from mcaptrack.sources.video import is_video_codec
+from mcaptrack.tables.box_files import boxes_topic
+from mcaptrack.viewing.serving import WebViewer
 
 Progress = Callable[[str, int, int], None]
 _APPLICATION: Final = "mcaptrack"
+_MISSING: Final = 'needs rerun-sdk, which is not installed; install it with: pip install "mcaptrack[rerun]"'
 #: Times are dates from here on, and durations before.
 _DATES_NS: Final = 10**9 * NS_PER_S
 #: How long trails are.
@@ -49,32 +55,73 @@ def library() -> Any:
     try:
         import rerun
     except ImportError:
-        raise McaptrackError(
-            "a recording of Rerun needs rerun-sdk, which is not installed; install it with: "
-            'pip install "mcaptrack[rerun]"'
-        ) from None
+        raise McaptrackError(f"a recording of Rerun {_MISSING}") from None
     return rerun
 
 
-def write_recording(opened: log.Log, output: Path, topic: str, progress: Progress) -> tuple[int, list[str]]:
-    """Write a recording with the boxes of a channel; returns the number of its rows, and notes.
+class Rerun:
+    """A recording of Rerun, as an exporter."""
 
-    Raises McaptrackError if the library is missing, or if the file can't be written.
+    end: ClassVar[str] = ".rrd"
+
+    def write(
+        self, recording: Any, path: Path, topic: str | None = None, progress: Progress = lambda *_: None
+    ) -> dict[str, int]:
+        """Write a log with the boxes of a channel: by default the best tracks of the only camera, or its detections.
+
+        Raises McaptrackError if the library is missing, or if there is no such channel.
+        """
+        with log.read(recording.path) as opened:
+            return write_recording(opened, path, boxes_topic(opened, topic), progress)
+
+
+def viewer() -> WebViewer:
+    """Rerun's viewer on the web, of the version of the library that is installed."""
+    return WebViewer(Rerun.end, _made, _link, _why_not)
+
+
+def _made(opened: log.Log) -> bytes:
+    with TemporaryDirectory(prefix="mcaptrack-rerun-") as folder:
+        path = Path(folder, f"{opened.path.stem}{Rerun.end}")
+        write_recording(opened, path, boxes_topic(opened))
+        return path.read_bytes()
+
+
+def _link(file: str) -> str:
+    return f"https://app.rerun.io/version/{version('rerun-sdk')}/index.html?{urlencode({'url': file})}"
+
+
+def _why_not(opened: log.Log) -> str:
+    try:
+        version("rerun-sdk")
+        boxes_topic(opened)
+    except PackageNotFoundError:
+        return _MISSING
+    except McaptrackError as error:
+        return str(error)
+    return ""
+
+
+def write_recording(opened: log.Log, output: Path, topic: str, progress: Progress = lambda *_: None) -> dict[str, int]:
+    """Write a recording with the boxes of a channel; returns the number of its rows, and warns of what is left out.
+
+    Raises McaptrackError if the library is missing.
     """
     rerun = library()
     channel = opened.channel(topic)
     frames = opened.frame_columns(topic, SCHEMAS[channel.schema_name])
     camera = next((each for each in cameras(opened) if topic in each.topics), None)
-    recording = rerun.RecordingStream(_APPLICATION, recording_id=output.stem, send_properties=False)
+    recording = rerun.RecordingStream(_APPLICATION, recording_id=opened.path.stem, send_properties=False)
     job = _Job(rerun, recording, opened)
-    with publish(output) as part:
-        recording.save(part, default_blueprint=job.blueprint())
-        total = len(frames) + (opened.channel(camera.pictures).messages if camera and camera.pictures else 0)
-        for done, _ in enumerate(job.write_all(camera, topic, frames), start=1):
-            progress("export", min(done, total), total)
-        recording.flush()
-        recording.disconnect()
-    return job.rows, job.notes
+    recording.save(output, default_blueprint=job.blueprint())
+    total = len(frames) + (opened.channel(camera.pictures).messages if camera and camera.pictures else 0)
+    for done, _ in enumerate(job.write_all(camera, topic, frames), start=1):
+        progress("export", min(done, total), total)
+    recording.flush()
+    recording.disconnect()
+    for note in job.notes:
+        warn(note, "left-out")
+    return {topic: job.rows}
 
 
 class _Job:

@@ -14,24 +14,29 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.schema.classes import UNKNOWN
-from mcaptrack.tables.exchange.boxes import ExportedBoxes
+from mcaptrack.tables.box_files import BoxFile, ExportedBoxes
 
 _ENTRIES: Final = 1024
 _VIDEO: Final = 1
 
 
-def coco(boxes: ExportedBoxes) -> Iterator[bytes]:
+class CocoFile(BoxFile):
     """A JSON object with videos, images, annotations and categories."""
-    size = {} if boxes.size is None else {"width": boxes.size[0], "height": boxes.size[1]}
-    name = boxes.topic.strip("/")
-    yield b'{"info": ' + _bytes({"description": f"boxes of {name}", "frames": "frame_id counts pictures from 0"})
-    yield b', "videos": ' + _bytes([{"id": _VIDEO, "name": name, **size}])
-    yield b', "categories": ' + _bytes([_category(number, name) for number, name in boxes.classes.items()])
-    yield b', "images": [\n'
-    yield from _list(_images(boxes, size))
-    yield b'\n], "annotations": [\n'
-    yield from _list(_annotations(boxes))
-    yield b"\n]}\n"
+
+    title, end, holds = "COCO", ".coco.json", frozenset({"scores", "observed"})
+
+    def content(self, boxes: ExportedBoxes) -> Iterator[bytes]:
+        """Yield the object in parts."""
+        size = {} if boxes.size is None else {"width": boxes.size[0], "height": boxes.size[1]}
+        name = boxes.topic.strip("/")
+        yield b'{"info": ' + _bytes({"description": f"boxes of {name}", "frames": "frame_id counts pictures from 0"})
+        yield b', "videos": ' + _bytes([{"id": _VIDEO, "name": name, **size}])
+        yield b', "categories": ' + _bytes([_category(number, name) for number, name in boxes.classes.items()])
+        yield b', "images": [\n'
+        yield from _list(_images(boxes, size))
+        yield b'\n], "annotations": [\n'
+        yield from _list(_annotations(boxes))
+        yield b"\n]}\n"
 
 
 def _category(number: int, name: str) -> dict[str, Any]:

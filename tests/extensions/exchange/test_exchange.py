@@ -17,14 +17,13 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.cvat import KEYFRAME_PX, CvatFile
+from mcaptrack.extensions.exchange.text import KittiFile
 from mcaptrack.registry import find
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
-from mcaptrack.tables.exchange import _FORMATS
-from mcaptrack.tables.exchange.boxes import ExportedBoxes
-from mcaptrack.tables.exchange.cvat import KEYFRAME_PX, describe_classes
-from mcaptrack.tables.exchange.text import describe_merged
+from mcaptrack.tables.box_files import BoxFile, ExportedBoxes, MotFile
 
 ALL = WantedClasses("all")
 NAMES = {1: "person", 2: "bicycle", 3: "traffic light", 7: 'a "b" <c> & d'}
@@ -71,7 +70,7 @@ CVAT_EXAMPLE = """<?xml version="1.0" encoding="utf-8"?>
 </annotations>
 """
 
-_WRITERS = {name: find("exporter", name).cls for name in _FORMATS if name != "rerun"}
+_FORMATS = {name: find("exporter", name).cls() for name in ("mot", "kitti", "coco", "cvat", "boxes-csv")}
 
 
 def box(frame: int, left: float, outside: int = 0, more: str = "", inner: str = "") -> str:
@@ -125,11 +124,11 @@ def tables(draw, has_ids: bool = True) -> ExportedBoxes:
     )
 
 
-@pytest.mark.parametrize("form", _WRITERS)
+@pytest.mark.parametrize("form", _FORMATS)
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(table=tables())
 def test_what_is_written_is_read_again(form, table, tmp_path):
-    labels = read(tmp_path, b"".join(_WRITERS[form](table)), f"a.{form}")
+    labels = read(tmp_path, b"".join(_FORMATS[form].content(table)), f"a.{form}")
     first = labels.first_frame if form != "mot" else 1
     order = np.lexsort((table.id, table.frame))
     assert (labels.frame - first).tolist() == table.frame[order].tolist()
@@ -137,7 +136,7 @@ def test_what_is_written_is_read_again(form, table, tmp_path):
     np.testing.assert_allclose(labels.boxes_px, table.boxes[order], rtol=0, atol=1e-9)
     if "scores" in _FORMATS[form].holds:
         assert labels.score.astype(np.float32).tolist() == table.score[order].tolist()
-    if "names" in _FORMATS[form].holds:
+    if form != "mot":
         names = [labels.classes[one] for one in labels.class_id.tolist()]
         in_kitti = {1: "Pedestrian", 2: "bicycle", 3: "traffic_light", 7: "a_b_c_d"}
         assert names == [(in_kitti if form == "kitti" else NAMES)[one] for one in table.class_id[order].tolist()]
@@ -145,15 +144,15 @@ def test_what_is_written_is_read_again(form, table, tmp_path):
         assert labels.observed.tolist() == table.observed[order].tolist()
 
 
-@pytest.mark.parametrize("form", _WRITERS)
+@pytest.mark.parametrize("form", _FORMATS)
 @settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(table=tables(has_ids=False))
 def test_detections_are_read_again_without_ids(form, table, tmp_path):
     if form == "cvat":  # whose boxes of videos are tracks, of one frame each
-        labels = read(tmp_path, b"".join(_WRITERS[form](table)), "a.xml")
+        labels = read(tmp_path, b"".join(_FORMATS[form].content(table)), "a.xml")
         assert len(np.unique(labels.id)) == len(table.frame)
         return
-    labels = read(tmp_path, b"".join(_WRITERS[form](table)), f"a.{form}", "detections")
+    labels = read(tmp_path, b"".join(_FORMATS[form].content(table)), f"a.{form}", "detections")
     assert not labels.has_ids
     assert sorted(map(tuple, labels.boxes_px.round(6))) == sorted(map(tuple, table.boxes.round(6)))
 
@@ -162,7 +161,7 @@ def test_detections_are_read_again_without_ids(form, table, tmp_path):
 @given(table=tables())
 def test_cvat_interpolates_what_is_no_keyframe(table, tmp_path):
     """CVAT keeps keyframes alone, and interpolates: no corner is farther than ``KEYFRAME_PX`` from where it was."""
-    lines = b"".join(_WRITERS["cvat"](table)).decode().splitlines()
+    lines = b"".join(_FORMATS["cvat"].content(table)).decode().splitlines()
     sparse = "\n".join(line for line in lines if 'keyframe="0"' not in line)
     labels = read(tmp_path, sparse)
     order = np.lexsort((table.id, table.frame))
@@ -182,7 +181,7 @@ def test_a_straight_walk_needs_few_keyframes(tmp_path):
         "/t", frames, frames, frames, np.full(count, 4), boxes, boxes[:, :2], np.full(count, np.nan, np.float32),
         np.ones(count, int), observed, {}, True, False, None, (),
     )  # fmt: skip
-    text = b"".join(_WRITERS["cvat"](table)).decode()
+    text = b"".join(_FORMATS["cvat"].content(table)).decode()
     assert text.count("<box ") == count
     lines = text.splitlines()
     keys = [line.split('"')[1] for line in lines if 'keyframe="1"' in line]
@@ -290,22 +289,31 @@ def test_coco_of_polygons_and_of_numbers_with_a_point(tmp_path):
         read(tmp_path, json.dumps(content), "a.json")
 
 
-def test_classes_that_a_file_cannot_tell_apart_are_said():
-    assert describe_merged("kitti", {1: "person", 2: "traffic light", 3: "traffic-light", 4: "car"}) == (
-        "classes that the file can't tell apart: traffic light and traffic-light are both traffic_light"
-    )
-    assert "person and pedestrian are both 1" in describe_merged("mot", {1: "person", 2: "pedestrian", 3: "car"})
-    assert describe_merged("kitti", NAMES) == describe_merged("mot", NAMES) == ""
-    ids = np.array([1, 1, 1, 2])
+def remarks(form: BoxFile, names: dict[int, str], kinds: list[int], ids: list[int]) -> list[str]:
+    """What a format says of boxes of these classes and tracks."""
+    row, ones = np.arange(len(kinds)), np.ones((len(kinds), 4))
     table = ExportedBoxes(
-        "/t", ids, ids, ids, ids, np.ones((4, 4)), np.ones((4, 2)), np.ones(4, np.float32), np.array([3, 2, 3, 2]),
-        np.ones(4, bool), {}, True, False, None, (),
+        "/t", row, row, row, np.array(ids), ones, ones[:, :2], ones[:, 0].astype(np.float32), np.array(kinds),
+        np.ones(len(kinds), bool), names, True, False, None, (),
     )  # fmt: skip
-    assert "1 boxes get that of their track" in describe_classes(table)
+    return [remark for remark in form.remarks(table) if remark]
+
+
+def test_classes_that_a_file_cannot_tell_apart_are_said():
+    lights = {1: "person", 2: "traffic light", 3: "traffic-light", 4: "car"}
+    assert remarks(KittiFile(), lights, [1, 2, 3, 4], [1, 2, 3, 4]) == [
+        "classes that the file can't tell apart: traffic light and traffic-light are both traffic_light"
+    ]
+    (said,) = remarks(MotFile(), {1: "person", 2: "pedestrian", 3: "car"}, [1, 2, 3], [1, 2, 3])
+    assert "person and pedestrian are both 1" in said
+    assert remarks(KittiFile(), NAMES, [*NAMES], [*NAMES]) == []
+    assert not any("tell apart" in said for said in remarks(MotFile(), NAMES, [*NAMES], [*NAMES]))
+    (said,) = remarks(CvatFile(), {}, [3, 2, 3, 2], [1, 1, 1, 2])
+    assert "1 boxes get that of their track" in said
 
 
 class TestCommand:
-    @pytest.mark.parametrize("form", _WRITERS)
+    @pytest.mark.parametrize("form", _FORMATS)
     def test_a_channel_goes_out_and_comes_back_into_the_log(self, form, template, tmp_path):
         path = Path(shutil.copy(template, tmp_path / "a.mcap"))
         result = mcaptrack.export(path, tmp_path / f"a.{form}", form=form)
@@ -341,7 +349,7 @@ class TestCommand:
         [
             ({"topic": "/camera/video"}, "/camera/video has no detections and no tracks"),
             ({"topic": "/nothing"}, "/nothing"),
-            ({"topic": ["/camera/tracks", "/camera/truth"]}, "of one channel, not of"),
+            ({"topic": ["/camera/tracks", "/camera/truth"]}, "writes one channel, not /camera/tracks, /camera/truth"),
             ({"output": "there"}, "is a folder"),
         ],
     )

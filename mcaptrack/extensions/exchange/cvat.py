@@ -7,14 +7,14 @@ moves its neighbours, too. Letters: N boxes of a track.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.tables.exchange.boxes import ExportedBoxes
+from mcaptrack.tables.box_files import BoxFile, ExportedBoxes
 
 #: The attribute that keeps the id of a track: CVAT gives tracks new numbers.
 TRACK_ID: Final = "track_id"
@@ -25,16 +25,25 @@ _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010f
 _COLOURS: Final = ("#fa3253", "#3d3df5", "#33ddff", "#ffcc33", "#b83df5", "#24b353", "#ff6a4d", "#8c78f0")
 
 
-def cvat(boxes: ExportedBoxes) -> Iterator[bytes]:
+class CvatFile(BoxFile):
     """The file, track by track; a box without an id is a track of one frame."""
-    yield _head(boxes).encode("utf-8")
-    names = {number: _plain(name) for number, name in boxes.classes.items()}
-    order = np.lexsort((boxes.frame, boxes.id)) if boxes.has_ids else np.arange(len(boxes.id))
-    key = boxes.id[order] if boxes.has_ids else order
-    starts = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
-    for number, rows in enumerate(np.split(order, starts[1:])):
-        yield _track(boxes, number, rows, names).encode("utf-8")
-    yield b"</annotations>\n"
+
+    title, end, holds = "CVAT", ".cvat.xml", frozenset({"observed"})
+
+    def content(self, boxes: ExportedBoxes) -> Iterator[bytes]:
+        """Yield head, tracks and end."""
+        yield _head(boxes).encode("utf-8")
+        names = {number: _plain(name) for number, name in boxes.classes.items()}
+        order = np.lexsort((boxes.frame, boxes.id)) if boxes.has_ids else np.arange(len(boxes.id))
+        key = boxes.id[order] if boxes.has_ids else order
+        starts = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+        for number, rows in enumerate(np.split(order, starts[1:])):
+            yield _track(boxes, number, rows, names).encode("utf-8")
+        yield b"</annotations>\n"
+
+    def remarks(self, boxes: ExportedBoxes) -> Iterable[str]:
+        """Say how many boxes get the label of their track."""
+        return (describe_classes(boxes),)
 
 
 def describe_classes(boxes: ExportedBoxes) -> str:

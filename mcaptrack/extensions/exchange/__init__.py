@@ -1,0 +1,1 @@
+"""The boxes of a channel as files of annotation tools and benchmarks: KITTI, COCO, CVAT, and a plain table."""

@@ -1,0 +1,1 @@
+"""A log as a recording of Rerun, which `mcaptrack view` opens, too."""
