@@ -19,7 +19,6 @@ _PARTS = {
     "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
     "messages": ["DecodedMessage"],
-    "notebook": ["Player"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["Recording", "open"],
     "rendering": ["RenderResult", "render"],

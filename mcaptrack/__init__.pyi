@@ -23,7 +23,6 @@ from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.messages import DecodedMessage as DecodedMessage
-from mcaptrack.api.notebook import Player as Player
 from mcaptrack.api.querying import ColumnInfo as ColumnInfo
 from mcaptrack.api.querying import TableInfo as TableInfo
 from mcaptrack.api.querying import TableList as TableList
@@ -58,6 +57,7 @@ from mcaptrack.api.viewing import view as view
 from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.extensions.notebook.api import Player as Player
 from mcaptrack.extensions.report.api import ReportResult as ReportResult
 from mcaptrack.extensions.report.api import report as report
 from mcaptrack.extensions.training.api import train as train

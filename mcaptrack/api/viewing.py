@@ -15,13 +15,14 @@ from typing import Annotated, Final, Self, TypeVar
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline, tables
+from mcaptrack.api.arrow_tables import arrow_html
 from mcaptrack.api.common import as_path, log_file
 from mcaptrack.api.declared import Argument, Option, declared
-from mcaptrack.api.notebook import Choice, arrow_html, show_log
-from mcaptrack.api.options import PathLike, no_progress
+from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call, offer
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.installed import missing_extension
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
 from mcaptrack.registry import BUILT_IN, Entry, blamed, find, names, others
@@ -30,7 +31,7 @@ from mcaptrack.tables import export
 from mcaptrack.viewing import links
 from mcaptrack.viewing.formatting import policy, render
 from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, viewer_links
-from mcaptrack.viewing.serving import LOOPBACK, LogPage, Page, Server, WebViewer
+from mcaptrack.viewing.serving import LOOPBACK, LogPage, Page, Server, WebViewer, log_player
 
 _T = TypeVar("_T")
 
@@ -39,8 +40,6 @@ _OPENED: Final = "What is opened"
 _VIEWER: Final = "Server and viewer"
 #: The port where a log is served, unless another is given or this one is taken.
 PORT: Final = 8765
-#: The largest size of a player in megabytes: it is opened from this machine.
-_PLAYER_MB: Final = 16.0
 #: Our pages and scripts, below the secret word; files of the log have no folder.
 _FOLDER: Final = "page"
 #: The time in the text of an event.
@@ -89,16 +88,6 @@ class _FromLog:
                 return self._made[1]
             except McaptrackError as error:
                 return render("nothing.html", text=str(error)).encode()
-
-
-def _player(camera: str, is_above: bool, opened: logs.Log) -> bytes:
-    with with_views(opened) as (complete, _):
-        topics = pipeline.views_from_above(complete, camera) if is_above else ()
-    shown = show_log(
-        opened, None, topics=topics, camera=camera, choice=Choice(), max_mb=_PLAYER_MB, progress=no_progress,
-        all_tracks=True,
-    )  # fmt: skip
-    return shown.page.encode()
 
 
 def _page_names() -> list[str]:
@@ -215,10 +204,10 @@ class LogServer:
     def _pages(self, contents: _Contents) -> dict[str, Page]:
         """Return our pages on a log, by name."""
         made = partial(_FromLog, contents.path)
-        pages = {
-            f"{_FOLDER}/player-{number}.html": Page(made(partial(_player, camera, is_above)), policy("player.js"))
-            for number, (_, camera, is_above) in enumerate(contents.views)
-        }
+        pages = {}
+        for number, (_, camera, is_above) in enumerate(contents.views):
+            player = log_player().page(camera, is_above)
+            pages[f"{_FOLDER}/player-{number}.html"] = Page(made(player.make), player.policy)
         for name in _page_names():
             page = _log_page(name)
             pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
@@ -402,6 +391,8 @@ def view(
         if opened.start_ns or opened.end_ns:
             notes.append(f"viewers open at {links.seconds_of(opened, at_ns):.1f} s, {why}")
         _note_trouble(opened, notes)
+        if not names("player"):
+            notes.append(missing_extension("Player"))
         if host != LOOPBACK:
             warn(
                 f"{path}: whoever reaches this machine at {host} can read the log and all that is made of it", "shared"
@@ -419,13 +410,13 @@ def view(
 
 def _views(opened: logs.Log) -> list[tuple[str, str, bool]]:
     """Return what players show, the best first: a name, the camera, and whether it is seen from above."""
-    of_cameras = cameras(opened)
+    of_cameras = cameras(opened) if names("player") else []
     pictures = [(camera.prefix, False) for camera in of_cameras if camera.pictures]
     above = [(camera.prefix, True) for camera in of_cameras if pipeline.views_from_above(opened, camera.prefix)]
     what_there_is = [*pictures, *above] or [(camera.prefix, False) for camera in of_cameras[:1]]
-    names = {False: "pictures", True: "from above"}
+    sights = {False: "pictures", True: "from above"}
     return [
-        (names[is_above] if len(of_cameras) == 1 else f"{prefix.lstrip('/')}, {names[is_above]}", prefix, is_above)
+        (sights[is_above] if len(of_cameras) == 1 else f"{prefix.lstrip('/')}, {sights[is_above]}", prefix, is_above)
         for prefix, is_above in what_there_is
     ]
 

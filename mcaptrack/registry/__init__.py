@@ -51,7 +51,11 @@ Kind = Literal[
     "exporter",
     "command",
     "page",
+<<<<<<< HEAD
     "viewer",
+=======
+    "player",
+>>>>>>> ext
     "name",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -68,7 +72,11 @@ _COMMANDS: Final = (
     "evaluate events zones calibrate check recover cut drop doctor"
 )
 #: Kinds that only entry points name.
+<<<<<<< HEAD
 _BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "viewer", "name")
+=======
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "name")
+>>>>>>> ext
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -155,6 +163,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         "page": {"tables": "mcaptrack.api.viewing:tables_page"},
+        "player": {},
         # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
         "name": {},
         # Viewers on the web that `mcaptrack view` links, besides Lichtblick and Foxglove.

@@ -32,7 +32,9 @@ from typing import Any, BinaryIO, Final, NamedTuple
 from urllib.parse import quote, unquote_to_bytes
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.installed import missing_extension
 from mcaptrack.log import Log
+from mcaptrack.registry import find, names
 
 LOOPBACK: Final = "127.0.0.1"
 _LOCAL: Final = (LOOPBACK, "localhost")
@@ -97,6 +99,7 @@ class LogPage(NamedTuple):
     policy: str
 
 
+<<<<<<< HEAD
 class WebViewer(NamedTuple):
     """A viewer on the web that `mcaptrack view` links. It opens a file with a name that ends with ``end``.
 
@@ -108,6 +111,28 @@ class WebViewer(NamedTuple):
     make: Callable[[Log], bytes]
     link: Callable[[str], str]
     why_not: Callable[[Log], str]
+=======
+class Choice(NamedTuple):
+    """Which pictures: from ``start_s`` to ``end_s`` (None: the end) every ``every``-th (None: as many as fit).
+
+    ``width_px`` is their width in pixels; None stands for a usual one.
+    """
+
+    start_s: float = 0.0
+    end_s: float | None = None
+    every: int | None = None
+    width_px: int | None = None
+
+
+AS_MANY_AS_FIT: Final = Choice()
+
+
+def log_player() -> Any:
+    """The maker of players of logs: that of the first entry point. Raises McaptrackError if there is none."""
+    if not names("player"):
+        raise McaptrackError(missing_extension("Player"))
+    return find("player", names("player")[0]).made("show", "page")
+>>>>>>> ext
 
 
 #: What is served: a file, the content of one, or a page.
