@@ -51,11 +51,8 @@ Kind = Literal[
     "exporter",
     "command",
     "page",
-<<<<<<< HEAD
-    "viewer",
-=======
     "player",
->>>>>>> ext
+    "viewer",
     "name",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -72,11 +69,7 @@ _COMMANDS: Final = (
     "evaluate events zones calibrate check recover cut drop doctor"
 )
 #: Kinds that only entry points name.
-<<<<<<< HEAD
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "viewer", "name")
-=======
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "name")
->>>>>>> ext
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "viewer", "name")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {

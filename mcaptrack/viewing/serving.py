@@ -99,7 +99,6 @@ class LogPage(NamedTuple):
     policy: str
 
 
-<<<<<<< HEAD
 class WebViewer(NamedTuple):
     """A viewer on the web that `mcaptrack view` links. It opens a file with a name that ends with ``end``.
 
@@ -111,7 +110,8 @@ class WebViewer(NamedTuple):
     make: Callable[[Log], bytes]
     link: Callable[[str], str]
     why_not: Callable[[Log], str]
-=======
+
+
 class Choice(NamedTuple):
     """Which pictures: from ``start_s`` to ``end_s`` (None: the end) every ``every``-th (None: as many as fit).
 
@@ -132,7 +132,6 @@ def log_player() -> Any:
     if not names("player"):
         raise McaptrackError(missing_extension("Player"))
     return find("player", names("player")[0]).made("show", "page")
->>>>>>> ext
 
 
 #: What is served: a file, the content of one, or a page.
