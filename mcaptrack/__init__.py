@@ -21,7 +21,6 @@ _PARTS = {
     "messages": ["DecodedMessage"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["Recording", "open"],
-    "rendering": ["RenderResult", "render"],
     "rows": ["detections", "schema_of"],
     "run": ["run"],
     "running": ["RunResult"],

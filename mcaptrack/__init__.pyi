@@ -31,8 +31,6 @@ from mcaptrack.api.querying import query as query
 from mcaptrack.api.reading import FetchedMessage as FetchedMessage
 from mcaptrack.api.recording import Recording as Recording
 from mcaptrack.api.recording import open as open  # noqa: A004
-from mcaptrack.api.rendering import RenderResult as RenderResult
-from mcaptrack.api.rendering import render as render
 from mcaptrack.api.rows import detections as detections
 from mcaptrack.api.rows import schema_of as schema_of
 from mcaptrack.api.run import run as run
@@ -58,6 +56,8 @@ from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
 from mcaptrack.extensions.notebook.api import Player as Player
+from mcaptrack.extensions.render.api import RenderResult as RenderResult
+from mcaptrack.extensions.render.api import render as render
 from mcaptrack.extensions.report.api import ReportResult as ReportResult
 from mcaptrack.extensions.report.api import report as report
 from mcaptrack.extensions.training.api import train as train

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mcaptrack.viewing.heat_map import occupancy
+from mcaptrack.evaluation.occupancy import occupancy
 
 S = 10**9
 
@@ -57,7 +57,7 @@ def slowly(t_ns, ids, xy, cell, gap_s):
 @pytest.mark.parametrize(("part", "gap_s"), [(1 << 18, 2.0), (40, 2.0), (40, 0.5)])
 def test_the_grid_is_that_of_a_slow_count(part, gap_s, monkeypatch):
     for name, value in {"_PART": part, "_CELL_M": 0.7, "MAX_GAP_S": gap_s}.items():
-        monkeypatch.setattr(f"mcaptrack.viewing.heat_map.{name}", value)
+        monkeypatch.setattr(f"mcaptrack.evaluation.occupancy.{name}", value)
     rng = np.random.default_rng(5)
     count = 120
     ids = rng.integers(0, 5, count)

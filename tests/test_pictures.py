@@ -16,7 +16,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import EncodedPicture, H264Encoder, VideoOptions, decode_gray, open_video
-from mcaptrack.viewing import rendering
 from tests.commands import printed
 from tests.worlds import SVT, X265, write_clip
 
@@ -201,31 +200,3 @@ def test_a_picture_that_is_damaged_is_said(tmp_path):
     foreign_log(tmp_path / "a.mcap", "/v", messages)
     with log.read(tmp_path / "a.mcap") as opened, pytest.raises(McaptrackError, match=r"a\.mcap: /v at \d+ ns"):
         list(Pictures(opened, "/v").frames([15]))
-
-
-def test_a_late_part_is_rendered_without_decoding_what_is_before_it(tmp_path, monkeypatch):
-    write_clip(tmp_path / "a.mkv", frames=COUNT, options=X264)
-    ingest(tmp_path / "a.mkv", tmp_path / "a.mcap", IngestOptions())
-    used = []
-
-    class Counted(Pictures):
-        def __init__(self, *given):
-            super().__init__(*given)
-            used.append(self)
-
-    monkeypatch.setattr(rendering, "Pictures", Counted)
-    with log.read(tmp_path / "a.mcap") as opened:
-        options = rendering.RenderOptions(start_s=4.4, end_s=4.95)
-        assert rendering.render(opened, TOPIC, (), tmp_path / "late.mp4", options) == 6
-        assert used[-1].decoded == 10  # 40 to 49: the key picture, and four that are not shown
-        assert rendering.render(opened, TOPIC, (), tmp_path / "all.mp4", rendering.RenderOptions()) == COUNT
-        assert used[-1].decoded == COUNT
-        thin = rendering.RenderOptions(max_fps=1.0)
-        assert rendering.render(opened, TOPIC, (), tmp_path / "thin.mp4", thin) == 6
-        assert used[-1].decoded == 6
-    with av.open(str(tmp_path / "late.mp4")) as late, av.open(str(tmp_path / "all.mp4")) as whole:
-        wanted = [frame.to_ndarray(format="gray") for frame in whole.decode(video=0)][44:50]
-        found = [frame.to_ndarray(format="gray") for frame in late.decode(video=0)]
-    assert len(found) == 6
-    for one, other in zip(found, wanted, strict=True):
-        assert np.abs(one.astype(int) - other).mean() < 2

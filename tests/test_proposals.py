@@ -239,11 +239,11 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
     "pipeline/drawing.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
-    "viewing/blur/recording.py:blurrable:run": lambda s: s.ingested("clip.mp4").says(
+    "extensions/render/blur/recording.py:blurrable:run": lambda s: s.ingested("clip.mp4").says(
         "render", "LOG", "--blur", "people", "-o", "c.mcap"
     ),
-    "viewing/comparing.py:find_panels:run": lambda s: s.untracked().says("render", "LOG", "--compare"),
-    "viewing/heat_map.py:_channel:run": lambda s: s.ingested("clip.mp4").says("render", "LOG", "--heatmap"),
+    "extensions/render/comparing.py:find_panels:run": lambda s: s.untracked().says("render", "LOG", "--compare"),
+    "extensions/render/heat_map.py:_channel:run": lambda s: s.ingested("clip.mp4").says("render", "LOG", "--heatmap"),
     "viewing/zones_page.py:zones_page:run": lambda s: s.ingested("truth.txt", "--as", "detections", "--fps", "10").says(
         "zones", "draw", "LOG"
     ),

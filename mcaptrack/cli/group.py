@@ -105,7 +105,6 @@ _LISTED: Final = (
     ("retrack", _STEP, _STAGE),
     ("fuse", _STEP, "running:Fuse"),
     ("models", _STEP, "models:Models"),
-    ("render", _RESULTS, "render:Render"),
     ("query", _RESULTS, "query:Query"),
     ("export", _RESULTS, "show:Export"),
     ("cut", _RESULTS, "files:Cut"),

@@ -65,7 +65,7 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares.
 _COMMANDS: Final = (
-    "ingest demo run detect motion track sample predict retrack fuse models info view render query export "
+    "ingest demo run detect motion track sample predict retrack fuse models info view query export "
     "evaluate events zones calibrate check recover cut drop doctor"
 )
 #: Kinds that only entry points name.

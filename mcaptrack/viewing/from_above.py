@@ -5,6 +5,7 @@ North (y) is up. Letters: P points.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.foxglove.views import styles
 from mcaptrack.geometry.arrays import Floats, Image
+from mcaptrack.pipeline import RobotPath
 from mcaptrack.viewing.legend import BACKGROUND
 from mcaptrack.viewing.painting import text_size
 
@@ -201,3 +203,45 @@ def _text(out: Any, content: str, at_px: Floats, rgba: Shade, sight: Sight) -> N
 
 def _paint(colour: Any, rgba: Shade) -> None:
     colour.r, colour.g, colour.b, colour.a = rgba
+
+
+# Which part of the ground is in a picture.
+
+
+#: Seen from above: the width of a video in pixels and its height as a share of it, the width in metres around a robot,
+#: the least one around places, and the margin around these as a factor.
+ABOVE_PX: Final = 960
+_HEIGHT: Final = 0.75
+_AROUND_M: Final = 80.0
+_LEAST_M: Final = 10.0
+_MARGIN: Final = 1.2
+
+
+def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: int) -> list[Sight]:
+    """The part of the ground in each picture: the surroundings of the robot, or all boxes and people of the scenes."""
+    if path is not None:
+        placed = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
+        if len(placed):
+            nearest = placed[np.abs(placed[None] - np.arange(count)[:, None]).argmin(axis=1)]
+            width, height = size_from_above(width_px)
+            return [Sight(x, y, width / _AROUND_M, width, height) for x, y in path.at_m[nearest].tolist()]
+    places = [
+        (shape.pose.position.x, shape.pose.position.y)
+        for scene in scenes
+        for entity in scene.entities
+        for shape in (*entity.cubes, *entity.cylinders)
+    ]
+    low, high = np.quantile(np.array(places), [0.01, 0.99], axis=0) if places else np.array([[-5.0, -5.0], [5.0, 5.0]])
+    return [sight_of(low, high, np.maximum((high - low) * _MARGIN, _LEAST_M), width_px)] * count
+
+
+def size_from_above(width_px: int) -> tuple[int, int]:
+    """The size of a picture that is seen from above, even numbers."""
+    return width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
+
+
+def sight_of(low: Floats, high: Floats, extent: Floats, width_px: int) -> Sight:
+    """The part of the ground in a picture that has the middle of two corners (2,), and shows an extent (2,) in m."""
+    width, height = size_from_above(width_px)
+    x, y = ((low + high) / 2).tolist()
+    return Sight(x, y, float(min(width / extent[0], height / extent[1])), width, height)

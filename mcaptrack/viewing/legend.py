@@ -13,6 +13,9 @@ from mcaptrack.foxglove.views import styles
 from mcaptrack.foxglove.views.people import ellipse_points, segments
 from mcaptrack.foxglove.views.styles import TrackStyle
 from mcaptrack.geometry.arrays import Image
+from mcaptrack.schema import DETECTIONS
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.painting import draw, put_text, text_size
 
 #: The colours of the strip and of its text: blue, green, red.
@@ -83,3 +86,16 @@ def _draw_sample(drawn: Annotations, text: str, style: TrackStyle, left: float, 
     around = np.array([[0, -1], [1, -1], [1, 1], [0, 1]]) * line * np.array([_SAMPLE * 0.9, 0.6])
     alpha = styles.opacity(np.array([text != _UNSEEN]))
     drawn.loops(_FIRST, np.add(around, [left, middle])[None], rgb, alpha, style.thickness * unit, dashes=style.dashes)
+
+
+#: How trackers are called; channels of earlier versions that name none were made by the first.
+_TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
+_FIRST_TRACKER: Final = next(iter(_TRACKERS))
+
+
+def tracker_name(provenance: Provenance | None) -> str:
+    """Return the name of the tracker of a channel, by how it was made."""
+    stage = STAGES.get(provenance.transform) if provenance else None
+    if provenance is None or stage is None or stage.reads is not DETECTIONS:
+        return "tracks as given"
+    return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")

@@ -5,13 +5,14 @@ Letters: P points.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Floats, Image
+from mcaptrack.geometry.arrays import Floats, Image, Ints
+from mcaptrack.notices import warn
 
 #: The size of text that OpenCV draws at a scale of 1, and the least one in a video.
 _TEXT_PX: Final = 24.0
@@ -133,3 +134,47 @@ def put_text(image: Image, text: str, at: tuple[int, int], size_px: float, bgr: 
 def _thickness(size: float) -> int:
     """The thickness of the lines of letters of a scale."""
     return max(1, round(size / 2))
+
+
+def scaled(image: Image, width_px: int | None) -> Image:
+    """The picture in the given width, and of even size, as video needs it."""
+    import cv2
+
+    height, width = image.shape[:2]
+    wide = width_px or width
+    size = (max(2, wide // 2 * 2), max(2, round(height * wide / width) // 2 * 2))
+    if size == (width, height):
+        return image
+    if width_px is None:
+        return np.ascontiguousarray(image[: size[1], : size[0]])
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+# Which messages and pictures.
+
+
+def message_at(
+    coming: Iterator[tuple[int, bytes]], read: Callable[[bytes], Any], held_ns: int = 0
+) -> Callable[[int], Any]:
+    """A function that reads the message at a time, for rising times, or the last one that is at most so much older.
+
+    None if there is none.
+    """
+    last: tuple[int, bytes] | None = None
+    waiting = next(coming, None)
+
+    def at(t_ns: int) -> Any:
+        nonlocal last, waiting
+        while waiting is not None and waiting[0] <= t_ns:
+            last, waiting = waiting, next(coming, None)
+        return read(last[1]) if last is not None and last[0] >= t_ns - held_ns else None
+
+    return at
+
+
+def without_repeated(times: Ints, numbers: Ints, what: str) -> Ints:
+    """Leave out pictures, or scenes, that have the time of another, with a warning."""
+    _, first_of = np.unique(times[numbers], return_index=True)
+    if len(first_of) < len(numbers):
+        warn(f"{len(numbers) - len(first_of)} {what} have the time of another and are left out", "left-out")
+    return np.asarray(numbers[first_of], np.int64)

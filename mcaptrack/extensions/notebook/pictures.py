@@ -32,9 +32,8 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing import from_above
-from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.painting import CLOSED, draw, strokes
-from mcaptrack.viewing.rendering import message_at, scaled, sights, without_repeated
+from mcaptrack.viewing.from_above import Sight, sights
+from mcaptrack.viewing.painting import CLOSED, draw, message_at, scaled, strokes, without_repeated
 
 #: The largest width of a player and of a still in pixels, unless it is given.
 PLAYER_PX: Final = 640

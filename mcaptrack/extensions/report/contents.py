@@ -46,8 +46,8 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing.background import SceneBackground, background_picture, moment_picture
 from mcaptrack.viewing.charts import POINTS, Axis, Floats, Line, figure, line_chart, round_most
-from mcaptrack.viewing.comparing import tracker_name
 from mcaptrack.viewing.formatting import NONE, clock, number, plain, short
+from mcaptrack.viewing.legend import tracker_name
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {

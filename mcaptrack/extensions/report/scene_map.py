@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.evaluation.occupancy import occupancy
 from mcaptrack.extensions.report.statistics import rows_by_track
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.foxglove.views.people import ellipse_points, ellipses
@@ -22,7 +23,6 @@ from mcaptrack.schema import Frame, Rows
 from mcaptrack.viewing.background import SceneBackground
 from mcaptrack.viewing.charts import round_step
 from mcaptrack.viewing.formatting import number
-from mcaptrack.viewing.heat_map import occupancy
 
 #: The largest number of points of a map, so that the page stays small.
 _MAX_POINTS: Final = 6000

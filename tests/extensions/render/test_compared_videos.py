@@ -12,14 +12,15 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log, notices
+from mcaptrack.evaluation.occupancy import Occupancy
+from mcaptrack.extensions.render import comparing, heat_map
 from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.viewing import comparing, from_above, heat_map
-from mcaptrack.viewing.heat_map import Occupancy
+from mcaptrack.viewing import from_above
 from tests.commands import call, printed
 from tests.logs import write_with_views
 from tests.worlds import ns

@@ -17,13 +17,13 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 import mcaptrack
 from mcaptrack import foxglove, log, notices
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.render.blur.people import outlines
 from mcaptrack.foxglove.views import Drawing, MovingCamera
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.viewing.blur.people import outlines
 from tests.logs import write_with_views
 from tests.worlds import ns
 

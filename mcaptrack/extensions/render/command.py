@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from mcaptrack.api.rendering import default_suffix
 from mcaptrack.cli import common
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import counted
+from mcaptrack.extensions.render.api import default_suffix
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:

@@ -18,6 +18,8 @@ from mcap.well_known import MessageEncoding
 
 from mcaptrack import __version__, foxglove, log
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.extensions.render.blur.people import HiddenPeople, hide
+from mcaptrack.extensions.render.video import rate_of
 from mcaptrack.geometry.arrays import Bools, Image
 from mcaptrack.notices import warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of
@@ -28,8 +30,6 @@ from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import H264Encoder, encode_image
 from mcaptrack.sources.video.pixels import raw_with
-from mcaptrack.viewing.blur.people import HiddenPeople, hide
-from mcaptrack.viewing.rendering import rate_of
 
 #: The key of the metadata of a channel with replaced pictures.
 BLURRED: Final = "mcaptrack.blurred"

@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.render.video import RenderOptions, render
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.legend import with_legend
-from mcaptrack.viewing.painting import draw
-from mcaptrack.viewing.rendering import RenderOptions, message_at, render
+from mcaptrack.viewing.painting import draw, message_at
 from tests.commands import call, printed
 from tests.robots import write_log
 

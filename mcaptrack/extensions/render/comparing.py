@@ -18,32 +18,30 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import describe
-from mcaptrack.foxglove import views
-from mcaptrack.geometry.arrays import Image, Ints
-from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.pipeline import RobotPath
-from mcaptrack.schema import DETECTIONS, EVENTS, TRACKS, EventKind
-from mcaptrack.schema.framing import frame_times, joined_parts
-from mcaptrack.schema.provenance import Provenance
-from mcaptrack.schema.resampling import interval_ns
-from mcaptrack.sources.cameras import provenance_of
-from mcaptrack.sources.pictures import Pictures
-from mcaptrack.sources.video import write_clip
-from mcaptrack.transforms import FULL, STAGES
-from mcaptrack.viewing.legend import BACKGROUND, INK
-from mcaptrack.viewing.painting import draw, put_text, text_size
-from mcaptrack.viewing.rendering import (
+from mcaptrack.extensions.render.video import (
     RenderOptions,
     SceneDrawing,
     empty_ground,
     pictures_of_video,
     rate_of,
-    scaled,
     scene_times,
     scenes_of,
-    sights,
     views_at,
 )
+from mcaptrack.foxglove import views
+from mcaptrack.geometry.arrays import Image, Ints
+from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.pipeline import RobotPath
+from mcaptrack.schema import EVENTS, TRACKS, EventKind
+from mcaptrack.schema.framing import frame_times, joined_parts
+from mcaptrack.schema.resampling import interval_ns
+from mcaptrack.sources.cameras import provenance_of
+from mcaptrack.sources.pictures import Pictures
+from mcaptrack.sources.video import write_clip
+from mcaptrack.transforms import FULL
+from mcaptrack.viewing.from_above import sights
+from mcaptrack.viewing.legend import BACKGROUND, INK, tracker_name
+from mcaptrack.viewing.painting import draw, put_text, scaled, text_size
 
 #: The largest width of a comparison in pixels, unless one is given.
 _WIDTH_PX: Final = 1920
@@ -73,22 +71,6 @@ class _Happened(NamedTuple):
     is_switch: list[bool]
     born_ns: Ints
     is_compared: bool
-
-
-# Names of trackers, in reports and videos.
-
-
-#: How trackers are called; channels of earlier versions that name none were made by the first.
-_TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
-_FIRST_TRACKER: Final = next(iter(_TRACKERS))
-
-
-def tracker_name(provenance: Provenance | None) -> str:
-    """Return the name of the tracker of a channel, by how it was made."""
-    stage = STAGES.get(provenance.transform) if provenance else None
-    if provenance is None or stage is None or stage.reads is not DETECTIONS:
-        return "tracks as given"
-    return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
 
 def find_panels(opened: log.Log, prefix: str, pictures: str | None) -> list[Panel]:

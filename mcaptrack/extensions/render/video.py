@@ -7,7 +7,7 @@ Letters: P points.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -15,29 +15,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack import log, notices
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.render.blur.people import HiddenPeople, hide
 from mcaptrack.foxglove.views.ground import lifetime_ns
-from mcaptrack.geometry.arrays import Floats, Image, Ints
+from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.pipeline import RobotPath
 from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
-from mcaptrack.viewing.blur.people import HiddenPeople, hide
-from mcaptrack.viewing.from_above import Sight
+from mcaptrack.viewing.from_above import ABOVE_PX, Sight, sights
 from mcaptrack.viewing.legend import with_legend
-from mcaptrack.viewing.painting import draw
+from mcaptrack.viewing.painting import draw, message_at, scaled, without_repeated
 
 _GIF_FPS: Final = 10.0
-#: Seen from above: the width of a video in pixels and its height as a share of it, the width in metres around a robot,
-#: the least one around places, and the margin around these as a factor.
-ABOVE_PX: Final = 960
-_HEIGHT: Final = 0.75
-_AROUND_M: Final = 80.0
-_LEAST_M: Final = 10.0
-_MARGIN: Final = 1.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,36 +201,6 @@ class SceneDrawing:
         return image
 
 
-def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: int) -> list[Sight]:
-    """The part of the ground in each picture: the surroundings of the robot, or all boxes and people of the scenes."""
-    if path is not None:
-        placed = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
-        if len(placed):
-            nearest = placed[np.abs(placed[None] - np.arange(count)[:, None]).argmin(axis=1)]
-            width, height = size_from_above(width_px)
-            return [Sight(x, y, width / _AROUND_M, width, height) for x, y in path.at_m[nearest].tolist()]
-    places = [
-        (shape.pose.position.x, shape.pose.position.y)
-        for scene in scenes
-        for entity in scene.entities
-        for shape in (*entity.cubes, *entity.cylinders)
-    ]
-    low, high = np.quantile(np.array(places), [0.01, 0.99], axis=0) if places else np.array([[-5.0, -5.0], [5.0, 5.0]])
-    return [sight_of(low, high, np.maximum((high - low) * _MARGIN, _LEAST_M), width_px)] * count
-
-
-def size_from_above(width_px: int) -> tuple[int, int]:
-    """The size of a picture that is seen from above, even numbers."""
-    return width_px // 2 * 2, max(2, round(width_px * _HEIGHT) // 2 * 2)
-
-
-def sight_of(low: Floats, high: Floats, extent: Floats, width_px: int) -> Sight:
-    """The part of the ground in a picture that has the middle of two corners (2,), and shows an extent (2,) in m."""
-    width, height = size_from_above(width_px)
-    x, y = ((low + high) / 2).tolist()
-    return Sight(x, y, float(min(width / extent[0], height / extent[1])), width, height)
-
-
 def check_suffix(output: Path) -> None:
     """Raise McaptrackError for a name that is not that of a video."""
     if output.suffix.lower() not in (".mp4", ".gif"):
@@ -259,14 +222,6 @@ def chosen_pictures(opened: log.Log, times: Ints, what: str, output: Path, optio
         period = f"the {what} are from 0 to {(int(times[-1]) - int(times[0])) / NS_PER_S:.3f} s"
         raise McaptrackError(f"{opened.path} has no {what[:-1]} between {options.start_s:g} s and {end}; {period}")
     return numbers
-
-
-def without_repeated(times: Ints, numbers: Ints, what: str) -> Ints:
-    """Leave out pictures, or scenes, that have the time of another, with a warning."""
-    _, first_of = np.unique(times[numbers], return_index=True)
-    if len(first_of) < len(numbers):
-        notices.warn(f"{len(numbers) - len(first_of)} {what} have the time of another and are left out", "left-out")
-    return np.asarray(numbers[first_of], np.int64)
 
 
 def rate_of(t_ns: Ints) -> Fraction:
@@ -291,36 +246,3 @@ def views_at(
         )
         for topic in topics
     ]
-
-
-def message_at(
-    coming: Iterator[tuple[int, bytes]], read: Callable[[bytes], Any], held_ns: int = 0
-) -> Callable[[int], Any]:
-    """A function that reads the message at a time, for rising times, or the last one that is at most so much older.
-
-    None if there is none.
-    """
-    last: tuple[int, bytes] | None = None
-    waiting = next(coming, None)
-
-    def at(t_ns: int) -> Any:
-        nonlocal last, waiting
-        while waiting is not None and waiting[0] <= t_ns:
-            last, waiting = waiting, next(coming, None)
-        return read(last[1]) if last is not None and last[0] >= t_ns - held_ns else None
-
-    return at
-
-
-def scaled(image: Image, width_px: int | None) -> Image:
-    """The picture in the given width, and of even size, as video needs it."""
-    import cv2
-
-    height, width = image.shape[:2]
-    wide = width_px or width
-    size = (max(2, wide // 2 * 2), max(2, round(height * wide / width) // 2 * 2))
-    if size == (width, height):
-        return image
-    if width_px is None:
-        return np.ascontiguousarray(image[: size[1], : size[0]])
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

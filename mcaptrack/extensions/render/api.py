@@ -50,6 +50,8 @@ class RenderResult:
 
 
 @declared(
+    heading="Results",
+    printed_by="mcaptrack.extensions.render.command:Render",
     most_used=("output", "topic", "compare", "heatmap", "blur", "width", "start_s", "end_s", "force"),
 )
 def render(
@@ -144,12 +146,12 @@ def render(
     from mcaptrack import log as logs
     from mcaptrack import pipeline
     from mcaptrack.api.common import log_location, names_of, optional_path, warn_unused, warnings_about
+    from mcaptrack.extensions.render import comparing, video
+    from mcaptrack.extensions.render.blur.recording import blurrable, write_blurred_log
+    from mcaptrack.extensions.render.heat_map import draw_heat_map
     from mcaptrack.files import is_same_file, refuse_overwrite
     from mcaptrack.location import local_name
     from mcaptrack.sources.cameras import camera_at
-    from mcaptrack.viewing import comparing, rendering
-    from mcaptrack.viewing.blur.recording import blurrable, write_blurred_log
-    from mcaptrack.viewing.heat_map import draw_heat_map
 
     path = log_location(log)
     refuse_both(compare=compare, heatmap=heatmap, blur=blur is not None)
@@ -161,7 +163,7 @@ def render(
     if is_log and blur is None:
         raise McaptrackError(f"{target}: a log is written only with `blur=`; a video is rendered to .mp4 or .gif")
     refuse_overwrite(target, force)
-    options = rendering.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
+    options = video.RenderOptions(width_px=width, max_fps=max_fps, start_s=start_s, end_s=end_s)
     views: Sequence[str] = ()
     blurred: Sequence[str] = ()
     with warnings_about(path) as warnings, ExitStack() as stack:
@@ -179,7 +181,7 @@ def render(
             pictures = _one_of(opened, list(hidden), camera)
             if topic:
                 views = pipeline.find_views(opened, pipeline.find_camera(opened, camera), names_of(topic)).views
-            count = rendering.render(opened, pictures, views, target, options, progress, hidden[pictures])
+            count = video.render(opened, pictures, views, target, options, progress, hidden[pictures])
             blurred = (pictures,)
         else:
             prefix = pipeline.find_camera(opened, camera)
@@ -198,9 +200,9 @@ def render(
                 views, pictures = pipeline.find_views(opened, prefix, names_of(topic))
                 follow = partial(pipeline.robot_path, opened, prefix, views[0])
                 if pictures:
-                    count = rendering.render(opened, pictures, views, target, options, progress)
+                    count = video.render(opened, pictures, views, target, options, progress)
                 else:
-                    count = rendering.render_from_above(opened, views, target, options, follow, progress)
+                    count = video.render_from_above(opened, views, target, options, follow, progress)
     return RenderResult(path, target, count, tuple(views), tuple(dict.fromkeys(warnings)), tuple(blurred))
 
 

@@ -19,12 +19,12 @@ from mcap_ros2.decoder import DecoderFactory
 
 import mcaptrack
 from mcaptrack import foxglove, log
+from mcaptrack.extensions.render.blur.people import hide
+from mcaptrack.extensions.render.blur.recording import picture_replacer
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.sources.foreign import MessageType, picture_decoder
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.viewing.blur.people import hide
-from mcaptrack.viewing.blur.recording import picture_replacer
 from tests.commands import call, printed
 from tests.logs import add_rows
 from tests.robots import write_log
