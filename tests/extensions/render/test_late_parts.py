@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import av
+import numpy as np
 
 from mcaptrack import log
 from mcaptrack.extensions.render import video
