@@ -50,6 +50,7 @@ _WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
 class _Contents:
     """The contents of a log for viewers: its files, layouts by name (name of the file, content), events, and the time
     at which viewers open. ``views`` are what players show: a name, the camera, and whether it is seen from above.
+    ``pages`` stand beside them.
     """
 
     path: Path
@@ -57,6 +58,7 @@ class _Contents:
     layouts: Mapping[str, tuple[str, Path | bytes]]
     events: Sequence[LinkedEvent]
     views: Sequence[tuple[str, str, bool]]
+    pages: Mapping[str, LogPage]
     rerun: str
     start_ns: int
     at_ns: int
@@ -89,17 +91,18 @@ class _FromLog:
                 return render("nothing.html", text=str(error)).encode()
 
 
-def _page_names() -> list[str]:
-    """The names of the pages beside the player: those of entry points, and our own."""
-    return [name for name in (*others("page"), *BUILT_IN["page"]) if re.fullmatch(r"\w[\w-]*", name)]
-
-
-def _log_page(name: str) -> LogPage:
-    """A page by its name. Raises McaptrackError if that of another package can't be made."""
-    entry = find("page", name)
-    with blamed(entry, "could not be made") if not entry.is_built_in else nullcontext():
-        page: LogPage = entry.cls()
-    return page if entry.is_built_in else page._replace(make=partial(_made_by, entry, page.make))
+def _log_pages() -> dict[str, LogPage]:
+    """The pages beside the player by name: those of entry points, and our own. One that can't be made is left out."""
+    pages: dict[str, LogPage] = {}
+    for name in (*others("page"), *BUILT_IN["page"]):
+        try:
+            entry = find("page", name)
+            with blamed(entry, "could not be made") if not entry.is_built_in else nullcontext():
+                page: LogPage = entry.cls()
+                pages[name] = page if entry.is_built_in else page._replace(make=partial(_made_by, entry, page.make))
+        except McaptrackError as error:
+            warn(str(error), "left-out")
+    return {name: page for name, page in pages.items() if re.fullmatch(r"\w[\w-]*", name)}
 
 
 def _made_by(entry: Entry, make: Callable[[logs.Log], bytes], opened: logs.Log) -> bytes:
@@ -206,8 +209,7 @@ class LogServer:
         for number, (_, camera, is_above) in enumerate(contents.views):
             player = log_player().page(camera, is_above)
             pages[f"{_FOLDER}/player-{number}.html"] = Page(made(player.make), player.policy)
-        for name in _page_names():
-            page = _log_page(name)
+        for name, page in contents.pages.items():
             pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
         for name in tables.TABLES:
             pages[f"{_FOLDER}/{name}.csv"] = Page(made(partial(_csv, name)), kind="text/csv; charset=utf-8")
@@ -235,7 +237,7 @@ class LogServer:
                 {"name": name, "address": f"{place}player-{number}.html"}
                 for number, (name, *_) in enumerate(contents.views)
             ],
-            "pages": {name: f"{place}{name}.html" for name in _page_names()},
+            "pages": {name: f"{place}{name}.html" for name in contents.pages},
             "best": links.best_tracks(contents.events),
             "events": [
                 {
@@ -389,7 +391,7 @@ def view(
                 f"{path}: whoever reaches this machine at {host} can read the log and all that is made of it", "shared"
             )
         contents = _Contents(
-            path, files, layouts, events, _views(shown), _without_rerun(opened), opened.start_ns, at_ns,
+            path, files, layouts, events, _views(shown), _log_pages(), _without_rerun(opened), opened.start_ns, at_ns,
             tuple(notes), tuple(dict.fromkeys(warnings)),
         )  # fmt: skip
         server = LogServer(contents, port, host, lichtblick, stack.pop_all() if shown is not opened else None)
