@@ -529,7 +529,7 @@ def test_a_class_of_a_package_prints_for_its_command(site):
 @pytest.mark.parametrize("breaks", [False, True])
 def test_a_page_of_a_package_stands_beside_the_player_and_one_that_breaks_is_left_out(site, tracked, breaks):
     code = "from mcaptrack.viewing.serving import LogPage\ndef Part():\n    return LogPage(lambda opened: opened.path.name.encode(), '')\n"
-    add(site, "page", "name-of-it", code.replace("return", "1 / 0") if breaks else code)
+    add(site, "page", "name-of-it", code.replace("return", "return 1 / 0 and") if breaks else code)
     with mcaptrack.view("a.mcap", port=0) as server:
         index = urlopen(server.address).read().decode()
         assert ('"page-name-of-it"' in index) is not breaks
