@@ -16,6 +16,7 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import find_topic
+from tests.commands import LACKS
 
 
 def _results(path: Path) -> dict[str, tuple[int, ...]]:
