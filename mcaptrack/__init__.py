@@ -1,6 +1,6 @@
 """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 __version__ = "0.3.0.dev0"
@@ -44,15 +44,19 @@ def _lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], object]
 
     def imported(name: str) -> object:
         if name not in modules:
-            from mcaptrack.errors import did_you_mean
-
-            meant = f"; {did_you_mean(name, modules)}".rstrip("; ")
-            raise AttributeError(f"module {package!r} has no attribute {name!r}{meant}")
+            raise _unknown(package, name, modules)
         from importlib import import_module
 
         return getattr(import_module(modules[name]), name)
 
     return imported
+
+
+def _unknown(package: str, name: str, names: Iterable[str]) -> AttributeError:
+    from mcaptrack.errors import did_you_mean
+
+    meant = f"; {did_you_mean(name, names)}".rstrip("; ")
+    return AttributeError(f"module {package!r} has no attribute {name!r}{meant}")
 
 
 _imported = _lazily(__name__, _MODULES)  # `import mcaptrack` stays light
@@ -72,11 +76,12 @@ def __getattr__(name: str) -> object:
     from mcaptrack.installed import missing_extension
     from mcaptrack.registry import find
 
-    if kind := _of_entry_points().get(name):
-        return find(kind, name).cls
+    kinds = _of_entry_points()
+    if name in kinds:
+        return find(kinds[name], name).cls
     if text := missing_extension(name):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}: {text}")
-    return _imported(name)
+    raise _unknown(__name__, name, [*_MODULES, *kinds])
 
 
 def _of_entry_points(*, own: bool = False) -> dict[str, Any]:

@@ -14,11 +14,15 @@ from typing import Any, NamedTuple
 import pytest
 from typer.main import get_command
 
+import mcaptrack
 from mcaptrack.api.running import RunResult
 from mcaptrack.cli import app
 from tests.worlds import write_clip
 
 GROUP = get_command(app)
+_STUB = Path(mcaptrack.__file__).with_name("__init__.pyi").read_text()
+#: Names that the package lacks because extensions were taken away (tools/without.py); none, usually.
+LACKS = {*re.findall(r"^from mcaptrack\.extensions\.\S+ import (\w+)", _STUB, re.M)} - {*mcaptrack.__all__}
 #: Commands that change no file except the one that -o names.
 ONLY_READ = ("check", "docs", "doctor", "evaluate", "info", "query", "view")
 

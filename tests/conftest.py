@@ -20,10 +20,8 @@ from mcaptrack import log
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from tests import bounded
-from tests.commands import done, made_log
+from tests.commands import LACKS, done, made_log
 from tests.worlds import small_scene
-
-STUB = Path(mcaptrack.__file__).with_name("__init__.pyi")
 
 # The same examples each time, so that a failure comes from a change; `--hypothesis-profile search` tries many new ones.
 settings.register_profile(
@@ -46,10 +44,6 @@ def pytest_collection_finish() -> None:
     """Spare what was loaded and collected: it stays until the end, and searching it for cycles again takes long."""
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
-
-
-#: Names that the package lacks because extensions were taken away (tools/without.py); none, usually.
-LACKS = set(re.findall(r"^from mcaptrack\.extensions\.\S+ import (\w+)", STUB.read_text(), re.M)) - {*mcaptrack.__all__}
 
 
 @pytest.hookimpl(wrapper=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.parse import urljoin
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -521,6 +524,29 @@ def test_a_class_of_a_package_prints_for_its_command(site):
     (site / "another.py").write_text(code.replace("another:Printer", "another:Lost"))
     sys.modules.pop("another")
     assert "command odd (another 2.0): another has no class Lost" in one_line("odd")
+
+
+@pytest.mark.parametrize("breaks", [False, True])
+def test_a_page_of_a_package_stands_beside_the_player_and_one_that_breaks_is_left_out(site, tracked, breaks):
+    code = "from mcaptrack.viewing.serving import LogPage\ndef Part():\n    return LogPage(lambda opened: opened.path.name.encode(), '')\n"
+    add(site, "page", "name-of-it", code.replace("return", "return 1 / 0 and") if breaks else code)
+    with mcaptrack.view("a.mcap", port=0) as server:
+        index = urlopen(server.address).read().decode()
+        assert ('"page-name-of-it"' in index) is not breaks
+        if not breaks:
+            (address,) = re.findall(r'"name-of-it":"([^"]+)"', index)
+            assert urlopen(urljoin(server.address, address)).read() == b"a.mcap"
+    said = [notice.message for notice in server.warnings if notice.code == "left-out"]
+    assert said == (
+        ["page name-of-it (another 2.0) could not be made: ZeroDivisionError: division by zero (another.py, line 3)"]
+        if breaks
+        else []
+    )
+
+
+def test_a_name_that_is_not_there_proposes_one_of_an_extension():
+    with pytest.raises(AttributeError, match="did you mean report"):
+        mcaptrack.reprot  # noqa: B018
 
 
 def test_names_of_extensions_and_of_the_core_are_not_replaced(site):

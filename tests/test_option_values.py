@@ -23,7 +23,7 @@ from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.many import ManyOptions
 from mcaptrack.cli.settings import Setting
 from mcaptrack.errors import McaptrackError
-from tests.commands import GROUP, Terminal, call, done
+from tests.commands import GROUP, LACKS, Terminal, call, done
 
 
 @pytest.fixture
@@ -238,7 +238,7 @@ def test_tables_of_two_logs_of_one_name_are_not_written_to_one_folder(folder, as
     assert (call("export", *words).code, call("export", *words).err.count("\n")) == (1, 1)
 
 
-@pytest.mark.parametrize("command", [*OF_FUNCTIONS, "tune", "view", "query", "info", "check"])
+@pytest.mark.parametrize("command", sorted({*OF_FUNCTIONS, "tune", "view", "query", "info", "check"} - LACKS))
 def test_notes_are_printed_unless_quiet_and_details_with_verbose(command, folder, monkeypatch):
     def called(*_: Any, **__: Any) -> None:
         logging.getLogger("mcaptrack").info("a note")

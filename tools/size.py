@@ -52,15 +52,21 @@ def main() -> None:
     for path in (ROOT / "mcaptrack").rglob("*.py"):
         inside = path.relative_to(ROOT / "mcaptrack").parts
         room = inside[0] if len(inside) > 1 else "(top)"
+        room = "/".join(inside[:2]) if room == "extensions" and len(inside) > 2 else room
         lines[room] += code_lines(path.read_text())
         files[room] += 1
-    print(f"{'room':<14}{'code lines':>12}{'files':>8}")
-    for room, count in [*lines.most_common(), ("all", lines.total())]:
-        print(f"{room:<14}{count:>12}{files[room] or files.total():>8}")
+    print(f"{'room':<24}{'code lines':>12}{'files':>8}")
+    for is_extension in (False, True):
+        rooms = [room for room, _ in lines.most_common() if room.startswith("extensions") is is_extension]
+        for room in rooms:
+            print(f"{room:<24}{lines[room]:>12}{files[room]:>8}")
+        name = "all extensions" if is_extension else "the core"
+        print(f"{name:<24}{sum(lines[room] for room in rooms):>12}{sum(files[room] for room in rooms):>8}")
+    print(f"{'all':<24}{lines.total():>12}{files.total():>8}")
     for folder in ("tests", "tools"):
         sources = [path.read_text() for path in (ROOT / folder).rglob("*.py")]
         every_line = sum(len(source.splitlines()) for source in sources)
-        print(f"{folder:<14}{sum(map(code_lines, sources)):>12}{len(sources):>8}   ({every_line} lines with text)")
+        print(f"{folder:<24}{sum(map(code_lines, sources)):>12}{len(sources):>8}   ({every_line} lines with text)")
     shown, hidden = options()["shown"], options()["hidden"]
     print(f"options: {shown + hidden}, {hidden} of them hidden")
 

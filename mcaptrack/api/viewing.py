@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, Self, TypeVar
+from typing import Annotated, Any, Final, Self
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline, tables
@@ -25,15 +25,13 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
-from mcaptrack.registry import BUILT_IN, Entry, blamed, find, names, others
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, find, names, others
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.tables import export
 from mcaptrack.viewing import links
 from mcaptrack.viewing.formatting import policy, render
 from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, viewer_links
 from mcaptrack.viewing.serving import LOOPBACK, LogPage, Page, Server, WebViewer, log_player
-
-_T = TypeVar("_T")
 
 #: Headings in the help.
 _OPENED: Final = "What is opened"
@@ -50,7 +48,7 @@ _WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
 class _Contents:
     """The contents of a log for viewers: its files, layouts by name (name of the file, content), events, and the time
     at which viewers open. ``views`` are what players show: a name, the camera, and whether it is seen from above.
-    ``viewers`` says why other viewers on the web can't open the log, by their names; "" if they can.
+    ``pages`` stand beside them. ``viewers`` are other viewers on the web, each with why it can't open the log, or "".
     """
 
     path: Path
@@ -58,7 +56,8 @@ class _Contents:
     layouts: Mapping[str, tuple[str, Path | bytes]]
     events: Sequence[LinkedEvent]
     views: Sequence[tuple[str, str, bool]]
-    viewers: Mapping[str, str]
+    pages: Mapping[str, LogPage]
+    viewers: Mapping[str, tuple[WebViewer, str]]
     start_ns: int
     at_ns: int
     notes: tuple[str, ...] = ()
@@ -90,28 +89,21 @@ class _FromLog:
                 return render("nothing.html", text=str(error)).encode()
 
 
-def _page_names() -> list[str]:
-    """The names of the pages beside the player: those of entry points, and our own."""
-    return [name for name in (*others("page"), *BUILT_IN["page"]) if re.fullmatch(r"\w[\w-]*", name)]
+def _parts(kind: Kind) -> dict[str, Any]:
+    """The pages, or viewers, by name: those of entry points, and our own. One that can't be made is left out."""
+    parts: dict[str, Any] = {}
+    for name in (*others(kind), *BUILT_IN[kind]):
+        try:
+            entry = find(kind, name)
+            with blamed(entry, "could not be made"):
+                part = entry.cls()
+                parts[name] = part._replace(make=partial(_made_by, entry, part.make))
+        except McaptrackError as error:
+            warn(str(error), "left-out")
+    return {name: part for name, part in parts.items() if re.fullmatch(r"\w[\w-]*", name)}
 
 
-def _log_page(name: str) -> LogPage:
-    """A page by its name. Raises McaptrackError if that of another package can't be made."""
-    entry = find("page", name)
-    with blamed(entry, "could not be made"):
-        page: LogPage = entry.cls()
-    return page._replace(make=partial(_made_by, entry, page.make))
-
-
-def _web_viewer(name: str) -> WebViewer:
-    """A viewer on the web by its name. Raises McaptrackError if that of another package can't be made."""
-    entry = find("viewer", name)
-    with blamed(entry, "could not be made"):
-        viewer: WebViewer = entry.cls()
-    return viewer._replace(make=partial(_made_by, entry, viewer.make), why_not=partial(_made_by, entry, viewer.why_not))
-
-
-def _made_by(entry: Entry, make: Callable[[logs.Log], _T], opened: logs.Log) -> _T:
+def _made_by(entry: Entry, make: Callable[[logs.Log], bytes], opened: logs.Log) -> bytes:
     with blamed(entry, "failed"):
         return make(opened)
 
@@ -208,14 +200,12 @@ class LogServer:
         for number, (_, camera, is_above) in enumerate(contents.views):
             player = log_player().page(camera, is_above)
             pages[f"{_FOLDER}/player-{number}.html"] = Page(made(player.make), player.policy)
-        for name in _page_names():
-            page = _log_page(name)
+        for name, page in contents.pages.items():
             pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
         for name in tables.TABLES:
             pages[f"{_FOLDER}/{name}.csv"] = Page(made(partial(_csv, name)), kind="text/csv; charset=utf-8")
-        for name, why_not in contents.viewers.items():
+        for viewer, why_not in contents.viewers.values():
             if not why_not:
-                viewer = _web_viewer(name)
                 file = Page(made(viewer.make), kind="application/octet-stream", is_shared=True)
                 pages[contents.path.stem + viewer.end] = file
         return pages
@@ -225,8 +215,7 @@ class LogServer:
         offline = "needs a connection to the internet, and gets the log from this machine"
         linked = [
             (name, "" if why_not else viewer.link(self._server.address(contents.path.stem + viewer.end)), why_not)
-            for name, why_not in contents.viewers.items()
-            for viewer in [_web_viewer(name)]
+            for name, (viewer, why_not) in contents.viewers.items()
         ]
         viewers = [
             {"name": name, "address": address, "about": about or f"{name} {offline}"}
@@ -244,7 +233,7 @@ class LogServer:
                 {"name": name, "address": f"{place}player-{number}.html"}
                 for number, (name, *_) in enumerate(contents.views)
             ],
-            "pages": {name: f"{place}{name}.html" for name in _page_names()},
+            "pages": {name: f"{place}{name}.html" for name in contents.pages},
             "best": links.best_tracks(contents.events),
             "events": [
                 {
@@ -398,8 +387,9 @@ def view(
                 f"{path}: whoever reaches this machine at {host} can read the log and all that is made of it", "shared"
             )
         contents = _Contents(
-            path, files, layouts, events, _views(shown),
-            {name: _web_viewer(name).why_not(opened) for name in names("viewer")}, opened.start_ns, at_ns,
+            path, files, layouts, events, _views(shown), _parts("page"),
+            {name: (viewer, viewer.why_not(opened)) for name, viewer in _parts("viewer").items()},
+            opened.start_ns, at_ns,
             tuple(notes), tuple(dict.fromkeys(warnings)),
         )  # fmt: skip
         server = LogServer(contents, port, host, lichtblick, stack.pop_all() if shown is not opened else None)
