@@ -12,7 +12,7 @@ from mcaptrack import notices
 
 #: Intervals are wider than 90 % of the worlds by this share of the median on both sides, for what worlds get wrong
 #: alike. (Chosen on drawn scenes.)
-WIDER: Final = 0.04
+WIDER: Final = 0.06
 #: There are no intervals for fewer people, where more than this share of tracks begin in the middle of the seen area,
 #: and where some worlds have so many times more people than others.
 _FEW, _LATE, _APART = 10, 0.5, 3.0

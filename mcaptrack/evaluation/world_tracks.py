@@ -29,7 +29,7 @@ _BORDER_M, _BORDER_S, _BORDER_FRAMES = 0.5, 1.0, 2
 #: The motion at an end is that of so many samples.
 _SAMPLES: Final = 3
 #: Another track may go on after so many seconds, no farther away than by this speed and distance.
-_GOES_ON_S, _GOES_ON_M_PER_S, _GOES_ON_M = 60.0, 2.0, 1.5
+_GOES_ON_S, _GOES_ON_M_PER_S, _GOES_ON_M = 30.0, 2.0, 1.5
 #: Worlds are drawn with this seed and their number.
 _SEED: Final = 2012
 
@@ -148,6 +148,10 @@ class _Seen(NamedTuple):
         return out
 
 
+#: The track, the frame, the samples before and after, and the share of rows.
+_Rows = tuple[Ints, Ints, Ints, Ints, Floats]
+
+
 class _World:
     """A world: its samples (N,) ordered by track and frame, and what is drawn about the ends of its tracks (T,)."""
 
@@ -188,8 +192,8 @@ class _World:
         goes_on, root = self._joined(self.rng.random(len(self.names)) < go_on)
         begins, ends = self.begins & (root == np.arange(len(root))), self.ends & ~goes_on
         rows = np.arange(len(self.frame))
-        parts = [(root[self.of], self.frame, rows, rows, np.zeros(len(rows)))]
-        parts += [
+        parts = [
+            (root[self.of], self.frame, rows, rows, np.zeros(len(rows))),
             self._unseen(begins, self.first, self.before_begin, -1, root),
             self._unseen(ends, self.last, self.after_end, 1, root),
             self._never_seen(late, go_on),
@@ -220,10 +224,7 @@ class _World:
         order = np.argsort(cost, kind="stable")
         before, after = before[order], after[order]
         while len(before):  # the best of all, and of those that are left
-            best = np.zeros((2, len(before)), bool)
-            for of, side in zip(best, (before, after), strict=True):
-                of[np.unique(side, return_index=True)[1]] = True
-            chosen = best.all(axis=0)
+            chosen = np.intersect1d(np.unique(before, return_index=True)[1], np.unique(after, return_index=True)[1])
             root[after[chosen]] = before[chosen]
             goes_on[before[chosen]] = True
             left = ~np.isin(before, before[chosen]) & ~np.isin(after, after[chosen])
@@ -232,14 +233,14 @@ class _World:
             root = root[root]
         return goes_on, root
 
-    def _unseen(self, which: Bools, end: Ints, inner: Ints, way: int, root: Ints) -> tuple[Ints, ...]:
+    def _unseen(self, are: Bools, end: Ints, inner: Ints, way: int, root: Ints) -> _Rows:
         """The rows before or after some ends of tracks: one is anywhere within a gap as tracks have that go on."""
-        which = np.flatnonzero(which)
+        which = np.flatnonzero(are)
         gaps = np.diff(self.frame)[np.diff(self.of) == 0] - 1
         gaps = gaps[gaps > 0]
         if not len(gaps):
             which = which[:0]
-        steps = self.rng.choice(gaps, len(which), p=gaps / gaps.sum()) if len(which) else which
+        steps = self.rng.choice(gaps, len(which)) if len(which) else which
         at, to = end[which], inner[which]
         room = self.frame[at] if way < 0 else len(self.s) - 1 - self.frame[at]
         steps = np.minimum(np.round(steps * self.rng.random(len(which))).astype(np.int64), room)
@@ -252,7 +253,7 @@ class _World:
         inside = _Seen.inside(self.planes, places) > 0
         return track[inside], frame[inside], at[inside], to[inside], share[inside]
 
-    def _never_seen(self, late: float, go_on: float) -> tuple[Ints, ...]:
+    def _never_seen(self, late: float, go_on: float) -> _Rows:
         """The rows of people who were never tracked: such as those who were seen late or lost, at other times."""
         middle = self.depth > _BORDER_M + _BORDER_S * self._usual_speed()
         share = min(late / max(float(middle.mean()) if len(middle) else 0.0, 0.2), 0.9)
