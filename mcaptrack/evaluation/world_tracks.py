@@ -141,7 +141,7 @@ class _Seen(NamedTuple):
 
     @staticmethod
     def inside(planes: Floats, xy_m: Floats) -> Floats:
-        """How far places (N, 2) are from the border, below 0 outside."""
+        """The distance of places (N, 2) from the border, below 0 outside."""
         out = np.full(len(xy_m), np.inf)
         for x, y, offset in planes:
             out = np.minimum(out, -(x * xy_m[:, 0] + y * xy_m[:, 1] + offset))

@@ -189,8 +189,8 @@ class Database:
         """The answer of one SELECT from ``tracks`` in the worlds of re-tracking, an Arrow table.
 
         Each number has its median, and in ``NAME_from`` and ``NAME_to`` an interval of 90 %. Rows are told apart by
-        their texts and times; ``worlds`` says in how many worlds a row is. A whole number counts as 0 in others. The
-        number of people has no interval.
+        their texts and times; ``worlds`` says in how many worlds a row is. A whole number counts as 0 in others.
+        Intervals are null where the log can't tell, and for numbers of pairs of tracks.
 
         Raises McaptrackError for errors of DuckDB, queries that worlds don't change, and logs without worlds.
         """
