@@ -19,7 +19,7 @@ _FEW, _LATE, _APART = 10, 0.5, 3.0
 
 
 class WorldInterval(NamedTuple):
-    """The median of a number in all worlds, and an interval of 90 %, given what was detected; None for none."""
+    """The median of a number in all worlds, and an interval of 90 %; None for none."""
 
     median: float | None
     low: float | None

@@ -47,7 +47,7 @@ class ZoneOptions:
 
 @dataclass(frozen=True)
 class ZoneInWorlds:
-    """Of a zone in so many worlds of re-tracking, given the same detections: medians and intervals of 90 %.
+    """Of a zone in so many worlds of re-tracking: medians and intervals of 90 %.
 
     ``tracks`` are the different tracks that visited it, ``mean_dwell_s`` is the mean of their visits, over the worlds
     that have any. ``then`` has by the name of each other zone the tracks that came here first, and there after.

@@ -228,8 +228,8 @@ class Database:
         plain = re.sub(r"\busing\s*\([^)]*\)", "on true", query, flags=re.IGNORECASE)  # its columns are not known yet
         names = {name.lower().strip('"') for name in self._connection.get_table_names(plain)}
         self._load_worlds()
-        counts = dict(self._connection.sql("select recording, max(world) from worlds group by recording").fetchall())
-        if lacking := [name for name in self._names if name not in counts]:
+        having = {recording for recording, *_ in self._connection.sql(_WORLD_CHANNELS).fetchall()}
+        if lacking := [name for name in self._names if name not in having]:
             raise McaptrackError(f"{lacking[0]} has no worlds; {call('retrack', 'LOG', worlds=50)} draws them")
         others = {name for name in names if name in TABLES or "/" in name} - _IN_ALL_WORLDS - {"tracks"}
         topics = {topic for (topic,) in self._connection.sql("select distinct topic[:-8] from worlds").fetchall()}
