@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import WIDER
+from mcaptrack.evaluation.intervals import WIDER, lacks_intervals
+from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
 from mcaptrack.notices import collected
-from mcaptrack.schema import TRACKS, WORLDS, DecisionKind, Frame
+from mcaptrack.schema import TRACKS, WORLDS, Frame
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import offline, worlds
 from tests.commands import done
@@ -44,7 +45,7 @@ def rows_of(frames: list[Frame]) -> list[tuple]:
 
 @given(seed=SEEDS)
 @settings(max_examples=4, phases=QUICK)
-def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_others_only_get_the_share_of_additional_people(seed):
+def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_change_no_other_output(seed):
     frames = scene(seed)
     five, again = outputs_of(frames, worlds=5), outputs_of(frames, worlds=5)
     two, none = outputs_of(frames, worlds=2), outputs_of(frames)
@@ -53,22 +54,7 @@ def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_others_only_get_
     assert "worlds" not in none
     for name, wanted in none.items():
         for found, frame in zip(five[name], wanted, strict=True):
-            if name == "decisions":
-                more = found.rows["additional"]
-                assert (np.isfinite(more) == (found.rows["kind"] == DecisionKind.LEFT_OUT)).all()
-                assert not (more > 1 - found.rows["probability"]).any()
-                found.rows["additional"] = np.nan
             assert_same_rows(found.rows, frame.rows)
-
-
-def test_a_track_that_worlds_join_to_a_kept_one_is_seldom_an_additional_person():
-    """Two tracklets of a kept track, and three tracks that were left out: one joined, one alone, one never kept."""
-    decided, kept = np.array([0, 0, 1, 2, 3]), np.array([True, False, False, False])
-    drawn = worlds.Worlds(np.tile([0, 0, 0, 2, 3], (50, 1)), np.tile([True, True, True, True, False], (50, 1)))
-    _, joined, alone, never = worlds.additional_share(drawn, decided, kept)
-    assert 0 < joined < never < alone < 1
-    parted = drawn._replace(track=np.tile([0, 0, 1, 2, 3], (50, 1)))
-    assert worlds.additional_share(parted, decided, kept)[1] == alone
 
 
 @given(seed=SEEDS)
@@ -183,13 +169,13 @@ def test_retracking_without_the_option_removes_worlds(template, tmp_path):
 def drawn(tmp_path_factory) -> Path:
     """A log of walkers with nine worlds."""
     path = tmp_path_factory.mktemp("worlds") / "log.mcap"
-    write_channels(path, samples=noisy_tracks(np.random.default_rng(5), people=8, ticks=80, hidden=0.03))
+    write_channels(path, samples=noisy_tracks(np.random.default_rng(5), people=14, ticks=80, hidden=0.03))
     done("retrack", path, "--worlds", "9", "-q")
     return path
 
 
-def visitors(path: Path) -> list[int]:
-    """The tracks with an observed sample to the right of x = 0 in each world, from the rows of worlds and samples."""
+def kept_samples(path: Path) -> list[dict[tuple[int, float], int]]:
+    """The track of each sample that a world keeps, by its time and place, from the rows of worlds and samples."""
     with log.Log(path) as opened:
         parts = [(frame.t_ns, row) for frame in opened.frames("/camera/retracks/worlds", WORLDS) for row in frame.rows]
         samples = [(f.t_ns, row) for f in opened.frames("/camera/samples", TRACKS) for row in f.rows if row["observed"]]
@@ -198,48 +184,108 @@ def visitors(path: Path) -> list[int]:
             for frame in opened.frames("/camera/retracks", TRACKS)
             for row in frame.rows
         }
-    out = []
-    for world in range(1, 10):
-        tracks = set()
-        for begin_ns, part in parts:
-            end_ns = begin_ns + part["duration_s"] * 1e9 + 1000
-            if part["world"] == world and part["kept"]:
-                tracks |= {
-                    int(part["track_id"])
-                    for t_ns, row in samples
-                    if row["track_id"] == part["source_id"] and begin_ns <= t_ns <= end_ns
-                    and smooth.get((t_ns, row["track_id"]), row["x_m"]) > 0
-                }  # fmt: skip
-        out.append(len(tracks))
-    return out
+    out: list[dict[tuple[int, float], int]] = [{} for _ in range(9)]
+    for begin_ns, part in parts:  # in order of time: of two with a sample the later one
+        end_ns = begin_ns + part["duration_s"] * 1e9 + 1000
+        for t_ns, row in samples:
+            if row["track_id"] == part["source_id"] and begin_ns <= t_ns <= end_ns:
+                at = t_ns, float(smooth.get((t_ns, row["track_id"]), row["x_m"]))
+                out[part["world"] - 1][at] = int(part["track_id"])
+    return [{at: track for at, track in world.items() if track >= 0} for world in out]
+
+
+def test_worlds_have_the_samples_that_they_keep_and_join_whole_tracks_of_them(drawn):
+    joined = 0
+    for world, wanted in enumerate(kept_samples(drawn), start=1):
+        query = f"select t_ns, x_m, track_id from world_tracks where world = {world} and observed"
+        found = {(row["t_ns"], row["x_m"]): row["track_id"] for row in mcaptrack.query(drawn, query).to_pylist()}
+        assert found.keys() == wanted.keys()
+        names = {(wanted[at], track) for at, track in found.items()}
+        assert len(names) == len({track for track, _ in names})
+        joined += len(names) - len({track for _, track in names})
+    assert joined > 0
 
 
 def test_a_number_has_its_median_and_an_interval_around_those_of_the_worlds(drawn):
-    many = visitors(drawn)
     query = "select count(distinct track_id) as n, avg(x_m) as x from tracks where observed and x_m > 0"
     (row,) = mcaptrack.query(drawn, query, worlds=True).to_pylist()
     (again,) = mcaptrack.query(drawn, query, worlds=True).to_pylist()
+    grouped = query.replace("tracks", "world_tracks") + " group by world"
+    many = mcaptrack.query(drawn, grouped).column("n").to_pylist()
     low, middle, high = np.percentile(many, [5, 50, 95])
     assert len(set(many)) > 1
     assert (row, row["n"], row["worlds"]) == (again, middle, 9)
     assert max(low - WIDER * middle, 0) - 1 < row["n_from"] <= low <= high <= row["n_to"] < high + WIDER * middle + 1
     assert row["x_from"] < row["x"] < row["x_to"]
-    grouped = mcaptrack.query(
-        drawn, "select count(distinct track_id) as n from world_tracks where observed and x_m > 0 group by world"
-    )
-    assert sorted(grouped.column("n").to_pylist()) == sorted(many)
 
 
-def test_gaps_of_a_track_are_filled_straight_and_no_track_is_at_two_places_at_once(drawn):
+def test_unseen_rows_of_a_track_that_was_seen_are_straight_and_no_track_is_at_two_places_at_once(drawn):
     rows = mcaptrack.query(drawn, "from world_tracks order by world, track_id, t_ns").to_pylist()
+    seen = {(row["world"], row["track_id"]) for row in rows if row["observed"]}
     for one, row, other in zip(rows, rows[1:], rows[2:], strict=False):
         ends = (one, row, other)
         if len({(end["world"], end["track_id"]) for end in ends}) == 1:
             assert one["t_ns"] < row["t_ns"]
-            if not row["observed"]:
+            if not row["observed"] and (row["world"], row["track_id"]) in seen:
                 times, places = [end["t_ns"] for end in ends], [end["x_m"] for end in ends]
                 assert row["x_m"] == pytest.approx(np.interp(times[1], times[::2], places[::2]))
     assert any(not row["observed"] for row in rows)
+
+
+def walkers(is_seen: np.ndarray) -> list[WorldTracks]:
+    """Worlds of 20 people who walk 24 m along lanes of their own, at 1 m/s; ``is_seen`` (61,) is when they are."""
+    step = np.tile(np.arange(61), 20)
+    lane, seen = np.repeat(np.arange(20), 61), np.tile(is_seen, 20)
+    xy_m, t_ns = np.stack([0.4 * step, 4.0 * lane], axis=1), np.arange(100) * 400_000_000
+    frame, part = step + lane, np.tile(np.cumsum(np.diff(is_seen, prepend=False)), 20)
+    source = lane * 10 + part
+    rows = WORLDS.empty(50 * len(names := np.unique(source[seen])))
+    begins, ends = (np.array([some(frame[seen & (source == name)]) for name in names]) for some in (np.min, np.max))
+    rows["world"], rows["kept"] = np.repeat(np.arange(1, 51), len(names)), True
+    track = names - 2 * (names % 10 == 3)
+    for column, values in (("source_id", names), ("track_id", track), ("duration_s", (ends - begins) * 0.4)):
+        rows[column] = np.tile(values, 50)
+    of = (source[seen], np.ones(seen.sum(), np.int64), frame[seen], xy_m[seen])
+    return list(tracks_in_worlds(*of, t_ns, rows, np.tile(t_ns[begins], 50)))
+
+
+def test_who_is_seen_from_border_to_border_is_one_person_in_each_world_and_nothing_is_added():
+    for world in walkers(np.ones(61, bool)):
+        assert (world.people, world.late, world.observed.all()) == (20, 0, True)
+
+
+def test_tracks_that_end_and_begin_in_the_middle_are_one_person_or_two_who_were_longer_there_and_others_were_unseen():
+    is_seen = np.ones(61, bool)
+    is_seen[20:40], is_seen[5:7] = False, False
+    made = walkers(is_seen)
+    people = [world.people for world in made]
+    assert min(people) < 25 < 45 < max(people)
+    for world in made:
+        assert world.late == pytest.approx(1 / 2, abs=0.2)
+    steps = [np.diff(world.share[world.share < 0], prepend=0) for world in made]  # away from the end, or back to it
+    assert sum((way < 0).any() and (way > 0).any() for way in steps) > 25
+
+
+@pytest.mark.parametrize(
+    ("people", "late", "why"),
+    [([9] * 5, 0.0, "only 9 people"), ([10, 99] * 5, 0.0, "10 to 99"), ([20] * 5, 0.6, "60%"), ([20] * 5, 0.4, None)],
+)
+def test_where_a_log_can_not_tell_there_are_no_intervals_and_it_says_why(people, late, why):
+    with collected() as warnings:
+        assert lacks_intervals([(count, late) for count in people]) == (why is not None)
+    assert [warning.message.count(why) for warning in warnings] == ([1] if why else [])
+
+
+def test_numbers_of_pairs_have_no_interval(drawn):
+    for pairs in (
+        "tracks a join tracks b using (t_ns)",
+        "tracks a, tracks b",
+        "tracks as a left join tracks b using (t_ns)",
+    ):
+        with collected() as warnings:
+            (row,) = mcaptrack.query(drawn, f"select count(*) as n from {pairs}", worlds=True).to_pylist()
+        assert (row["n_from"], row["n_to"], row["n"] > 0) == (None, None, True)
+        assert ["no interval" in warning.message for warning in warnings] == [True]
 
 
 def test_rows_are_told_apart_by_texts_and_counts_of_missing_rows_are_none(drawn):
@@ -252,13 +298,6 @@ def test_rows_are_told_apart_by_texts_and_counts_of_missing_rows_are_none(drawn)
         many = [found["n"] for found in per_world if str(found["track_id"]) == row["track"]]
         assert (row["worlds"], row["n"]) == (len(many), np.median(many + [0] * (9 - len(many))))
         assert 0 <= row["n_from"] <= row["n"] <= row["n_to"]
-
-
-def test_the_number_of_people_has_no_interval(drawn):
-    with collected() as warnings:
-        (row,) = mcaptrack.query(drawn, "select count(distinct track_id) as n from tracks", worlds=True).to_pylist()
-    assert (row["n_from"], row["n_to"], row["n"] > 0) == (None, None, True)
-    assert ["no interval" in warning.message for warning in warnings] == [True]
 
 
 @pytest.mark.parametrize(
@@ -324,13 +363,14 @@ def test_zones_have_the_medians_and_intervals_of_what_sql_counts_in_each_world(d
         assert found == pytest.approx((middle, *ends)), name
 
 
-def test_zones_of_all_people_have_no_interval_and_those_of_logs_without_worlds_say_nothing(drawn, tmp_path):
-    everywhere = {"type": "Polygon", "coordinates": [[[-99, -99], [99, -99], [99, 99], [-99, 99], [-99, -99]]]}
-    there = Path(shutil.copyfile(drawn, tmp_path / "log.mcap"))
+def test_zones_of_few_people_have_no_interval_and_those_of_logs_without_worlds_say_nothing(tmp_path):
+    there = tmp_path / "log.mcap"
+    write_channels(there, samples=noisy_tracks(np.random.default_rng(5), people=3, ticks=80))
+    done("retrack", there, "--worlds", "9", "-q")
     with collected() as warnings:
-        (total,) = mcaptrack.zones(there, zones=everywhere | {"units": "metres"}).zones["/camera/retracks"]
+        total, _ = mcaptrack.zones(there, zones=SIDES).zones["/camera/retracks"]
     assert (total.in_worlds.tracks.low, total.in_worlds.tracks.high) == (None, None)
     assert ["no interval" in warning.message for warning in warnings] == [True]
     done("retrack", there, "-q")
-    (total,) = mcaptrack.zones(there).zones["/camera/retracks"]
+    total, _ = mcaptrack.zones(there).zones["/camera/retracks"]
     assert (total.in_worlds, "in_worlds" in total.to_json()) == (None, False)

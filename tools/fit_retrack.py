@@ -46,7 +46,7 @@ from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import Trajectories, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
-from mcaptrack.transforms.retrack.worlds import additional_share, draw_worlds
+from mcaptrack.transforms.retrack.worlds import draw_worlds
 
 DEFAULT = PROFILES["default"]
 Found = TypeVar("Found")
@@ -277,10 +277,9 @@ def decisions_of(run: Run) -> tuple[Judged, Judged]:
     return joins, Judged(decided.log_odds[:, None], np.bincount(track, people >= 0) * 2 >= count)
 
 
-def worlds_of(run: Run) -> tuple[Judged, Judged, np.ndarray]:
-    """In how many of 50 worlds each join of a scene holds, and which joins are right; how likely tracks that were left
-    out are additional people, and which are; and the number of people, the number that was decided, and those that 5 %,
-    50 % and 95 % of the worlds don't exceed.
+def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
+    """In how many of 50 worlds each join of a scene holds, and which joins are right; and the number of people, the
+    number that was decided, and those that 5 %, 50 % and 95 % of the worlds don't exceed.
     """
     _, decided, least_steps, _ = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
     tracks, choices, tracklets = decided.tracks, decided.hypotheses, decided.hypotheses.tracklets
@@ -295,19 +294,7 @@ def worlds_of(run: Run) -> tuple[Judged, Judged, np.ndarray]:
     joins = Judged(share[counts], (ends[before] == begins[after])[counts])
     many = [len(np.unique(track[kept])) for track, kept in zip(*some_worlds, strict=True)]
     people = np.unique(np.concatenate([frame.rows["track_id"] for frame in run.true]))
-    share = additional_share(some_worlds, tracks.track[tracklets.first], decided.kept)
-    additional = Judged(probability(decided.log_odds) * share, additional_people(run, decided))
-    left_out = Judged(*(values[~decided.kept] for values in additional))
-    return joins, left_out, np.array([len(people), decided.kept.sum(), *np.percentile(many, [5, 50, 95])])
-
-
-def additional_people(run: Run, decided: offline.Decided) -> np.ndarray:
-    """Which tracks (K,) are mostly of a person whom no kept track follows, for as many samples as count (``NEAR``)."""
-    person = run.people(decided.tracks)
-    of = np.unique(decided.tracks.track, return_inverse=True)[1]
-    owner = np.array([_most(part) for part in np.split(person, np.flatnonzero(np.diff(of)) + 1)])
-    pairs, counts = np.unique(np.stack([of, person])[:, decided.kept[of]], axis=1, return_counts=True)
-    return (owner >= 0) & ~np.isin(owner, pairs[1, counts >= NEAR])
+    return joins, np.array([len(people), decided.kept.sum(), *np.percentile(many, [5, 50, 95])])
 
 
 def told(find: Callable[[Run], Found], scenes: list[Run], what: str) -> Iterator[Found]:
@@ -414,11 +401,8 @@ def held(seeds: list[int], steps: int) -> None:
     is_person = probability(people[0][:, 0])
     is_right = np.where(is_person >= 0.5, people[1], ~people[1])
     show_reliability("people and false tracks", np.maximum(is_person, 1 - is_person), is_right)
-    joins, left_out, numbers = zip(*in_worlds, strict=True)
+    joins, numbers = zip(*in_worlds, strict=True)
     show_reliability("joins in worlds", *(np.concatenate(both) for both in zip(*joins, strict=True)))
-    chance, is_additional = (np.concatenate(both) for both in zip(*left_out, strict=True))
-    show_reliability("additional people in tracks that were left out", chance, is_additional)
-    print(f"  {chance.sum():.0f} such people were expected, of {len(chance)} tracks, and {is_additional.sum()} are")
     people, decided, low, middle, high = np.array(numbers).T
     inside = ((low <= people) & (people <= high)).mean()
     print(f"people of a scene: {people.mean():.1f}; decided {decided.mean():.1f}; in worlds {middle.mean():.1f}")

@@ -5,8 +5,9 @@
 
 ``signs`` makes five trackers of each scene (``crowds.py``), with faults of their own or with those of the tracker that
 the reference is re-tracked from, and prints how often better and worse are right, by the difference that is seen.
-``worlds`` prints how often the intervals of ``query --worlds`` and of ``zones`` hold the true number, and how wide they
-are.
+``worlds`` prints how often the intervals of ``query --worlds`` and of ``zones`` hold the true number, in the shape of
+scenes where they do so least, and how wide they are; and how wide intervals around the median are that hold as often in
+the same scenes and are made of their truth (conformal ones).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import STEP_S, Rows, corrupt
-from crowds import faults, scenes
+from crowds import SHAPES, faults, scenes
 from reproduce import on_clock
 
 import mcaptrack
@@ -127,11 +128,11 @@ select count(*) as n from (select min(t_ns) filter (zone = 'A') as a, max(t_ns) 
 """
 
 
-def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, list[float]]]:
-    """What was asked, the true answer, and that of worlds: median, from, to."""
+def answers(seeds: list[int], count: int) -> Iterator[tuple[str, str, float, list[float]]]:
+    """The shape of the scene, what was asked, the true answer, and that of worlds: median, from, to."""
     for seed in seeds:
         for number, truth in enumerate(scenes(seed, STEPS, count)):
-            rng = np.random.default_rng([seed, number, 8])
+            rng, shape = np.random.default_rng([seed, number, 8]), SHAPES[number % len(SHAPES)]
             made = {"scene": corrupt(truth, faults(rng), rng), "true": truth}
             with tempfile.TemporaryDirectory() as folder:
                 for name, rows in made.items():
@@ -145,8 +146,8 @@ def answers(seeds: list[int], count: int) -> Iterator[tuple[str, float, list[flo
                 (true,) = mcaptrack.query(Path(folder, "true.mcap"), query).to_pylist()
                 (found,) = mcaptrack.query(Path(folder, "scene.mcap"), query, worlds=True).to_pylist()
                 for name in asked:
-                    yield name, true[name], [found[name + end] for end in ("", "_from", "_to")]
-                yield from zone_answers(Path(folder), geometry(zones))
+                    yield shape, name, true[name], [found[name + end] for end in ("", "_from", "_to")]
+                yield from ((shape, *row) for row in zone_answers(Path(folder), geometry(zones)))
 
 
 def zone_answers(folder: Path, zones: dict) -> Iterator[tuple[str, float, list[float]]]:
@@ -162,13 +163,19 @@ def zone_answers(folder: Path, zones: dict) -> Iterator[tuple[str, float, list[f
 
 
 def worlds(seeds: list[int], count: int) -> None:
-    table = defaultdict(list)
-    for name, true, (middle, low, high) in answers(seeds, count):
+    table, shapes = defaultdict(list), defaultdict(list)
+    for shape, name, true, (middle, low, high) in answers(seeds, count):
         if true and low is not None:
             table[name].append((low <= true <= high, (high - low) / true, middle / true))
+            shapes[name, shape].append(low <= true <= high)
     for name, rows in table.items():
-        held, wide, middle = np.mean(rows, axis=0)
-        print(f"{name:16} {len(rows):4} scenes, held {held:.2f}, width {wide:.2f}, median {middle:.2f} of the truth")
+        held, wide, middle = np.array(rows, float).T
+        least = min(np.mean(shapes[name, shape]) for shape in SHAPES if shapes[name, shape])
+        conformal = 2 * np.quantile(np.abs(1 / middle[middle > 0] - 1), held.mean()) * middle.mean()
+        print(
+            f"{name:18} {len(rows):4} scenes, held {held.mean():.2f} (least {least:.2f}), width {wide.mean():.2f} "
+            f"(conformal {conformal:.2f}), median {np.median(middle):.2f} of the truth"
+        )
 
 
 def main() -> None:

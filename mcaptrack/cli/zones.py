@@ -104,7 +104,7 @@ def _print_worlds(topic: str, zones: Sequence[tuple[str, ZoneInWorlds]]) -> None
     """Print what worlds of re-tracking say of zones, by their names."""
     if not zones:
         return
-    show(f"{topic} in {zones[0][1].worlds} worlds: medians, and intervals of 90 % given these detections")
+    show(f"{topic} in {zones[0][1].worlds} worlds: medians, and intervals of 90 %")
     head = ("zone", "tracks", "mean stay")
     rows = [
         (name, zone.tracks.words(), zone.mean_dwell_s.words(1, " s") if zone.mean_dwell_s else "")

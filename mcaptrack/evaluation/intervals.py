@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -9,13 +10,16 @@ from numpy.typing import ArrayLike
 
 from mcaptrack import notices
 
-#: Intervals are wider than 90 % of the worlds by this share of the median on both sides, because worlds lack rows that
-#: no detector gave: so they hold in nine of ten drawn scenes (``tools/without_truth.py``).
-WIDER: Final = 0.12
+#: Intervals are wider than 90 % of the worlds by this share of the median on both sides, for what worlds get wrong
+#: alike. (Chosen on drawn scenes.)
+WIDER: Final = 0.06
+#: There are no intervals for fewer people, where more than this share of tracks begin in the middle of the seen area,
+#: and where some worlds have so many times more people than others.
+_FEW, _LATE, _APART = 10, 0.5, 3.0
 
 
 class WorldInterval(NamedTuple):
-    """The median of a number in all worlds, and an interval of 90 %, given what was detected; None for none."""
+    """The median of a number in all worlds, and an interval of 90 %; None for none."""
 
     median: float | None
     low: float | None
@@ -50,12 +54,20 @@ class WorldInterval(NamedTuple):
         return middle + ("" if self.low is None else f" ({self.low:.{digits}f} to {self.high:.{digits}f})") + unit
 
 
-def is_people(name: str, values: ArrayLike, people: ArrayLike) -> bool:
-    """Whether a number in all worlds (W,) is that of all their people (W,), which has no interval; that is said."""
-    if not np.array_equal(values, people):
+def lacks_intervals(worlds: Sequence[tuple[int, float]]) -> bool:
+    """Whether the log can't tell how sure numbers are; then it is said why.
+
+    Of each world there are the number of its people, and the share of them who are first seen in the middle.
+    """
+    people, late = np.array(worlds, float).T
+    low, middle, high = np.quantile(people, (0.05, 0.5, 0.95)).tolist()
+    if middle < _FEW:
+        why = f"there are only {middle:g} people; how often they are missed can't be told from fewer than {_FEW}"
+    elif high > _APART * low:
+        why = f"there are {low:g} to {high:g} people, by which tracks are taken for some"
+    elif (share := float(np.median(late))) > _LATE:
+        why = f"{share:.0%} of the tracks begin in the middle of the seen area, so that many people are never seen"
+    else:
         return False
-    notices.warn(
-        f"{name}: the number of people has no interval; worlds hold it too seldom, because they lack people that no "
-        "detector saw, and take those who come back late for others", "not-compared"
-    )  # fmt: skip
+    notices.warn(f"numbers have no intervals: {why}", "not-compared")
     return True

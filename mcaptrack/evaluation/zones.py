@@ -14,13 +14,13 @@ import numpy as np
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import WorldInterval, is_people
+from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
+from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import PERSON_HEIGHT_M, GroundPlane, Planes
-from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_ends, run_starts
 from mcaptrack.geometry.zones import Paths, Shape, Units, Zone, crossings, visits
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Rows
 from mcaptrack.schema.classes import class_name, is_person
@@ -47,7 +47,7 @@ class ZoneOptions:
 
 @dataclass(frozen=True)
 class ZoneInWorlds:
-    """Of a zone in so many worlds of re-tracking, given the same detections: medians and intervals of 90 %.
+    """Of a zone in so many worlds of re-tracking: medians and intervals of 90 %.
 
     ``tracks`` are the different tracks that visited it, ``mean_dwell_s`` is the mean of their visits, over the worlds
     that have any. ``then`` has by the name of each other zone the tracks that came here first, and there after.
@@ -497,14 +497,6 @@ def _insides(zones: Sequence[Zone], counts: Sequence[Frame]) -> dict[int, tuple[
 # Letters: W worlds, K tracklets, N rows.
 
 
-def moved_to(positions: TrackPositions, smoothed: JoinedFrames) -> TrackPositions:
-    """Positions of input tracks at the places in metres that re-tracking gave them; the others stay."""
-    at = find_rows((smoothed.rows["source_id"], smoothed.row_ns), (positions.track, positions.t_ns))
-    metres = positions.at["metres"].copy()
-    metres[at >= 0] = np.stack([smoothed.rows[name][at[at >= 0]] for name in ("x_m", "y_m")], axis=1)
-    return positions._replace(at={**positions.at, "metres": metres})
-
-
 def zones_in_worlds(
     positions: TrackPositions, t_ns: Ints, worlds: JoinedFrames, zones: Sequence[PlacedZone], options: ZoneOptions
 ) -> dict[str, ZoneInWorlds]:
@@ -527,10 +519,11 @@ def zones_in_worlds(
         Lines have none.
     """
     zones = [placed for placed in zones if not placed.zone.is_line]
-    people, counts, dwell_s, then = [], [], [], []
-    for of_world in _positions_in_worlds(positions, t_ns, worlds):
-        arrivals = []
-        people.append(len(np.unique(of_world.track)))
+    seen, counts, dwell_s, then = [], [], [], []
+    samples = (positions.track, positions.class_id, positions.frame, positions.at["metres"])
+    for rows_of_world in tracks_in_worlds(*samples, t_ns, worlds.rows, worlds.row_ns):
+        of_world, arrivals = _of_world(positions, t_ns, rows_of_world), []
+        seen.append((rows_of_world.people, rows_of_world.late))
         for placed in zones:
             paths, rows, margin = _paths(of_world, placed, options, "worlds")
             stay = _Stays.of(placed, margin, rows, of_world, paths)
@@ -538,17 +531,17 @@ def zones_in_worlds(
             dwell_s.append(stay.dwell_s.mean() if len(stay.dwell_s) else np.nan)
         counts.append([len(arrival.track) for arrival in arrivals])
         then.append([[a.before(b) for b in arrivals] for a in arrivals])
-    size, dwell = len(people), np.array(dwell_s).reshape(len(people), len(zones))
+    size, dwell = len(seen), np.array(dwell_s).reshape(len(seen), len(zones))
+    lacks = lacks_intervals(seen)
     out = {}
     for number, placed in enumerate(zones):
         tracks = np.array(counts)[:, number]
-        has_none = is_people(f"tracks in {placed.zone.name}", tracks, people)
         others = ((other, np.array(then)[:, number, to]) for to, other in enumerate(zones) if to != number)
         out[placed.zone.name] = ZoneInWorlds(
             size,
-            WorldInterval.of(tracks, is_count=True, has_none=has_none),
-            None if np.isnan(dwell[:, number]).all() else WorldInterval.of(dwell[:, number]),
-            {other.zone.name: WorldInterval.of(values, is_count=True) for other, values in others},
+            WorldInterval.of(tracks, True, lacks),
+            None if np.isnan(dwell[:, number]).all() else WorldInterval.of(dwell[:, number], has_none=lacks),
+            {other.zone.name: WorldInterval.of(values, True, lacks) for other, values in others},
         )
     return out
 
@@ -572,48 +565,11 @@ class _Arrivals(NamedTuple):
         return int((self.first[here] < other.last[there]).sum())
 
 
-def _positions_in_worlds(positions: TrackPositions, t_ns: Ints, worlds: JoinedFrames) -> Iterator[TrackPositions]:
-    """The positions of the tracks that each world keeps, with gaps filled straight."""
-    rows, frames = worlds.rows, len(t_ns) + 1
-    begin = np.searchsorted(t_ns, worlds.row_ns)
-    (source, first), which = np.unique(np.stack([rows["source_id"], begin]), axis=1, return_inverse=True)
-    numbers, world = np.unique(rows["world"], return_inverse=True)
-    track = np.full((len(numbers), len(source)), -1)
-    track[world, which.ravel()] = np.where(rows["kept"], rows["track_id"], -1)
-    end = np.zeros(len(source), np.int64)
-    until_ns = worlds.row_ns + (rows["duration_s"] * NS_PER_S).astype(np.int64) + _ROUNDED_NS
-    end[which.ravel()] = np.searchsorted(t_ns, until_ns, "right")
-    sources = np.unique(source)
-    begins = np.searchsorted(sources, source) * frames + first
-    own = np.searchsorted(begins, np.searchsorted(sources, positions.track) * frames + positions.frame, "right") - 1
-    is_own = (own >= 0) & (source[own] == positions.track) & (positions.frame < end[own])
-    for of_world in track:
-        name = np.where(is_own, of_world[own], -1)
-        kept = np.flatnonzero(name >= 0)
-        kept = kept[np.lexsort((positions.frame[kept], name[kept]))]
-        yield _filled(_rows_of(positions, kept)._replace(track=name[kept]), t_ns)
-
-
-def _filled(positions: TrackPositions, t_ns: Ints) -> TrackPositions:
-    """Positions with rows on a straight line in the frames between those of a track."""
-    starts = run_starts(positions.track)
-    low, high = positions.frame[starts], positions.frame[run_ends(starts)]
-    frame, seconds = ragged_range(low, high - low + 1), (t_ns - t_ns[0]) / NS_PER_S
-    key = (np.cumsum(starts) - 1) * (seconds[-1] + 1) + seconds[positions.frame]  # one track after the other
-    wanted = group_index(high - low + 1) * (seconds[-1] + 1) + seconds[frame]
-    filled = _rows_of(positions, np.searchsorted(key, wanted, "right") - 1)
-    at = {
-        unit: np.stack([np.interp(wanted, key, xy[:, axis]) for axis in (0, 1)], axis=1) if len(key) else xy
-        for unit, xy in positions.at.items()
-    }
-    return filled._replace(at=at, frame=frame, t_ns=t_ns[frame])
-
-
-def _rows_of(positions: TrackPositions, rows: Ints) -> TrackPositions:
-    """Some rows of positions."""
-    at = {unit: xy[rows] for unit, xy in positions.at.items()}
-    names = ("picture_px", "track", "frame", "t_ns", "low_m", "class_id")
-    return positions._replace(at=at, **{name: getattr(positions, name)[rows] for name in names})
+def _of_world(positions: TrackPositions, t_ns: Ints, rows: WorldTracks) -> TrackPositions:
+    """The positions of the tracks of a world."""
+    at = {unit: rows.values(xy) for unit, xy in positions.at.items()}
+    kept = {name: getattr(positions, name)[rows.before] for name in ("picture_px", "low_m", "class_id")}
+    return positions._replace(at=at, track=rows.track, frame=rows.frame, t_ns=t_ns[rows.frame], **kept)
 
 
 # Visits of zones and crossings of lines as text, for the log panel of viewers.

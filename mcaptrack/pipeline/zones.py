@@ -19,6 +19,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import SUFFIX
+from mcaptrack.evaluation.world_tracks import smoothed_places
 from mcaptrack.evaluation.zones import (
     PlacedZone,
     TrackPositions,
@@ -27,7 +28,6 @@ from mcaptrack.evaluation.zones import (
     ZoneTotals,
     find_zone_events,
     ground_height_m,
-    moved_to,
     place_zone,
     positions_of,
     zone_messages,
@@ -238,7 +238,9 @@ def _in_worlds(state: RunState, zones: Sequence[Zone], options: ZoneOptions) -> 
     path, _ = path_with(state, how.input)
     still = scene_planes(read_planes(state.opened, state.prefix) or (), path)
     positions = positions_of(samples, still, path, state.classes(how.input))
-    positions = moved_to(positions, join_frames(TRACKS, state.frames(f"{state.prefix}/retracks")))
+    shown, metres = join_frames(TRACKS, state.frames(f"{state.prefix}/retracks")), positions.at["metres"]
+    metres = smoothed_places(positions.track, positions.t_ns, metres, shown.rows, shown.row_ns)
+    positions = positions._replace(at={**positions.at, "metres": metres})
     return zones_in_worlds(
         positions, frame_times(samples), worlds, [place_zone(zone, still) for zone in zones], options
     )

@@ -10,20 +10,25 @@ log. Each channel is a table, too, under its name in double quotes. Only this mo
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call, did_you_mean
-from mcaptrack.evaluation.intervals import WorldInterval, is_people
+from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
+from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
 from mcaptrack.files import place_of
+from mcaptrack.geometry.arrays import Floats
 from mcaptrack.location import Location, distinct_names, join
 from mcaptrack.log.recording_files import results_path
+from mcaptrack.notices import warn
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
 
@@ -52,40 +57,25 @@ _READERS: Final = {
 #: The tables that ``world_tracks`` is made of, and all that are the same in each world.
 _OF_WORLDS: Final = ("tracks", "worlds", "channels", "frames")
 _IN_ALL_WORLDS: Final = {"frames", "channels", "recordings", "ground_planes"}
-#: Tracks in each world: observed samples of what a world keeps, at their smoothed places where re-tracking kept them,
-#: and straight on over gaps.
-_WORLD_TRACKS: Final = """
-create temp view world_tracks as
-with part as (
-    select recording, topic[:-8] as topic, input, world, source_id, track_id, t_ns as from_ns,
-           t_ns + (duration_s * 1e9)::bigint + 1000 as to_ns
-    from worlds join channels using (recording, topic) where kept),
-seen as (
-    select world, s.* replace (part.topic as topic, part.track_id as track_id,
-                               coalesce(r.x_m, s.x_m) as x_m, coalesce(r.y_m, s.y_m) as y_m)
-    from part
-    join all_tracks s on (s.recording, s.topic, s.track_id) = (part.recording, part.input, part.source_id)
-                         and s.t_ns between from_ns and to_ns and s.observed
-    left join all_tracks r on (r.recording, r.topic, r.source_id, r.t_ns)
-                              = (part.recording, part.topic, part.source_id, s.t_ns)),
-steps as (
-    select *, lead(frame) over track as next, lead(t_ns) over track - t_ns as dt, lead(x_m) over track - x_m as dx,
-           lead(y_m) over track - y_m as dy
-    from seen window track as (partition by world, recording, topic, track_id order by t_ns)),
-gaps as (select *, unnest(range(frame + 1, next)) as gap from steps where next > frame + 1)
-select * exclude (next, dt, dx, dy) from steps
-union all
-select g.* exclude (next, dt, dx, dy, gap)
-       replace (f.frame as frame, f.t as t, f.t_ns as t_ns, false as observed, -1 as source_id,
-                null as x_px, null as y_px, null as w_px, null as h_px, null as score,
-                x_m + dx * (f.t_ns - g.t_ns) / dt as x_m, y_m + dy * (f.t_ns - g.t_ns) / dt as y_m)
-from gaps g join frames f on (f.recording, f.topic, f.frame) = (g.recording, g.topic, g.gap)
+_WORLD_CHANNELS: Final = """
+select distinct recording, topic, input from worlds join channels using (recording, topic) order by all
 """
-_TRACKS_OF_WORLD: Final = """
-create or replace temp table tracks as
-select * exclude (world) from world_tracks where world = ? order by recording, topic, track_id, t_ns
+#: The samples of a channel of worlds, at their smoothed places where re-tracking kept them; its frames, and its rows.
+_SAMPLES: Final = """
+select s.* replace ($shown as topic, coalesce(r.x_m, s.x_m) as x_m, coalesce(r.y_m, s.y_m) as y_m)
+from all_tracks s
+left join all_tracks r on (r.recording, r.topic, r.source_id, r.t_ns) = (s.recording, $shown, s.track_id, s.t_ns)
+where s.recording = $recording and s.topic = $input and s.observed order by s.track_id, s.t_ns
 """
-_PEOPLE: Final = "select count(distinct (recording, topic, track_id)) from tracks"
+_FRAMES: Final = "select frame, t, t_ns from frames where recording = $recording and topic = $input order by t_ns"
+_WORLD_ROWS: Final = """
+select world, source_id, track_id, kept, duration_s, t_ns from worlds where recording = $recording and topic = $topic
+"""
+#: What rows that were not detected lack.
+_DETECTED: Final = ("x_px", "y_px", "w_px", "h_px", "score")
+#: Queries about pairs of tracks, such as how near people are to each other.
+_CODE: Final = "not-compared"
+_PAIRS: Final = re.compile(r"\btracks(\s+(as\s+)?\w+)?\s*(,|(\s\w+)*\sjoin\s)\s*tracks\b", re.IGNORECASE)
 _MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
 
 
@@ -199,8 +189,8 @@ class Database:
         """The answer of one SELECT from ``tracks`` in the worlds of re-tracking, an Arrow table.
 
         Each number has its median, and in ``NAME_from`` and ``NAME_to`` an interval of 90 %. Rows are told apart by
-        their texts and times; ``worlds`` says in how many worlds a row is. A whole number counts as 0 in others. The
-        number of people has no interval.
+        their texts and times; ``worlds`` says in how many worlds a row is. A whole number counts as 0 in others.
+        Intervals are null where the log can't tell, and for numbers of pairs of tracks.
 
         Raises McaptrackError for errors of DuckDB, queries that worlds don't change, and logs without worlds.
         """
@@ -235,10 +225,11 @@ class Database:
         statements = self._connection.extract_statements(query)
         if [statement.type.name for statement in statements] != ["SELECT"]:
             raise McaptrackError("worlds are asked by one SELECT; `world_tracks` has their tracks for other queries")
-        names = {name.lower().strip('"') for name in self._connection.get_table_names(query)}
-        self._load("world_tracks")
-        counts = dict(self._connection.sql("select recording, max(world) from worlds group by recording").fetchall())
-        if lacking := [name for name in self._names if name not in counts]:
+        plain = re.sub(r"\busing\s*\([^)]*\)", "on true", query, flags=re.IGNORECASE)  # its columns are not known yet
+        names = {name.lower().strip('"') for name in self._connection.get_table_names(plain)}
+        self._load_worlds()
+        having = {recording for recording, *_ in self._connection.sql(_WORLD_CHANNELS).fetchall()}
+        if lacking := [name for name in self._names if name not in having]:
             raise McaptrackError(f"{lacking[0]} has no worlds; {call('retrack', 'LOG', worlds=50)} draws them")
         others = {name for name in names if name in TABLES or "/" in name} - _IN_ALL_WORLDS - {"tracks"}
         topics = {topic for (topic,) in self._connection.sql("select distinct topic[:-8] from worlds").fetchall()}
@@ -248,18 +239,53 @@ class Database:
                 f"worlds have other `tracks` of {', '.join(sorted(topics))}, and nothing else: ask these"
                 + (f", not {', '.join(sorted(others))}" if others else "")
             )
-        self._connection.unregister("tracks")
-        answers, people = [], []
-        for world in range(1, min(counts.values()) + 1):
-            self._connection.execute(_TRACKS_OF_WORLD, [world])
+        answers, seen = [], []
+        for tracks, people, late in self._tracks_in_worlds():
+            self._connection.register("tracks", tracks.drop_columns(["world"]))
             answers.append(tables.tidy(self._run(self._connection.extract_statements(query)[0])))
-            people += self._connection.sql(_PEOPLE).fetchall()[0]
-        return self._over_worlds(answers, people)
+            seen.append((people, late))
+        has_none = lacks_intervals(seen)
+        if _PAIRS.search(query) and not has_none:
+            has_none = True
+            warn(
+                "numbers of pairs of tracks have no intervals: worlds hold how near people are too seldom",
+                "not-compared",
+            )
+        return self._over_worlds(answers, has_none)
 
-    def _over_worlds(self, answers: Sequence[Any], people: Sequence[int]) -> Any:
-        """The median and the interval of each number in the ``answers`` of all worlds, which have so many people."""
+    def _tracks_in_worlds(self) -> Iterator[tuple[Any, int, float]]:
+        """The tracks of each world, Arrow, the number of people, and the share of them who begin in the middle."""
         import pyarrow as pa
-        import pyarrow.compute as pc
+
+        def asked(query: str, **values: str) -> Any:
+            return self._connection.sql(query, params=values).to_arrow_table()
+
+        parts = []
+        for recording, topic, samples_topic in self._connection.sql(_WORLD_CHANNELS).fetchall():
+            where = {"recording": recording, "input": samples_topic}
+            samples, frames = asked(_SAMPLES, shown=topic.removesuffix("/worlds"), **where), asked(_FRAMES, **where)
+            rows = _arrays(asked(_WORLD_ROWS, recording=recording, topic=topic))
+            of, t_ns = _arrays(samples), _arrays(frames)["t_ns"]
+            frame = np.searchsorted(t_ns, of["t_ns"])
+            xy_m = np.stack([of["x_m"], of["y_m"]], axis=1)
+            drawn = tracks_in_worlds(of["track_id"], of["class_id"], frame, xy_m, t_ns, rows, rows["t_ns"])
+            parts.append(zip(repeat(samples), repeat(frames), repeat(xy_m), drawn, strict=False))
+        for number, channels in enumerate(zip(*parts, strict=False), start=1):
+            people = [world.people for *_, world in channels]
+            late = sum(count * world.late for count, (*_, world) in zip(people, channels, strict=True))
+            whole = pa.concat_tables([_of_world(*channel) for channel in channels])
+            whole = whole.append_column("world", pa.array(np.full(len(whole), number, np.uint32)))
+            yield whole, sum(people), late / max(sum(people), 1)
+
+    def _load_worlds(self) -> None:
+        """Load what the tracks of worlds are made of."""
+        for table in _OF_WORLDS:
+            self._load(table)
+        self._connection.register("all_tracks", self._loaded["tracks"])
+
+    def _over_worlds(self, answers: Sequence[Any], has_none: bool) -> Any:
+        """The median and the interval of each number in the ``answers`` of all worlds."""
+        import pyarrow as pa
 
         schema = answers[0].schema
         is_number = {f.name: pa.types.is_integer(f.type) or pa.types.is_floating(f.type) for f in schema}
@@ -281,8 +307,6 @@ class Database:
         columns = {name: found[name] for name in schema.names if not is_number[name]}
         for name in numbers:
             counts = pa.types.is_integer(schema.field(name).type)
-            sums = [pc.sum(answer[name]).as_py() or 0 for answer in answers]
-            has_none = counts and is_people(name, sums, people)
             missing = [0] * len(answers) if counts else []
             values = (row + missing[len(row) :] for row in found[name].to_pylist())
             intervals = [WorldInterval.of(np.array(row, float), counts, has_none) for row in values]
@@ -333,10 +357,13 @@ class Database:
         if name in self._loaded or lower in self._loaded:
             return False
         if lower == "world_tracks":
-            for table in _OF_WORLDS:
-                self._load(table)
-            self._connection.register("all_tracks", self._loaded["tracks"])
-            self._loaded[lower] = self._connection.execute(_WORLD_TRACKS)
+            import pyarrow as pa
+
+            self._load_worlds()
+            whole = [tracks for tracks, *_ in self._tracks_in_worlds()]
+            none = self._loaded["tracks"].slice(0, 0).append_column("world", pa.array([], pa.uint32()))
+            self._loaded[lower] = pa.concat_tables(whole or [none])
+            self._connection.register(lower, self._loaded[lower])
             return True
         if lower in TABLES:
             name, columns = lower, TABLES[lower].arrow
@@ -411,6 +438,28 @@ class Database:
             text += " Such functions take t::timestamptz, which is exact to the microsecond."
         where = f", in line {line.group(1)}" if line and "\n" in query.strip() else ""
         return f"SQL{where}: {text}" if kind.endswith("Error") else f"SQL: {error}"
+
+
+def _arrays(table: Any) -> dict[str, NDArray[Any]]:
+    """The columns of an Arrow table, of numbers."""
+    import pyarrow.types as kinds
+
+    numbers = [name for name in table.column_names if kinds.is_primitive(table.schema.field(name).type)]
+    return {name: table[name].to_numpy() for name in numbers}
+
+
+def _of_world(samples: Any, frames: Any, xy_m: Floats, world: WorldTracks) -> Any:
+    """The tracks of a world, as rows of samples, Arrow."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    rows, at, seen = samples.take(pa.array(world.before)), frames.take(pa.array(world.frame)), pa.array(world.observed)
+    x_m, y_m = (pa.array(values, from_pandas=True) for values in world.values(xy_m).T)
+    columns = {name: at[name] for name in at.column_names}
+    columns |= {"track_id": pa.array(world.track), "x_m": x_m, "y_m": y_m, "observed": seen}
+    columns |= {name: pc.if_else(seen, rows[name], pa.scalar(None, rows[name].type)) for name in _DETECTED}
+    columns["source_id"] = pc.if_else(seen, rows["source_id"], -1)
+    return pa.table({name: columns.get(name, rows[name]) for name in rows.column_names})
 
 
 def _duckdb() -> Any:

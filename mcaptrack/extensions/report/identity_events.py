@@ -306,9 +306,7 @@ class DoubtfulTrack(NamedTuple):
         seen = f"seen for {number(float(row['duration_s']), 1, 's')}" if row["duration_s"] > 0 else "seen once"
         done = f"{track} is {'kept' if is_kept else 'left out'}, {seen}"
         but = ": the" if is_kept == (chance >= _EVEN) else ", although the"
-        more = float(row["additional"])
-        split = "" if np.isnan(more) else f", {percent(more, 0)} for an additional one"
-        return f"{done}{but} probability of being {noun} is {percent(chance, 0)}{split}"
+        return f"{done}{but} probability of being {noun} is {percent(chance, 0)}"
 
 
 def find_doubts(

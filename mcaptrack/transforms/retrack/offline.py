@@ -39,7 +39,7 @@ from mcaptrack.transforms.retrack.motion_model import (
 )
 from mcaptrack.transforms.retrack.options import RetrackOptions
 from mcaptrack.transforms.retrack.weights import Logistic, probability
-from mcaptrack.transforms.retrack.worlds import Worlds, additional_share, draw_worlds, world_rows
+from mcaptrack.transforms.retrack.worlds import Worlds, draw_worlds, world_rows
 
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
@@ -164,14 +164,9 @@ class Decided(NamedTuple):
     hypotheses: Hypotheses
 
 
-def decision_rows(
-    decided: Decided, model: MotionModel, samples: LogSamples, steps: Sequence[int], additional: Floats
-) -> Iterator[Rows]:
-    """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track.
-
-    ``additional`` (K,) is as in ``additional_share``, NaN without worlds.
-    """
-    parts = _joined(decided, model.step_s), _persons(decided, model.step_s, additional)
+def decision_rows(decided: Decided, model: MotionModel, samples: LogSamples, steps: Sequence[int]) -> Iterator[Rows]:
+    """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track."""
+    parts = _joined(decided, model.step_s), _persons(decided, model.step_s)
     at, rows = np.concatenate([places for places, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
     places = samples.take(decided.tracks.sample[at])
     rows["x_m"], rows["y_m"] = places["x_m"], places["y_m"]
@@ -235,7 +230,7 @@ def _alternatives(hypotheses: Hypotheses, log_odds: Floats) -> Ints:
     return np.asarray(np.where(best, other[1, hypotheses.before], other[0, hypotheses.before]))
 
 
-def _persons(decided: Decided, step_s: float, additional: Floats) -> tuple[Ints, Rows]:
+def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     """The first assignment of each track (K,), and the row that says whether it is a person."""
     step, track, source = decided.tracks[:3]
     starts = run_starts(track)
@@ -247,7 +242,6 @@ def _persons(decided: Decided, step_s: float, additional: Floats) -> tuple[Ints,
     rows["source_id"] = _usual(track, source)
     is_person = probability(decided.log_odds)
     rows["probability"] = np.where(decided.kept, is_person, 1 - is_person)
-    rows["additional"] = np.where(decided.kept, np.nan, additional * is_person)
     rows["duration_s"] = (step[last] - step[first]) * step_s
     rows["frames"] = last - first + 1
     return first, rows
@@ -514,12 +508,10 @@ def offline_tracks(
     if is_decided and len(ids):
         hypotheses = hypotheses_of(model, tracks, options.link_s / movers.unit_m, appearance)
         decided = Decided(tracks, np.where(is_fixed, np.inf, odds), keeps, hypotheses)
-        additional = np.full(len(ids), np.nan)
         if options.drawn_worlds:
             drawn = _worlds(options, decided, round(least_s * options.rate_hz), samples)
             worlds = world_rows(drawn, hypotheses, model.step_s, steps)
-            additional = additional_share(drawn, tracks.track[hypotheses.tracklets.first], keeps)
-        decisions = decision_rows(decided, model, samples, steps, additional)
+        decisions = decision_rows(decided, model, samples, steps)
     shown_m = None if moved_m is None else moved_m[left]
     by_step = rows_by_step(taken(rows, left), samples, shown_m, options.ground_planes, steps, times_ns)
     looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))

@@ -32,9 +32,6 @@ _KNOWN: Final = (1 + 0.346 * _OF_LOG**2) ** 0.5
 _SEED, _OF_LINKS, _OF_PEOPLE = 2011, 0, 1
 #: What was decided is better than anything else by so much at least, without noise.
 _LEAST: Final = 1e-3
-#: How many of the people in tracks that were left out are followed by no track that was kept: where worlds never join
-#: such a track to a kept one, and where they always do. (Chosen on synthetic crowds.)
-_ALONE, _JOINED = 0.6, 0.15
 #: Log odds of what is certain, with or without noise.
 _CERTAIN: Final = 50.0
 
@@ -95,21 +92,6 @@ def draw_worlds(
         certain = np.bincount(root, is_certain[of], minlength=size) > 0
         out.kept[world] = (certain | ((total > 0) & (last - first >= least_steps)))[root]
     return out
-
-
-def additional_share(worlds: Worlds, track: Ints, kept: Bools) -> Floats:
-    """Of the probability that each track (P,) is a person, the share for an additional one.
-
-    No track that was ``kept`` (P,) follows it, before, after or beside. ``track`` (K,) is that of each tracklet as it
-    was decided.
-    """
-    of = np.unique(track, return_inverse=True)[1]
-    counts = np.zeros((2, len(kept)))
-    for name, is_kept in zip(*worlds, strict=True):
-        joined = is_kept & np.isin(name, name[is_kept & kept[of]])
-        counts += [np.bincount(of, some, len(kept)) > 0 for some in (joined, is_kept)]
-    joined_share = (counts[0] + 1) / (counts[1] + 2)  # of the worlds that keep it
-    return np.asarray(_ALONE + (_JOINED - _ALONE) * joined_share)
 
 
 def draw_links(count: int, hypotheses: Hypotheses, gain: Floats, seed: int = 0) -> Iterator[Ints]:

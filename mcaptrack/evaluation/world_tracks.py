@@ -1,0 +1,290 @@
+"""Tracks in worlds of re-tracking: what was detected, by the identities of each world, and what no detector saw.
+
+A track that begins or ends in the middle of the seen area was not seen there first or last: either another track goes
+on as this one, or the person was there unseen. Which it is can't be told from the log, so that each world draws the
+share of the one and of the other. Where people are unseen before they are tracked, others are never tracked: worlds add
+so many. How long people are unseen is told by the gaps of tracks that went on.
+
+Letters: W worlds, K tracklets, N samples, F frames, R rows, T tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.ragged import find_rows, ragged_range, run_ends, run_starts
+from mcaptrack.schema import Rows
+
+#: Durations in rows are rounded by less than this.
+_ROUNDED_NS: Final = 1000
+#: An end is in the middle if it is farther from the border of the seen area than this, and than its way of so long.
+_BORDER_M, _BORDER_S, _BORDER_FRAMES = 0.5, 1.0, 2
+#: The motion at an end is that of so many samples.
+_SAMPLES: Final = 3
+#: Another track may go on after so many seconds, no farther away than by this speed and distance.
+_GOES_ON_S, _GOES_ON_M_PER_S, _GOES_ON_M = 30.0, 2.0, 1.5
+#: Worlds are drawn with this seed and their number.
+_SEED: Final = 2012
+
+
+class WorldTracks(NamedTuple):
+    """The rows (R,) of a world, ordered by track and frame, from samples.
+
+    What a row has are the values of the sample ``before``, and ``share`` of the way from there to ``after``: 0 at a
+    sample, from 0 to 1 in a gap, below 0 where a track begins earlier or ends later than it was seen.
+    ``observed`` are samples. ``late`` is the share of tracks that begin in the middle of the seen area.
+    """
+
+    track: Ints
+    frame: Ints
+    before: Ints
+    after: Ints
+    share: Floats
+    observed: Bools
+    late: float
+
+    @property
+    def people(self) -> int:
+        """The number of tracks."""
+        return len(np.unique(self.track))
+
+    def values(self, samples: Floats) -> Floats:
+        """The values of samples (N, ...) in each row (R, ...)."""
+        share = self.share.reshape(-1, *[1] * (samples.ndim - 1))
+        start = samples[self.before]
+        return np.asarray(np.where(share == 0, start, start + share * (samples[self.after] - start)))
+
+
+def smoothed_places(source: Ints, t_ns: Ints, xy_m: Floats, smoothed: Rows, smoothed_ns: Ints) -> Floats:
+    """Places (N, 2) of samples, those that re-tracking gave them in its rows ``smoothed``; others stay at ``xy_m``."""
+    at, xy_m = find_rows((smoothed["source_id"], smoothed_ns), (source, t_ns)), xy_m.copy()
+    xy_m[at >= 0] = np.stack([smoothed[name][at[at >= 0]] for name in ("x_m", "y_m")], axis=1)
+    return xy_m
+
+
+def tracks_in_worlds(
+    source: Ints,
+    class_id: Ints,
+    frame: Ints,
+    xy_m: Floats,
+    t_ns: Ints,
+    worlds: Rows | Mapping[str, NDArray[Any]],
+    begin_ns: Ints,
+) -> Iterator[WorldTracks]:
+    """The tracks of each world.
+
+    Parameters
+    ----------
+    source, class_id, frame : (N,) of int
+        The input id, the class and the frame of each sample.
+    xy_m : (N, 2) of float
+    t_ns : (F,) of int
+        The times of frames.
+    worlds : Rows, or a mapping with their columns
+        Rows of Worlds; ``begin_ns`` are their times.
+    """
+    track, own = _tracklets(source, frame, t_ns, worlds, begin_ns)
+    seen = _Seen.of(xy_m, (track >= 0).mean(axis=0)[own] >= 0.5)
+    for world, names in enumerate(track):
+        name = names[own]
+        kept = np.flatnonzero(name >= 0)
+        kept = kept[np.lexsort((frame[kept], name[kept]))]
+        yield _World(name[kept], frame[kept], kept, xy_m[kept], class_id[kept], t_ns, seen, world).tracks()
+
+
+def _tracklets(
+    source: Ints, frame: Ints, t_ns: Ints, rows: Rows | Mapping[str, NDArray[Any]], begin_ns: Ints
+) -> tuple[Ints, Ints]:
+    """The track of each tracklet in each world (W, K + 1), -1 for none, and the tracklet of each sample (N,)."""
+    frames = len(t_ns) + 1
+    begin = np.searchsorted(t_ns, begin_ns)
+    (of_source, first), which = np.unique(np.stack([rows["source_id"], begin]), axis=1, return_inverse=True)
+    numbers, world = np.unique(rows["world"], return_inverse=True)
+    track = np.full((len(numbers), len(of_source) + 1), -1)
+    track[world, which.ravel()] = np.where(rows["kept"], rows["track_id"], -1)
+    end = np.zeros(len(of_source), np.int64)
+    until_ns = begin_ns + (rows["duration_s"] * NS_PER_S).astype(np.int64) + _ROUNDED_NS
+    end[which.ravel()] = np.searchsorted(t_ns, until_ns, "right")
+    sources = np.unique(of_source)
+    begins = np.searchsorted(sources, of_source) * frames + first
+    own = np.searchsorted(begins, np.searchsorted(sources, source) * frames + frame, "right") - 1
+    while (ended := (own >= 0) & (of_source[own] == source) & (frame >= end[own])).any():
+        own[ended] -= 1  # the tracklet before goes on beside the one that has ended
+    is_own = (own >= 0) & (of_source[own] == source)
+    return track, np.where(is_own, own, len(of_source))
+
+
+class _Seen(NamedTuple):
+    """The seen area: a convex polygon as half planes (E, 3), and how deep each sample is inside (N,), in metres."""
+
+    planes: Floats
+    depth: Floats
+
+    @classmethod
+    def of(cls, xy_m: Floats, usual: Bools) -> _Seen:
+        """Around the ``usual`` samples; without an extent all is at its border."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        planes = np.array([[0.0, 0.0, 0.0]])
+        around = xy_m[usual & np.isfinite(xy_m).all(axis=1)]
+        if len(around) > 2:
+            with suppress(QhullError):
+                planes = ConvexHull(around).equations
+        return cls(planes, cls.inside(planes, xy_m))
+
+    @staticmethod
+    def inside(planes: Floats, xy_m: Floats) -> Floats:
+        """The distance of places (N, 2) from the border, below 0 outside."""
+        out = np.full(len(xy_m), np.inf)
+        for x, y, offset in planes:
+            out = np.minimum(out, -(x * xy_m[:, 0] + y * xy_m[:, 1] + offset))
+        return out
+
+
+#: The track, the frame, the samples before and after, and the share of rows.
+_Rows = tuple[Ints, Ints, Ints, Ints, Floats]
+
+
+class _World:
+    """A world: its samples (N,) ordered by track and frame, and what is drawn about the ends of its tracks (T,)."""
+
+    def __init__(
+        self,
+        track: Ints,
+        frame: Ints,
+        sample: Ints,
+        xy_m: Floats,
+        class_id: Ints,
+        t_ns: Ints,
+        seen: _Seen,
+        world: int,
+    ) -> None:
+        self.frame, self.sample, self.xy_m, self.planes = frame, sample, xy_m, seen.planes
+        self.s = (t_ns - t_ns[:1]) / NS_PER_S
+        self.rng = np.random.default_rng([_SEED, world])
+        starts = run_starts(track)
+        self.first, self.last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
+        self.of, self.names = np.cumsum(starts) - 1, track[starts]
+        self.depth, self.class_id = seen.depth[sample], class_id
+        self.begins, self.before_begin = self._in_the_middle(self.first, 1)
+        self.ends, self.after_end = self._in_the_middle(self.last, -1)
+
+    def _in_the_middle(self, end: Ints, way: int) -> tuple[Bools, Ints]:
+        """Which ends (T,) of tracks are in the middle of what was seen, and the sample that tells the motion there."""
+        inner = np.clip(end + way * _SAMPLES, self.first, self.last)
+        seconds = np.abs(self.s[self.frame[inner]] - self.s[self.frame[end]])
+        moved_m = np.hypot(*(self.xy_m[inner] - self.xy_m[end]).T)
+        speed = np.divide(moved_m, seconds, out=np.zeros(len(end)), where=seconds > 0)
+        frames = np.minimum(self.frame[end], len(self.s) - 1 - self.frame[end])
+        return (self.depth[end] > _BORDER_M + _BORDER_S * speed) & (frames > _BORDER_FRAMES), inner
+
+    def tracks(self) -> WorldTracks:
+        """Draw which tracks go on as others, how long people were unseen, and who was not seen at all."""
+        late = float(self.begins.mean()) if len(self.names) else 0.0
+        go_on = float(self.rng.random()) ** 0.5  # most do; the other explanation stays likely
+        goes_on, root = self._joined(self.rng.random(len(self.names)) < go_on)
+        begins, ends = self.begins & (root == np.arange(len(root))), self.ends & ~goes_on
+        rows = np.arange(len(self.frame))
+        parts = [
+            (root[self.of], self.frame, rows, rows, np.zeros(len(rows))),
+            self._unseen(begins, self.first, self.before_begin, -1, root),
+            self._unseen(ends, self.last, self.after_end, 1, root),
+            self._never_seen(late, go_on),
+        ]
+        track, frame, before, after, share = (np.concatenate(values) for values in zip(*parts, strict=True))
+        order = np.lexsort((frame, track))
+        track, frame, before, after, share = (values[order] for values in (track, frame, before, after, share))
+        others = self.names.max(initial=0) + 1 + np.arange(track.max(initial=0) + 1)
+        names = np.append(self.names, others)  # of those who were never tracked others than all tracks have
+        return self._filled(names[track], frame, before, after, share, order < len(rows), late)
+
+    def _joined(self, wanted: Bools) -> tuple[Bools, Ints]:
+        """Which tracks (T,) go on as another one, and the first track of each (T,)."""
+        count, root = len(self.names), np.arange(len(self.names))
+        goes_on = np.zeros(count, bool)
+        enders, beginners = np.flatnonzero(self.ends), np.flatnonzero(self.begins & wanted)
+        end_s, begin_s = self.s[self.frame[self.last[enders]]], self.s[self.frame[self.first[beginners]]]
+        order = np.argsort(end_s, kind="stable")
+        enders, end_s = enders[order], end_s[order]
+        low, high = np.searchsorted(end_s, begin_s - _GOES_ON_S), np.searchsorted(end_s, begin_s)
+        before, after = enders[ragged_range(low, high - low)], np.repeat(beginners, high - low)
+        gap_s = np.repeat(begin_s, high - low) - self.s[self.frame[self.last[before]]]
+        apart_m = np.hypot(*(self.xy_m[self.first[after]] - self.xy_m[self.last[before]]).T)
+        near = apart_m < _GOES_ON_M + _GOES_ON_M_PER_S * gap_s
+        near &= self.class_id[self.first[after]] == self.class_id[self.first[before]]
+        before, after, gap_s, apart_m = before[near], after[near], gap_s[near], apart_m[near]
+        cost = apart_m / (1 + gap_s / 2) + np.log(gap_s) + self.rng.gumbel(size=len(gap_s)) / 2
+        order = np.argsort(cost, kind="stable")
+        before, after = before[order], after[order]
+        while len(before):  # the best of all, and of those that are left
+            chosen = np.intersect1d(np.unique(before, return_index=True)[1], np.unique(after, return_index=True)[1])
+            root[after[chosen]] = before[chosen]
+            goes_on[before[chosen]] = True
+            left = ~np.isin(before, before[chosen]) & ~np.isin(after, after[chosen])
+            before, after = before[left], after[left]
+        while (root != root[root]).any():
+            root = root[root]
+        return goes_on, root
+
+    def _unseen(self, are: Bools, end: Ints, inner: Ints, way: int, root: Ints) -> _Rows:
+        """The rows before or after some ends of tracks: one is anywhere within a gap as tracks have that go on."""
+        which = np.flatnonzero(are)
+        gaps = np.diff(self.frame)[np.diff(self.of) == 0] - 1
+        gaps = gaps[gaps > 0]
+        if not len(gaps):
+            which = which[:0]
+        steps = self.rng.choice(gaps, len(which)) if len(which) else which
+        at, to = end[which], inner[which]
+        room = self.frame[at] if way < 0 else len(self.s) - 1 - self.frame[at]
+        steps = np.minimum(np.round(steps * self.rng.random(len(which))).astype(np.int64), room)
+        rows, step = np.repeat(np.arange(len(which)), steps), ragged_range(np.ones(len(steps), np.int64), steps)
+        at, to, track = at[rows], to[rows], root[which][rows]
+        frame = self.frame[at] + way * step
+        from_s, to_s = self.s[self.frame[at]], self.s[self.frame[to]]
+        share = np.divide(self.s[frame] - from_s, to_s - from_s, out=np.zeros(len(at)), where=to_s != from_s)
+        places = self.xy_m[at] + share[:, None] * (self.xy_m[to] - self.xy_m[at])
+        inside = _Seen.inside(self.planes, places) > 0
+        return track[inside], frame[inside], at[inside], to[inside], share[inside]
+
+    def _never_seen(self, late: float, go_on: float) -> _Rows:
+        """The rows of people who were never tracked: such as those who were seen late or lost, at other times."""
+        middle = self.depth > _BORDER_M + _BORDER_S * self._usual_speed()
+        share = min(late / max(float(middle.mean()) if len(middle) else 0.0, 0.2), 0.9)
+        like = np.flatnonzero(self.begins | self.ends)
+        more = int(self.rng.poisson((1 - go_on) * share**2 * len(self.names))) if len(like) else 0
+        like = like[self.rng.integers(0, max(len(like), 1), more)]
+        at = ragged_range(self.first[like], sizes := self.last[like] - self.first[like] + 1)
+        room = len(self.s) - 1 - self.frame[self.last[like]] + self.frame[self.first[like]]
+        shift = np.floor(self.rng.random(more) * (room + 1)).astype(np.int64) - self.frame[self.first[like]]
+        track = np.repeat(len(self.names) + np.arange(more), sizes)
+        return track, self.frame[at] + np.repeat(shift, sizes), at, at, np.zeros(len(at))
+
+    def _usual_speed(self) -> float:
+        """The median speed from sample to sample."""
+        same = np.diff(self.of) == 0
+        seconds = np.diff(self.s[self.frame])[same]
+        return float(np.median(np.hypot(*np.diff(self.xy_m, axis=0)[same].T) / seconds)) if len(seconds) else 0.0
+
+    def _filled(
+        self, track: Ints, frame: Ints, before: Ints, after: Ints, share: Floats, observed: Bools, late: float
+    ) -> WorldTracks:
+        """With rows on a straight line in the frames between those of a track."""
+        gap = np.flatnonzero((track[1:] == track[:-1]) & (np.diff(frame) > 1))
+        steps = frame[gap + 1] - frame[gap] - 1
+        here = np.repeat(gap, steps)
+        between = ragged_range(frame[gap] + 1, steps)
+        times = self.s[frame[here]], self.s[between], self.s[frame[here + 1]]
+        part = np.ones(len(here)) * (times[1] - times[0]) / (times[2] - times[0])
+        track, frame = np.append(track, track[here]), np.append(frame, between)
+        before, after = np.append(before, before[here]), np.append(after, before[here + 1])
+        share, observed = np.append(share, part), np.append(observed, np.zeros(len(here), bool))
+        order = np.lexsort((frame, track))
+        sides = self.sample[before[order]], self.sample[after[order]]
+        return WorldTracks(track[order], frame[order], *sides, share[order], observed[order], late)
