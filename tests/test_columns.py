@@ -16,7 +16,7 @@ from google.protobuf.message import DecodeError
 from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from mcaptrack.columns import Malformed, ProtobufColumns, RosColumns, Unsupported, cdr
+from mcaptrack.columns import Malformed, ProtobufColumns, RosColumns, Unsupported
 
 NS = 10**9
 #: Types whose alignment, lengths and nesting are awkward.
@@ -202,10 +202,8 @@ def types_of(store: Any, share: int) -> list[str]:
     return [*sorted(set(store.fielddefs) - set(CUSTOM))[::share], *CUSTOM]
 
 
-@pytest.mark.parametrize("copied", [2048, 0], ids=["copied", "in place"])
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_columns_equal_what_rosbags_reads(encoding: str, copied: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cdr, "_COPIED", copied)
+def test_columns_equal_what_rosbags_reads(encoding: str) -> None:
     store = store_of(encoding)
     for name in types_of(store, 4):
         try:
@@ -260,12 +258,8 @@ def damaged(draw: random.Random, payload: bytes, has_head: bool) -> bytes:
     return bytes(out)
 
 
-@pytest.mark.parametrize("copied", [2048, 0], ids=["copied", "in place"])
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
-def test_damaged_messages_are_refused_where_rosbags_refuses_them(
-    encoding: str, copied: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cdr, "_COPIED", copied)
+def test_damaged_messages_are_refused_where_rosbags_refuses_them(encoding: str) -> None:
     store = store_of(encoding)
     refused = 0
     for name in types_of(store, 9):

@@ -106,7 +106,7 @@ class _Rows:
 
         self._source, self._types, self._done = source, types, source.first
         head = self._head(_NO_MESSAGES).schema
-        names = dict.fromkeys(head.names, ())
+        names = {RECORDING.name, *map(str.lower, head.names)}
         columns = list(head)
         for path, kind in types.items():
             unit = "ns" if path[-1].endswith("_ns") or pa.types.is_timestamp(kind) else _unit(source.schema_name, path)
@@ -397,14 +397,13 @@ def _settled(kind: Any) -> Any:
     return kind
 
 
-def _free_name(wanted: str, names: dict[str, Any]) -> str:
+def _free_name(wanted: str, taken: set[str]) -> str:
     """The name, with a number if it is taken, by a column that SQL adds as well; case is ignored, as in SQL."""
     name, number = wanted, 1
-    taken = {RECORDING.name, *(name_taken.lower() for name_taken in names)}
     while name.lower() in taken:
         number += 1
         name = f"{wanted}_{number}"
-    names[name] = ()
+    taken.add(name.lower())
     return name
 
 
