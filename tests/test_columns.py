@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 import random
+import tracemalloc
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -24,7 +25,7 @@ CUSTOM = {
     "test_msgs/msg/Deep": "bool flag\nfloat64 x\nuint8 tail\n",
     "test_msgs/msg/Odd": (
         "uint8 a\nfloat64 b\nint16 c\nuint8[3] d\nint8[] e\nbool[] f\nstring[2] g\nint64[] h\nuint16[] i\n"
-        "string j\nuint8 k\n"
+        "string j\nuint8 k\nstring<=3 l\nint16[<=3] m\n"
     ),
     "test_msgs/msg/All": (
         "test_msgs/Odd[] odds\ntest_msgs/Deep[] deeps\ntest_msgs/Odd[2] pair\ntest_msgs/Deep[3] three\nint8 z\n"
@@ -56,10 +57,10 @@ class Draw:
         self.random, self.store = random.Random(seed), store
         self.counts = self.random.choice([[0], [1], [3], [0, 1, 2, 3, 7], [0, 20], [2]])
 
-    def base(self, kind: str, most: int) -> Any:
+    def base(self, kind: str) -> Any:
         draw = self.random
         if kind == "string":
-            count = draw.randint(0, most // 3) if most else draw.choice([0, 1, 2, 3, 5, 8, 13, 30])
+            count = draw.choice([0, 1, 2, 3, 5, 8, 13, 30])
             return "".join(draw.choice("abcé日/_ ") for _ in range(count))
         if kind == "bool":
             return draw.random() < 0.5
@@ -73,14 +74,14 @@ class Draw:
     def value(self, form: Any) -> Any:
         node, what = int(form[0]), form[1]
         if node == 1:
-            return self.base(*what)
+            return self.base(what[0])
         if node == 2:
             fields = self.store.fielddefs[what][1]
             is_time = {name for name, _ in fields} in TIMES
             inner = {name: self.random.randint(0, 2**31 - 1) % NS if is_time else self.value(of) for name, of in fields}
             return self.store.types[what](**inner)
         member, count = what
-        size = count if node == 3 else self.random.randint(0, count) if count else self.random.choice(self.counts)
+        size = count if node == 3 else self.random.choice(self.counts)
         values = [self.value(member) for _ in range(size)]
         is_number = int(member[0]) == 1 and member[1][0] != "string"
         plain = {"bool": "bool", "byte": "uint8", "char": "uint8", "octet": "uint8"}
@@ -288,6 +289,25 @@ def test_damaged_messages_are_refused_where_rosbags_refuses_them(encoding: str) 
                 assert expected is not None, (name, payloads[bad])
                 assert same(without_empty(expected), rows[bad])
     assert refused > 50
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_messages_that_only_say_they_are_large_take_no_room(encoding: str) -> None:
+    store = store_of(encoding)
+    name = "test_msgs/msg/Large"
+    for kind in (
+        "string", "string[]", "float64[]", "float64[9000000]", "string[9000000]", "std_msgs/Empty[]", "test_msgs/Odd[]",
+        "test_msgs/Odd[9000000]",
+    ):  # fmt: skip
+        definitions = store.fielddefs | get_types_from_msg(f"{kind} values", name)
+        columns = RosColumns(definitions, name, encoding)
+        payloads = [b"\0\1\0\0" + b"\xff\xff\xff\0" * 9] * 20
+        tracemalloc.start()
+        with pytest.raises(Malformed):
+            columns.read(*laid_out(payloads, None))
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert peak < 2**20, kind
 
 
 # Protobuf

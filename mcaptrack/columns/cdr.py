@@ -281,9 +281,9 @@ def is_utf8(text: bytes) -> bool:
 class _List(_Counted):
     """A sequence, or an array of ``fixed`` elements; bytes become binary, others lists."""
 
-    def __init__(self, of: _Type, fixed: int | None, most: int, order: str, is_aligned: bool) -> None:
+    def __init__(self, of: _Type, fixed: int | None, order: str, is_aligned: bool) -> None:
         super().__init__(order, is_aligned)
-        self.of, self.fixed, self.most = of, fixed, most
+        self.of, self.fixed = of, fixed
         self.is_bytes = isinstance(of, _Number) and of.is_byte
         self.is_blob = self.is_bytes and fixed is None
         self.stride = of.size + -of.size % of.align if of.size >= 0 else 0 if fixed == 0 else -1
@@ -303,9 +303,6 @@ class _List(_Counted):
         cursor.need(counts * self.of.least, "lists")
         if not self.of.least and int(counts.sum()) > len(cursor.data):  # empty messages of ROS 1
             raise _Outside("a list of it is longer than all messages", int(cursor.end[np.argmax(counts)]))
-        if self.most and (counts > self.most).any():
-            bad = np.flatnonzero(counts > self.most)[0]
-            raise _Outside(f"a list of it has more than {self.most} elements", int(cursor.end[bad]))
         return counts
 
     def read(self, cursor: Cursor) -> pa.Array:
@@ -510,8 +507,8 @@ class RosColumns:
             return self._struct(what, order, path)
         if node in (_ARRAY, _SEQUENCE):
             member, count = what
-            fixed, most = (count, 0) if node == _ARRAY else (None, count)
-            return _List(self._type(member, order, path), fixed, most, order, self.is_cdr)
+            fixed = count if node == _ARRAY else None  # lists beyond their bound are read, as strings are
+            return _List(self._type(member, order, path), fixed, order, self.is_cdr)
         if what[0] == "string":
             return _Text(order, self.is_cdr)
         if what[0] not in _NUMBERS:
