@@ -46,7 +46,9 @@ def recording(path: Path, seed: int, compression: CompressionType = CompressionT
         writer = Writer(stream, chunk_size=draw.choice([600, 4000, 20_000]), compression=compression)
         writer.start()
         schema = writer.register_schema("test_msgs/msg/A", "ros2msg", DEFINITION)
-        numbers = {topic: writer.register_channel(topic, "cdr", schema) for topic in TOPICS}
+        of_lists = writer.register_schema("test_msgs/msg/B", "ros2msg", DEFINITION + b"string[] names\n")
+        kinds = {"/empty": of_lists}
+        numbers = {topic: writer.register_channel(topic, "cdr", kinds.get(topic, schema)) for topic in TOPICS}
         for t_ns, topic, data in events:
             writer.add_message(numbers[topic], t_ns, data, t_ns)
         writer.finish()
