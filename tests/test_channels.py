@@ -198,12 +198,18 @@ def test_pages_of_lists_and_structs_have_dictionaries_of_text() -> None:
     }
 
 
+#: Messages that Arrow reads in another way than Python, or that others make so.
 ODD = (
-    b'{"a": 9007199254740993.0}', b'{"a": 18446744073709551615}', b'{"s": "2020-01-01 00:00:00"}', b'{"a":', b"", b"[1]",
-    b'{"a": {"sec": 1}}', b'{"at": {"sec": 1, "nanosec": 2.5}}', b'{"at": null}', b'{"a": 1, "a": 2}', b'{"s": "\\ud800"}',
-    b'{"s": "\xff"}', b'{"v": [1, "x"]}', b'{"v": [[1]]}', b'{"v": [{"x": 1}]}', b'{"a": Inf}', b'{"a": 1}{"a": 2}', b"{}",
-    b'{"a": Infinity}', b'{"a": 1e400}', b'{"inner": {"z": true}}', b'{"inner": null}', b'{\n"a": 1\n}', b'{"a": 1',
-    b'"b": 2}', b'{"a": true}', b'{"at": {"nanosec": 1, "sec": 2}}', b'{"at": {"sec": 99999999999, "nanosec": 1}}',
+    (b'{"a": 9007199254740993}', b'{"a": 0.5}'), (b'{"a": 18446744073709551615}',), (b'{"a": [9007199254740993, 0.5]}',),
+    (b'{"s": "2020-01-01 00:00:00"}',), (b'{"s": ["2020-01-01"]}',), (b'{"s": "\\ud800"}',), (b'{"s": "\xff"}',),
+    (b'{"a":',), (b"",), (b"[1]",), (b"{}",), (b'{"a": 1, "a": 2}',), (b'{\n"a": 1\n}',), (b' {"a": 1}',), (b'{"a": Inf}',),
+    (b'{"a": Infinity}',), (b'{"a": 1e400}',), (b'{"a": 1}{"a": 2}',), (b'{"a": 1,', b'"b": 2}', b'{"a": 1}{"a": 2}'),
+    (b'{"v": [1, "x"]}',), (b'{"v": [[1]]}',), (b'{"v": [{"x": 1}]}',), (b'{"a": true}', b'{"a": 1}'),
+    (b'{"v": [{"at": {"sec": 1, "nanosec": 2}}]}',), (b'{"at": {"sec": 1}}',), (b'{"at": {"sec": 1, "nanosec": 2.5}}',),
+    (b'{"at": {"sec": 1, "nanosec": 5}}', b'{"at": {"sec": 1}}'), (b'{"at": {"sec": 1, "nanosec": 5}}', b'{"at": null}'),
+    (b'{"at": {"nanosec": 1, "sec": 2}}',), (b'{"at": {"sec": 99999999999, "nanosec": 1}}',), (b'{"sec": 1, "nanosec": 2}',),
+    (b'{"at": {"sec": 1, "nanosec": true}}',), (b'{"in": {"z": true}}', b'{"in": null}'), (b'{"in": {"y": 1}, "z": 1}',),
+    (b'{"in": {"x": 1}}', b'{"z": 1, "in": {"y": 1}}'), (b'{"in": {}}', b'{"in": 1}'), (b'{"a": 1}', b'{"b": 1}'),
 )  # fmt: skip
 
 
@@ -234,11 +240,12 @@ def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
         at_once += bool(columns)
         return columns
 
-    for seed in range(part * 30, part * 30 + 30):
+    for seed in range(part * 100, part * 100 + 100):
         draw = random.Random(seed)
-        payloads = list(json_messages(draw))
-        for _ in range(draw.choice([0, 0, 1, 2])):
-            payloads.insert(draw.randrange(len(payloads) + 1), draw.choice(ODD))
+        payloads = list(json_messages(draw)) if draw.random() < 0.5 else []
+        for _ in range(draw.choice([0, 1, 2]) if payloads else draw.choice([1, 1, 2])):
+            place = draw.randrange(len(payloads) + 1)
+            payloads[place:place] = draw.choice(ODD)
         path = tmp_path / f"{seed}.mcap"
         with path.open("wb") as stream:
             writer = Writer(stream)
@@ -251,8 +258,10 @@ def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
         for reader in (counted, lambda *_: {}):
             monkeypatch.setattr(tables_of_messages, "_json_columns", reader)
             with mcaptrack.open(path) as opened, collected():
-                tables.append(opened.table("/j"))
-        first, second = tables
-        assert first.schema.equals(second.schema, check_metadata=True), seed
-        assert str(first.to_pylist()) == str(second.to_pylist()), seed  # NaN is not NaN
+                try:
+                    table = opened.table("/j")
+                    tables.append((table.schema.to_string(), str(table.to_pylist())))  # NaN is not NaN
+                except McaptrackError as error:
+                    tables.append(("", str(error)))
+        assert tables[0] == tables[1], seed
     assert at_once > 5

@@ -417,7 +417,9 @@ def test_damaged_messages_are_refused_where_protobuf_refuses_them(name: str) -> 
         payload = damaged(draw, message.SerializeToString(), has_head=False)
         if draw.random() < 0.3:
             place = draw.randrange(len(payload) + 1)
-            varint = draw.choice([b"\xff", b"\x80"]) * draw.choice([1, 4, 5, 9, 10]) + draw.randbytes(1)
+            varint = draw.choice([b"\xff", b"\x80"]) * draw.choice([1, 4, 5, 9, 10]) + draw.choice(
+                [b"\0", draw.randbytes(1)]
+            )
             payload = payload[:place] + draw.choice([b"", b"\x12", b"\x10", b"\x90"]) + varint + payload[place:]
         try:
             expected = kind.FromString(payload)

@@ -165,7 +165,7 @@ class _Fields:
         number = (tag >> np.uint64(3)).astype(np.int64)
         if (wire == _GROUP).any():
             raise Unsupported("groups are not read")
-        bad = (tag_size > _SHORT) | (size < 0) | (number < 1) | (number >= _NUMBERS) | (at > end) | (size > end - at)
+        bad = (tag_size > _SHORT) | (size < 0) | (number < 1) | (number >= _NUMBERS) | (size > end - at)
         if bad.any():
             raise Malformed("a field of it can't be", int(self.message[row[np.argmax(bad)]]))
         return row, number, wire, at, size
