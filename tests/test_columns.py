@@ -415,12 +415,13 @@ def test_damaged_messages_are_refused_where_protobuf_refuses_them(name: str) -> 
         message = kind()
         fill(draw, message, [0, 1, 2])
         payload = damaged(draw, message.SerializeToString(), has_head=False)
-        if draw.random() < 0.3:
-            place = draw.randrange(len(payload) + 1)
-            varint = draw.choice([b"\xff", b"\x80"]) * draw.choice([1, 4, 5, 9, 10]) + draw.choice(
-                [b"\0", draw.randbytes(1)]
-            )
-            payload = payload[:place] + draw.choice([b"", b"\x12", b"\x10", b"\x90"]) + varint + payload[place:]
+        if draw.random() < 0.5:  # a field of it with other bytes, and a number of more bytes than it needs
+            place, size = draw.choice([0, len(payload), draw.randrange(len(payload) + 1)]), draw.randrange(12)
+            tag = bytes([draw.choice(kind.DESCRIPTOR.fields).number << 3 | draw.choice([2, 2, 0])])
+            more = draw.choice([0, 0, 3, 4, 5, 9])
+            number = bytes([size | 128]) + b"\x80" * more + b"\0" if more else bytes([size])
+            tag = bytes([tag[0] | 128]) + b"\x80" * more + b"\0" if draw.random() < 0.3 else tag
+            payload = payload[:place] + tag + number + draw.randbytes(size) + payload[place:]
         try:
             expected = kind.FromString(payload)
         except DecodeError:

@@ -5,7 +5,7 @@ field is in the column's metadata. Columns have the types of the definition; mes
 that can't be read has no values, and costs the others nothing.
 
 Messages without a definition (JSON) have the types of their values, which are known when all were read, so they wait in
-a temporary file: numbers, texts, lists and structs; values that no type holds become JSON text. Thousands that are alike
+a temporary file: numbers, texts, lists and structs; values that no type holds become JSON text. Messages that are alike
 are read at once.
 """
 
@@ -329,9 +329,9 @@ def _times(parts: Sequence[Any]) -> Any:
     """Seconds and nanoseconds as times."""
     import pyarrow as pa
 
-    if any(not pa.types.is_integer(part.type) or part.null_count for part in parts):
+    if not all(pa.types.is_integer(part.type) for part in parts):
         raise _Unlike
-    seconds, rest = (part.to_numpy() for part in parts)
+    seconds, rest = (part.to_numpy() for part in parts)  # raises ArrowInvalid for nulls
     if max(np.abs(seconds).max(), np.abs(rest).max()) > _SOON:
         raise _Unlike
     return pa.array(seconds * NS_PER_S + rest, pa.timestamp("ns"))

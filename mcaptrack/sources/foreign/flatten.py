@@ -117,7 +117,7 @@ class UnreadMessages:
 
 
 def payload_decoder(opened: log.Log, topic: str, make: Callable[[MessageType], T]) -> T:
-    """What ``make`` gives for the type of a channel, to decode its payloads. Raises McaptrackError, with the topic, if
+    """The decoder of payloads that ``make`` makes for the type of a channel. Raises McaptrackError, with the topic, if
     that type isn't read.
     """
     try:
