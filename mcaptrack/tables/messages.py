@@ -329,9 +329,7 @@ def _times(parts: Sequence[Any]) -> Any:
     """Seconds and nanoseconds as times."""
     import pyarrow as pa
 
-    if not all(pa.types.is_integer(part.type) for part in parts):
-        raise _Unlike
-    seconds, rest = (part.to_numpy() for part in parts)  # raises ArrowInvalid for nulls
+    seconds, rest = (part.to_numpy() for part in parts)  # Arrow refuses nulls here, and parts of numbers as times
     if max(np.abs(seconds).max(), np.abs(rest).max()) > _SOON:
         raise _Unlike
     return pa.array(seconds * NS_PER_S + rest, pa.timestamp("ns"))
