@@ -9,9 +9,8 @@ The elements of a list become the rows of another cursor. Their positions follow
 size. Otherwise (messages with strings or lists in them) the first elements of all messages are skipped together, then
 the second ones, and so on; where few messages have that many, element by element.
 
-Alignment (XCDR1) is relative to the end of the 4-byte head of a message, wherever that stands. Short messages are
-copied to multiples of 8, unless all are as far from these already; long ones are read in place. So is ROS 1, which has
-neither heads nor alignment.
+Alignment (XCDR1) is relative to the end of the 4-byte head of a message, wherever that stands; ROS 1 has neither heads
+nor alignment. Messages are read in place: to copy them to multiples of 8 first costs as much as it saves.
 
 Nothing is read, nor room made for it, before it is certain to be within its message: other messages raise Malformed.
 
@@ -42,8 +41,6 @@ _MAX_BYTES: Final = 2**31 - 1
 _NS_PER_S: Final = 10**9
 #: Numbers of CDR are aligned to at most so many bytes behind the head of a message.
 _GRID: Final = 8
-#: Longer messages, on average, are not copied to aligned places.
-_COPIED: Final = 2048
 #: Writers may fill up the end of a message.
 _PADDING: Final = 3
 #: The fields of times and durations, in ROS 2 and ROS 1.
@@ -284,9 +281,9 @@ def is_utf8(text: bytes) -> bool:
 class _List(_Counted):
     """A sequence, or an array of ``fixed`` elements; bytes become binary, others lists."""
 
-    def __init__(self, of: _Type, fixed: int | None, most: int, order: str, is_aligned: bool) -> None:
+    def __init__(self, of: _Type, fixed: int | None, order: str, is_aligned: bool) -> None:
         super().__init__(order, is_aligned)
-        self.of, self.fixed, self.most = of, fixed, most
+        self.of, self.fixed = of, fixed
         self.is_bytes = isinstance(of, _Number) and of.is_byte
         self.is_blob = self.is_bytes and fixed is None
         self.stride = of.size + -of.size % of.align if of.size >= 0 else 0 if fixed == 0 else -1
@@ -306,9 +303,6 @@ class _List(_Counted):
         cursor.need(counts * self.of.least, "lists")
         if not self.of.least and int(counts.sum()) > len(cursor.data):  # empty messages of ROS 1
             raise _Outside("a list of it is longer than all messages", int(cursor.end[np.argmax(counts)]))
-        if self.most and (counts > self.most).any():
-            bad = np.flatnonzero(counts > self.most)[0]
-            raise _Outside(f"a list of it has more than {self.most} elements", int(cursor.end[bad]))
         return counts
 
     def read(self, cursor: Cursor) -> pa.Array:
@@ -513,8 +507,8 @@ class RosColumns:
             return self._struct(what, order, path)
         if node in (_ARRAY, _SEQUENCE):
             member, count = what
-            fixed, most = (count, 0) if node == _ARRAY else (None, count)
-            return _List(self._type(member, order, path), fixed, most, order, self.is_cdr)
+            fixed = count if node == _ARRAY else None  # lists beyond their bound are read, as strings are
+            return _List(self._type(member, order, path), fixed, order, self.is_cdr)
         if what[0] == "string":
             return _Text(order, self.is_cdr)
         if what[0] not in _NUMBERS:
@@ -548,14 +542,8 @@ class RosColumns:
 
     def _read(self, data: Bytes, start: Ints, end: Ints, order: str) -> dict[Path, pa.Array]:
         """The columns of messages of one byte order."""
-        shift, sizes = start % _GRID, end - start
-        origin: Ints | int = 0
-        if self.is_cdr and not _are_equal(shift) and int(sizes.sum()) <= _COPIED * len(start):
-            slots = ends_of((sizes | (_GRID - 1)) + 1)
-            data, start = Cursor(data, start, end, 1, _step(start)).joined(sizes, slots), slots[:-1]
-            end = start + sizes
-        elif self.is_cdr and len(start):
-            origin = int(shift[0]) if _are_equal(shift) else shift
+        shift = start % _GRID if self.is_cdr else np.empty(0, np.int64)
+        origin = shift if not _are_equal(shift) else int(shift[0]) if len(shift) else 0
         cursor = Cursor(data, start, end, _GRID, _step(start), origin)
         try:
             out = dict(self._by_order[order].columns(cursor))

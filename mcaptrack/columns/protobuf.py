@@ -49,8 +49,12 @@ _TIME, _DURATION = "google.protobuf.Timestamp", "google.protobuf.Duration"
 _NS_PER_S: Final = 10**9
 #: Times that are so far from 1970 have no nanoseconds in 64 bits: they are null.
 _FAR_S: Final = 2**63 // _NS_PER_S - 4
-#: Wire types: a varint, 8 bytes, as many bytes as its varint says, 4 bytes.
-_VARINT, _WIDE, _SIZED_BYTES, _NARROW = 0, 1, 2, 5
+#: Wire types: a varint, 8 bytes, as many bytes as its varint says, fields up to a mark, 4 bytes.
+_VARINT, _WIDE, _SIZED_BYTES, _GROUP, _NARROW = 0, 1, 2, 3, 5
+#: The bytes of a tag or a length.
+_SHORT: Final = 5
+#: Fields have smaller numbers.
+_NUMBERS: Final = 2**29
 #: Bytes behind a message that a varint at its end may be read beyond.
 _PADDING: Final = 16
 
@@ -71,7 +75,7 @@ def _varints(data: Bytes, at: Ints) -> tuple[NDArray[np.uint64], Ints]:
     long = np.flatnonzero(low == 0)
     if len(long):
         eighth, ninth = data[at[long] + 8].astype(np.uint64), data[at[long] + 9].astype(np.uint64)
-        size[long] = np.where(eighth < 0x80, 9, np.where(ninth < 2, 10, 11))
+        size[long] = np.where(eighth < 0x80, 9, np.where(ninth < 0x80, 10, 11))
         value[long] |= (eighth & np.uint64(0x7F)) << np.uint64(56)
         value[long] |= np.where(eighth < 0x80, np.uint64(0), ninth << np.uint64(63))
     return value, size
@@ -127,16 +131,21 @@ class _Fields:
                 at, shift = at + 1, shift + 7
             return value | data[at] << shift, at + 1
 
+        def short(at: int) -> tuple[int, int]:
+            value, behind = varint(at)
+            return value if behind - at <= _SHORT else -1, behind
+
         for index, begin, last in zip(row.tolist(), at.tolist(), end.tolist(), strict=True):
             here = begin
             while here < last:
-                (tag, here), size = varint(here), -1
+                (tag, here), size = short(here), -1
                 if tag & 7 == _SIZED_BYTES and here < last:
-                    size, here = varint(here)
+                    size, here = short(here)
+                elif tag & 7 == _GROUP:
+                    raise Unsupported("groups are not read")
                 elif here < last:
                     size = {_VARINT: varint(here)[1] - here, _WIDE: 8, _NARROW: 4}.get(tag & 7, -1)
-                is_long = tag & 7 == _VARINT and size == 10 and data[here + 9] > 1
-                if not 0 <= size <= last - here or not 0 < tag >> 3 < 2**29 or is_long:
+                if not 0 <= size <= last - here or not 0 < tag >> 3 < _NUMBERS:
                     raise Malformed("a field of it can't be", int(self.message[index]))
                 out.append((index, tag >> 3, tag & 7, here, size))
                 here += size
@@ -151,10 +160,12 @@ class _Fields:
         length, size = _varints(self.data, np.where(has_varint, np.minimum(at, end), len(self.data) - _PADDING))
         at = at + np.where(is_sized, size, 0)
         wide, narrow = np.full_like(at, 8), np.full_like(at, 4)
-        sizes = [length.astype(np.int64), size, wide, narrow]
+        sizes = [np.where(size > _SHORT, -1, length.astype(np.int64)), size, wide, narrow]
         size = np.select([is_sized, wire == _VARINT, wire == _WIDE, wire == _NARROW], sizes, -1)
         number = (tag >> np.uint64(3)).astype(np.int64)
-        bad = (tag_size > 5) | (size < 0) | (number < 1) | (at > end) | (size > end - at)
+        if (wire == _GROUP).any():
+            raise Unsupported("groups are not read")
+        bad = (tag_size > _SHORT) | (size < 0) | (number < 1) | (number >= _NUMBERS) | (size > end - at)
         if bad.any():
             raise Malformed("a field of it can't be", int(self.message[row[np.argmax(bad)]]))
         return row, number, wire, at, size

@@ -331,7 +331,8 @@ class _TableDigest:
         """Add the next rows, an Arrow table."""
         for column, values in zip(self._columns, piece.columns, strict=True):
             for chunk in values.chunks:
-                column.add(chunk)
+                if len(chunk):  # lists of nothing are as no lists
+                    column.add(chunk)
         self.rows += piece.num_rows
 
     def hexdigest(self) -> str:

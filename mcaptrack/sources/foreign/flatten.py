@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -29,6 +29,7 @@ from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defin
 if TYPE_CHECKING:
     from mcaptrack.columns import ProtobufColumns, RosColumns
 
+T = TypeVar("T")
 Path = tuple[str, ...]
 
 _MAX_DEPTH: Final = 32
@@ -37,7 +38,7 @@ _LIMIT_NS: Final = 2**63
 _MOST_UNREAD: Final = 10_000
 #: Times in protobuf, and the field names of those in ROS 1, ROS 2 and JSON of bridges.
 _OF_PROTOBUF: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
-_TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
+TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
 
 
 #: The definitions of open logs that were found by their messages, by topic.
@@ -115,11 +116,9 @@ class UnreadMessages:
         return f"{self._where} at {self._first[0]} ns: {self._first[1]}{many}"
 
 
-def payload_decoder(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
-) -> Callable[[bytes], Any]:
-    """A function that decodes payloads of a channel, which ``make`` makes for its type. Raises McaptrackError, with the
-    topic, if that type isn't read.
+def payload_decoder(opened: log.Log, topic: str, make: Callable[[MessageType], T]) -> T:
+    """The decoder of payloads that ``make`` makes for the type of a channel. Raises McaptrackError, with the topic, if
+    that type isn't read.
     """
     try:
         return make(message_type_of(opened, topic))
@@ -231,12 +230,12 @@ def _is_time(value: Any, fields: Mapping[str, Any]) -> bool:
     if isinstance(value, dict):
         return _nanoseconds(fields) is not None
     descriptor = getattr(value, "DESCRIPTOR", None)
-    return set(fields) in _TIMES if descriptor is None else descriptor.full_name in _OF_PROTOBUF
+    return set(fields) in TIMES if descriptor is None else descriptor.full_name in _OF_PROTOBUF
 
 
 def _nanoseconds(fields: Mapping[str, Any]) -> int | None:
     """A time or duration in nanoseconds; None if fields are none, or if 64 bits don't hold it."""
-    if set(fields) not in _TIMES:
+    if set(fields) not in TIMES:
         return None
     values = [*fields.values()]  # seconds come first
     if next(iter(fields)).startswith("n"):

@@ -234,7 +234,8 @@ def export(
     force: bool = False,
     boxes: BoxesRead | None = None,
 ) -> Exported:
-    """Update the tables of a log in a folder. Tables without rows are written, too, with their columns.
+    """Update the tables of a log in a folder. A table without rows is written for one log of the folder only, so that
+    its columns are known, and patterns such as ``events/*/*.parquet`` find a file.
 
     Parameters
     ----------
@@ -351,6 +352,8 @@ class _Job:
         path = self.path(name)
         if not self._stands(name, path, metadata["source"]):
             pieces = self.contents.pieces(name)
+            if self._is_spare(name, path, pieces.num_rows):
+                return
             note = self.contents.notes.get(name)
             self._write(name, path, pieces, metadata | ({"note": note} if note else {}), TABLES[name].order)
             self.done.notes += [f"{name}: {note}"] if note else []
@@ -363,6 +366,9 @@ class _Job:
         if self._stands(name, path, metadata["source"]):
             metadata_before = tables.file_metadata(path, self.form) or {}
             self._note_left_out(topic, metadata_before.get("left_out", ""))
+            return None
+        if self._is_spare(name, path, self.contents.timing(topic, part).messages):
+            self.reasons[topic] = "it has no messages"
             return None
         messages = self.contents.typed_messages(topic, part) if self.form == "parquet" else None
         if messages is not None:
@@ -399,6 +405,13 @@ class _Job:
             return False
         self.done.rows[name] = int(metadata["rows"])
         return True
+
+    def _is_spare(self, name: str, path: Path, rows: int) -> bool:
+        """Whether a table has no rows, and another log of the folder says what its columns are."""
+        is_spare = not rows and not path.exists() and any(self.folder.glob(f"{name}/{_PREFIX}*/{path.name}"))
+        if is_spare:
+            self.done.rows[name] = 0
+        return is_spare
 
     def _write(self, name: str, path: Path, pieces: object, metadata: dict[str, str], order: Sequence[str]) -> None:
         rows = pieces.num_rows  # type: ignore[attr-defined]  # a table, which only tables knows

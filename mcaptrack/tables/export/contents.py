@@ -341,7 +341,7 @@ class LogTables:
         if self.opened.channel(topic).schema is not None:
             return None
         try:
-            reader = column_reader(message_type_of(self.opened, topic), part.wants, part.blobs)
+            reader = payload_decoder(self.opened, topic, lambda kind: column_reader(kind, part.wants, part.blobs))
         except Unsupported:
             return None
         messages = tables.TypedMessages(self._source(topic, part), reader)
