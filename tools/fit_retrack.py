@@ -261,8 +261,8 @@ def _most(people: np.ndarray) -> int:
     return int(np.bincount(somebody).argmax()) if 2 * len(somebody) >= len(people) else -1
 
 
-def decisions_of(run: Run) -> tuple[Judged, Judged]:
-    """The joins of the offline tracks of a scene, and which tracks are people.
+def decisions_of(run: Run) -> tuple[Judged, Judged, Judged]:
+    """The joins of the offline tracks of a scene, and which tracks are people, of those that are too short apart.
 
     Joins of two false tracks are neither right nor wrong.
     """
@@ -274,7 +274,9 @@ def decisions_of(run: Run) -> tuple[Judged, Judged]:
     counts = (sides >= 0).any(axis=0)
     joins = Judged(decided.hypotheses.scored().log_odds()[link][counts], (sides[0] == sides[1])[counts])
     _, track, count = np.unique(tracks.track, return_inverse=True, return_counts=True)
-    return joins, Judged(decided.log_odds[:, None], np.bincount(track, people >= 0) * 2 >= count)
+    is_person = np.bincount(track, people >= 0) * 2 >= count
+    short = offline._are_short(*reached("_are_short", *run.args))
+    return joins, *(Judged(decided.log_odds[some, None], is_person[some]) for some in (~short, short))
 
 
 def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
@@ -327,10 +329,11 @@ def fit_choices(parts: Sequence[Chosen]) -> dict[str, Any]:
 
 def fit_decisions(scenes: list[Run]) -> dict[str, Any]:
     """The weights of joins that are made, and of tracks."""
-    of_joins, of_people = zip(*told(decisions_of, scenes, "decisions"), strict=True)
+    of_joins, of_people, of_short = zip(*told(decisions_of, scenes, "decisions"), strict=True)
     return {
         "joins": fit_judged(("end", "beginning"), of_joins),
         "decided": fit_judged(("log odds",), of_people),
+        "decided short": fit_judged(("log odds",), of_short),
     }
 
 
@@ -396,11 +399,12 @@ def held(seeds: list[int], steps: int) -> None:
     for name, side in zip(("input", "re-tracked"), parts, strict=True):
         row = summary(combine(side))
         print(f"{name:12}{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")
-    made, people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
+    made, *people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
     show_reliability("joins", offline.JOINS.probability(made[0]), made[1])
-    is_person = probability(people[0][:, 0])
-    is_right = np.where(is_person >= 0.5, people[1], ~people[1])
-    show_reliability("people and false tracks", np.maximum(is_person, 1 - is_person), is_right)
+    for name, (log_odds, are_people) in zip(("people and false tracks", "short tracks"), people, strict=True):
+        is_person = probability(log_odds[:, 0])
+        is_right = np.where(is_person >= 0.5, are_people, ~are_people)
+        show_reliability(name, np.maximum(is_person, 1 - is_person), is_right)
     joins, numbers = zip(*in_worlds, strict=True)
     show_reliability("joins in worlds", *(np.concatenate(both) for both in zip(*joins, strict=True)))
     people, decided, low, middle, high = np.array(numbers).T
@@ -438,7 +442,8 @@ def main() -> None:
     false_tracks._THROUGHOUT = people["stands throughout"]
     for name in ("mean", "spread"):
         setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))
-    offline.PERSON = Logistic(np.ones(1), 0.0, {})  # what is fitted
+    offline.PERSON = offline.SHORT = Logistic(np.ones(1), 0.0, {})  # what is fitted
+    offline._SHORT = np.inf
     judged = fit_decisions(others)
     card = {
         "made_by": f"tools/fit_retrack.py --seeds {' '.join(map(str, seeds))} --steps {given.steps}, "

@@ -73,13 +73,13 @@ def log_odds_in_log(motion: Motion, paths: dict[int, Path], log: tuple[int, int]
     mean, spread = (np.array([FITTED["people"][what][one] for one in PEOPLE]) for what in ("mean", "spread"))
     fitted = np.array(list(PEOPLE.values()))
     known = np.array([[*((np.array([of[one] for one in PEOPLE]) - mean) / spread), 1.0] for of in found.values()])
-    counts = np.array([min(max(path) - min(path) + 1, 20) / 8 for path in paths.values()])
+    counts = np.array([min(len(path), 20) / 8 for path in paths.values()])
     start = np.append(fitted * spread, PERSON_BIAS + fitted @ mean)
 
     def loss(weights: np.ndarray) -> float:
         likely = np.clip(1 / (1 + np.exp(-known @ weights - extra)), 1e-12, 1 - 1e-12)
         entropy = -likely * np.log(likely) - (1 - likely) * np.log(1 - likely)
-        return float(counts @ entropy + 15 * ((weights - start) ** 2).sum())
+        return float(counts @ entropy + 10 * ((weights - start) ** 2).sum())
 
     best = minimize(loss, start, method="BFGS", options={"gtol": 1e-6}).x
     return dict(zip(found, (known @ best + extra).tolist(), strict=True))

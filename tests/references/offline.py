@@ -309,53 +309,25 @@ def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) ->
     return costs
 
 
-def pace(motion: Motion, path: Path, steps: range) -> tuple[float, float] | None:
-    """The mean speed between the first and last position in these steps, and its variance; None for less than 1.2 s."""
-    seen = [step for step in steps if step in path]
-    seconds = (seen[-1] - seen[0]) * motion.step_s if seen else 0.0
-    if seconds < 1.2 - 1e-9:
-        return None
-    (x0, y0), (x1, y1) = path[seen[0]], path[seen[-1]]
-    return hypot(x1 - x0, y1 - y0) / seconds, 2 * motion.noise_m**2 / seconds**2
-
-
-def by_pace(motion: Motion, a: Path, b: Path, met: int, parted: int) -> float:
-    """The log likelihood ratio that two who came at their paces went on at each other's, at most 3."""
-    span = round(8 / motion.step_s)
-    before, after = range(met - span, met + 1), range(parted, parted + span + 1)
-    paces = [pace(motion, path, steps) for steps in (before, after) for path in (a, b)]
-    if None in paces:
-        return 0.0
-    (a0, b0, a1, b1), spread = zip(*paces, strict=True)
-    variance = 0.4**2 + sum(spread) / 2
-
-    def log_likelihood(*changes: float) -> float:
-        return sum(-(change**2) / (2 * variance) for change in changes)
-
-    return min(max(log_likelihood(b1 - a0, a1 - b0) - log_likelihood(a1 - a0, b1 - b0), -3.0), 3.0)
-
-
 def exchanged(
     motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]
 ) -> tuple[dict[int, dict[int, int]], int]:
     """For each track the one to which each step belongs after identity swaps, and how many encounters were changed."""
     decided = []
-    for a, b, low, high, met, parted in encounters(paths):
+    for a, b, low, high, *_ in encounters(paths):
         steps = range(low, high + 1)
         apart = [np.subtract(paths[a][s], paths[b][s]) if s in paths[a] and s in paths[b] else None for s in steps]
         costs = exchange_costs(ids[a], ids[b], low, high)
-        paces = by_pace(motion, paths[a], paths[b], met, parted)
-        course, gain, _ = max((course_of(apart, costs, motion, d, paces) for d in DRIFTS), key=lambda each: each[2])
+        course, gain, _ = max((course_of(apart, costs, motion, d) for d in DRIFTS), key=lambda each: each[2])
         if gain >= LEAST_GAIN:
             decided.append((gain, a, b, low, high, course))
 
     def meet(one: tuple, other: tuple) -> bool:
         return bool({*one[1:3]} & {*other[1:3]}) and one[3] <= other[4] and other[3] <= one[4]
 
-    sets = [[]]
-    for one in decided:
-        sets += [[*some, one] for some in sets if not any(meet(one, other) for other in some)]
-    best = max(sets, key=lambda some: sum(one[0] for one in some))
+    best: list[tuple] = []
+    for one in sorted(decided, key=lambda each: -each[0]):
+        best += [] if any(meet(one, other) for other in best) else [one]
     toggled: dict[int, list[tuple[int, int]]] = {}
     for _, a, b, low, _, course in best:
         for step, (was, now) in enumerate(pairwise([False, *course]), low):

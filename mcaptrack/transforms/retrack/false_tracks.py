@@ -194,10 +194,10 @@ _PEOPLE: Final = Logistic.of("people", FEATURES)
 _MEAN, _SPREAD = (np.array([_PEOPLE.numbers[what][name] for name in FEATURES]) for what in ("mean", "spread"))
 #: What is added to the log odds of tracks that stand for the whole log.
 _THROUGHOUT: Final = float(_PEOPLE.numbers["stands throughout"])
-#: How strongly weights stay as they were fitted while they follow a log, and how much each step of a track counts
-#: against that, up to so many steps. (Chosen on synthetic scenes and crowds.)
-_STAYS: Final = 30.0
-_EACH_STEP, _MOST_STEPS = 1 / 8, 20
+#: How strongly weights stay as they were fitted while they follow a log, and how much each sample of a track counts
+#: against that, up to so many: steps between samples are no evidence. (Chosen on synthetic scenes and crowds.)
+_STAYS: Final = 20.0
+_EACH_SAMPLE, _MOST_SAMPLES = 1 / 8, 20
 #: The same for detections with scores: log odds without any; of the mean score, as a ratio to the usual one, above
 #: ``_LOW``, times the number of rows up to ``_ENOUGH``; of log seconds; of the share that was observed; of log extent.
 SCORED: Final = (-3.1, 0.8, 1.1, 5.1, 1.6)
@@ -222,7 +222,8 @@ def log_odds_in_log(model: MotionModel, trajectories: Trajectories, smoothed: St
     columns = np.column_stack([standard, np.ones(len(standard))])
     # not a feature: its weight doesn't follow the log, and is no reason to think less of others who stand
     extra = _THROUGHOUT * stand_throughout(trajectories, smoothed, values, log, model.step_s)
-    counts = _EACH_STEP * np.minimum(np.diff(trajectories.first), _MOST_STEPS)
+    samples = np.add.reduceat(np.isfinite(trajectories.xy_m[:, 0]), trajectories.first[:-1], dtype=np.int64)
+    counts = _EACH_SAMPLE * np.minimum(samples, _MOST_SAMPLES)
     fitted = np.append(_PEOPLE.weights * _SPREAD, _PEOPLE.bias + _PEOPLE.weights @ _MEAN)
 
     def loss(weights: Floats) -> tuple[float, Floats]:

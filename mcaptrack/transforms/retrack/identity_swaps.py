@@ -11,19 +11,15 @@ Letters: C encounters, T steps of them, N rows of trajectories.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
-from mcaptrack.notices import warn
 from mcaptrack.transforms.retrack.appearance import Sides
 from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 #: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter. With the
 #: largest, of people who walk to and fro, motion says little.
@@ -45,101 +41,22 @@ _CELLS: Final = 2**16
 _MIN_GAIN: Final = 1.0
 
 
-# The paces of two people before and after they meet, as evidence of which is which.
-#
-# While people give way to each other their paths are hard to predict, and what they do is soon forgotten by a
-# filter. But who came fast mostly goes on fast, and who stood stands.
-#
-# Letters: C encounters, N rows of trajectories.
-
-
-#: A pace is that of so many seconds before or after an encounter at most, and at least. (Chosen on synthetic scenes.)
-_MOST_S, _LEAST_S = 8.0, 1.2
-#: How much a pace changes over an encounter, in m/s, and the most that paces count as a log likelihood: less than that
-#: both keep their input ids, because people who meet also stop.
-_CHANGE_M_PER_S: Final = 0.4
-
-
-# Which encounters are changed at once: of those that need the same track at the same time, the best ones together.
+# Which encounters are changed at once: of those that need the same track at the same time, the one that gains most.
 #
 # Whether two tracks were swapped is judged as if all other tracks were right. So of two encounters that overlap in
-# time and have a track in common only one is changed, and the other is judged again afterwards. Encounters hang
-# together in chains where many people meet: the best set is found by an integer programme (HiGHS), one for each
-# such group.
-#
-# Letters: C encounters, Q groups of encounters of which only one can be changed.
-
-
-#: The most encounters that are decided at once, and nodes after which the solver gives up: unlike a time, both are the
-#: same on every machine.
-_MOST_TOGETHER, _NODES = 1_000, 10_000
+# time and have a track in common only one is changed, and the other is judged again afterwards.
 
 
 def compatible(pair: Ints, low: Ints, high: Ints, gain: Floats) -> Ints:
-    """The encounters (C,) with the largest total gain of which no two change a track at the same time, rising.
+    """The encounters (C,), rising, of which no two change a track at the same time: each that no better one precludes.
 
     ``pair`` (C, 2) are the tracks of each, which are judged and changed between the steps ``low`` and ``high`` (C,).
-    Gains (C,) are positive.
     """
-    rivals = _rivals(pair, low, high)
-    if not rivals:
-        return np.arange(len(gain))
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    ends = np.cumsum([0, *(len(rival) for rival in rivals)])
-    limits = csr_array((np.ones(ends[-1]), np.concatenate(rivals), ends), shape=(len(rivals), len(gain)))
-    _, part = connected_components(limits.T @ limits, directed=False)
-    chosen = np.bincount(part)[part] == 1
-    for number in np.unique(part[~chosen]):
-        among = np.flatnonzero(part == number)
-        of_these = limits[:, among]
-        chosen[among] = _solved(of_these[np.diff(of_these.indptr) > 0], np.round(gain[among], 6))
-    return np.flatnonzero(chosen)
-
-
-def _rivals(pair: Ints, low: Ints, high: Ints) -> list[Ints]:
-    """Groups of encounters that compete for a track: those of it that are under way when another one begins.
-
-    None is a part of another one.
-    """
-    encounter = np.repeat(np.arange(len(pair)), 2)
-    order = np.lexsort((low[encounter], pair.ravel()))
-    out: list[Ints] = []
-    group, before = np.empty(0, np.int64), -1
-    for track, new in zip(pair.ravel()[order].tolist(), encounter[order].tolist(), strict=True):
-        lasting = group[high[group] >= low[new]] if track == before else group[:0]
-        if len(lasting) < len(group):
-            out.append(group)
-        group, before = np.append(lasting, new), track
-    return [rivals for rivals in [*out, group] if len(rivals) > 1]
-
-
-def _solved(limits: csr_array, gain: Floats) -> Bools:
-    """Which encounters (C,) have the largest total gain, if one at most of each row of ``limits`` (Q, C) is chosen."""
-    from scipy.optimize import Bounds, LinearConstraint, milp
-
-    if len(gain) <= _MOST_TOGETHER:
-        solution = milp(
-            -gain,
-            integrality=np.ones(len(gain)),
-            bounds=Bounds(0, 1),
-            constraints=LinearConstraint(limits, ub=1),
-            options={"node_limit": _NODES, "mip_rel_gap": 0.0},
-        )
-        if solution.status == 0:
-            return np.asarray(solution.x > 0.5)
-    warn(f"{len(gain)} encounters were decided one after another: too many people meet to decide them at once")
-    chosen, is_taken = np.zeros(len(gain), bool), np.zeros(limits.shape[0], bool)
-    groups = limits.tocsc()
+    chosen = np.zeros(len(gain), bool)
     for encounter in np.argsort(-gain, kind="stable").tolist():
-        own = groups.indices[groups.indptr[encounter] : groups.indptr[encounter + 1]]
-        if not is_taken[own].any():
-            chosen[encounter] = is_taken[own] = True
-    return chosen
-
-
-_MOST: Final = 3.0
+        shares = np.isin(pair, pair[encounter]).any(axis=1)
+        chosen[encounter] = not (chosen & shares & (low <= high[encounter]) & (low[encounter] <= high)).any()
+    return np.flatnonzero(chosen)
 
 
 class Encounters(NamedTuple):
@@ -151,40 +68,6 @@ class Encounters(NamedTuple):
     high: Ints
     meet: Ints
     part_ways: Ints
-
-
-def swapped_by_pace(model: MotionModel, trajectories: Trajectories, pair: Ints, meet: Ints, part_ways: Ints) -> Floats:
-    """The log likelihood ratio (C,) that two tracks are swapped after an encounter, by their paces before and after it.
-
-    ``pair`` (2, C) are the tracks, which are near each other from the steps ``meet`` (C,) to ``part_ways`` (C,). It is
-    0 where one of the four paces isn't known.
-    """
-    step_s, noise_m = model.step_s, model.noise_m
-    span = round(_MOST_S / step_s)
-    came, came_s = _paces(trajectories, pair, meet - span, meet, step_s)
-    left, left_s = _paces(trajectories, pair, part_ways, part_ways + span, step_s)
-    is_judged = (np.minimum(came_s, left_s) >= _LEAST_S - 1e-9).all(axis=0)
-    came_s, left_s = np.maximum(came_s, _LEAST_S), np.maximum(left_s, _LEAST_S)
-    # the mean of both people: the variance of a pace, of two positions, is 2 noise^2 / time^2
-    variance = _CHANGE_M_PER_S**2 + (noise_m**2 * (1 / came_s**2 + 1 / left_s**2)).sum(axis=0)
-    ratio = -(came[0] - came[1]) * (left[0] - left[1]) / variance
-    return np.where(is_judged, np.clip(ratio, -_MOST, _MOST), 0.0)
-
-
-def _paces(trajectories: Trajectories, track: Ints, since: Ints, until: Ints, step_s: float) -> tuple[Floats, Floats]:
-    """The mean speeds of tracks (2, C) between their first and last position in these steps (C,), and the seconds
-    between these; 0 where there are no two.
-    """
-    seen = np.flatnonzero(np.isfinite(trajectories.xy_m[:, 0]))
-    first, end = trajectories.first[track], trajectories.first[track + 1]
-    begin = first - trajectories.step[first]
-    low = np.searchsorted(seen, np.maximum(begin + since, first))
-    high = np.searchsorted(seen, np.minimum(begin + until + 1, end)) - 1
-    is_known = high > low
-    before, other = (seen[np.where(is_known, at, 0)] for at in (low, high))
-    seconds = (other - before) * step_s
-    way = trajectories.xy_m[other] - trajectories.xy_m[before]
-    return np.hypot(way[..., 0], way[..., 1]) / np.where(is_known, seconds, 1.0), np.asarray(seconds, np.float64)
 
 
 def resolve_swaps(
@@ -210,9 +93,7 @@ def resolve_swaps(
     if examined is not None:
         encounters = taken(encounters, examined[encounters.i] | examined[encounters.j])
     i, j, low, high, meet, part_ways = encounters
-    evidence = swapped_by_pace(model, trajectories, np.stack([i, j]), meet, part_ways)
-    if seen is not None:
-        evidence += seen.of_swaps(i, j, meet, part_ways)
+    evidence = np.zeros(len(i)) if seen is None else seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
     swaps: dict[int, _Swaps] = {}
     gain = np.zeros(len(i))

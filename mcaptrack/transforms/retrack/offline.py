@@ -45,8 +45,8 @@ from mcaptrack.transforms.retrack.worlds import Worlds, draw_worlds, world_rows
 _CONFIRMED_SHARE: Final = 0.25
 #: Tracks with samples in a smaller share of their steps are as long as they were seen at once.
 _SPARSE: Final = 0.25
-#: The log odds of tracks that are too short are no larger.
-_SHORT: Final = -0.7
+#: The log odds of tracks that are left out because they are too short are no larger.
+_SHORT: Final = -0.05
 #: Identities are decided so often, each time with the motion of the tracks that were decided before.
 _SWEEPS: Final = 2
 #: The number of times that encounters are examined again after identities were swapped.
@@ -144,6 +144,8 @@ def _runs(is_fixed: Bools) -> list[tuple[int, int]]:
 JOINS: Final = Logistic.of("joins", ("end", "beginning"))
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
 PERSON: Final = Logistic.of("decided", ("log odds",))
+#: The same of tracks that are too short: there is less to see of these, so they are more doubtful.
+SHORT: Final = Logistic.of("decided short", ("log odds",))
 #: An alternative is at least so likely as log odds.
 _MAY_BE: Final = -4.0
 #: Samples of another input id that last less, between two parts with one, are no join. Seconds.
@@ -487,6 +489,10 @@ def offline_tracks(
     moved_m: Floats | None = None
     ids, of = np.unique(tracks.track, return_inverse=True)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
+    of_row = np.searchsorted(ids, rows.track)
+    least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
+    least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
+    is_short = _are_short(of_row, rows.is_sample, len(ids), round(least_s * options.rate_hz) + 1)
     odds = np.full(len(ids), np.inf)
     if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
         _, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
@@ -494,11 +500,7 @@ def offline_tracks(
         if options.smooth:  # rows and trajectories are both ordered by track, then by step
             moved_m = movers.unit_m * smooth_in_log(model, trajectories, options.noise_m is not None, movers.unit_m)
         log = steps[0], steps[-1]
-        odds = _log_odds(model, trajectories, smoothed, rows, samples, movers, log)
-    of_row = np.searchsorted(ids, rows.track)
-    least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
-    least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
-    is_short = _are_short(of_row, rows.is_sample, len(ids), round(least_s * options.rate_hz) + 1)
+        odds = _log_odds(model, trajectories, smoothed, rows, samples, movers, log, is_short)
     odds = np.where(is_short, np.minimum(odds, _SHORT), odds)
     keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short)
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
@@ -548,10 +550,12 @@ def _log_odds(
     samples: LogSamples,
     movers: Movers,
     log: tuple[int, int],
+    is_short: Bools,
 ) -> Floats:
     """The log odds (K,) that tracks are people, or what else moves; ``log`` are its first and last steps."""
     if not movers.on_ground:
-        return PERSON.log_odds(log_odds_in_log(model, trajectories, smoothed, log)[:, None])
+        odds = log_odds_in_log(model, trajectories, smoothed, log)[:, None]
+        return np.where(is_short, SHORT.log_odds(odds), PERSON.log_odds(odds))
     return scored_log_odds(
         smoothed.mean[:, :2] * movers.unit_m,
         trajectories.first,
