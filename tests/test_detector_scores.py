@@ -108,7 +108,7 @@ def mota(scene: Scene, score: np.ndarray, kind: int) -> float:
     return 100 * (1 - (counts["FP"] + counts["FN"] + counts["IDSW"]) / sum(map(len, true)))
 
 
-@pytest.mark.parametrize("scale", one_in(3, SCALES))
+@pytest.mark.parametrize("scale", one_in(5, SCALES))
 def test_what_scores_mean_is_found_without_truth(scale):
     """In every class: the order stays, likelihoods are shares of real detections, tracks as good as with true ones."""
     off, worse = [], []

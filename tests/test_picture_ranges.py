@@ -19,6 +19,7 @@ import mcaptrack
 from tests.commands import call
 from tests.logs import provenance_of
 from tests.ros_messages import pixels, ros_writer
+from tests.tiers import one_in
 from tests.worlds import small_scene
 
 TOPIC = "/cam/image_raw"
@@ -123,7 +124,7 @@ def boxes(tmp_path_factory) -> int:
     return mcaptrack.detect(path).rows["/cam/detections"]
 
 
-@pytest.mark.parametrize(("channel", "span"), SAME.values(), ids=SAME)
+@pytest.mark.parametrize(("channel", "span"), one_in(3, SAME.values()), ids=SAME)
 def test_the_same_people_are_found_and_the_range_is_said_and_kept(tmp_path, boxes, channel, span):
     path = written(tmp_path / "a.mcap", {TOPIC: channel})
     result = mcaptrack.detect(path)
@@ -186,7 +187,7 @@ DEPTHS = {
 }
 
 
-@pytest.mark.parametrize(("depth", "topic"), DEPTHS.values(), ids=DEPTHS)
+@pytest.mark.parametrize(("depth", "topic"), one_in(3, DEPTHS.values()), ids=DEPTHS)
 def test_people_are_not_looked_for_in_depths(tmp_path, depth, topic):
     alone = written(tmp_path / "alone.mcap", {topic: depth}, 2.0)
     for name in ("run", "detect"):
