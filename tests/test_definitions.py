@@ -7,7 +7,7 @@ import re
 import sqlite3
 import struct
 import time
-from itertools import cycle
+from itertools import cycle, product
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from tests.bags import database
 from tests.box_reading import boxes_in
 from tests.commands import call
+from tests.tiers import one_in
 from tests.undefined import T0, message, names_no_definitions, package, store_of
 
 #: How one type is written: ROS 2, ROS 1, IDL, DDS, Python, and with what writers put before it.
@@ -149,7 +150,7 @@ def rows(path: Path) -> list:
         return [re.sub(r"'\w+': |[{}]", "", repr([*read(found.payload).values()])) for found in opened.messages("/t")]
 
 
-@pytest.mark.parametrize("kind", ASKS)
+@pytest.mark.parametrize("kind", one_in(2, ASKS))
 def test_a_type_is_the_same_in_every_spelling(tmp_path, kind):
     """For everything that asks for a type, and for every way in which its definition is written."""
     name, asked = ASKS[kind]
@@ -240,8 +241,10 @@ def test_what_is_not_read_of_idl_is_named(tmp_path, idl, why):
 DISTRIBUTIONS = [store for store in Stores if store.value.startswith("ros2_")]
 
 
-@pytest.mark.parametrize("distribution", DISTRIBUTIONS, ids=lambda store: store.value)
-@pytest.mark.parametrize("name", ["visualization_msgs/MarkerArray", "vision_msgs/Detection2DArray"])
+@pytest.mark.parametrize(
+    ("distribution", "name"),
+    one_in(5, product(DISTRIBUTIONS, ["visualization_msgs/MarkerArray", "vision_msgs/Detection2DArray"])),
+)
 def test_the_definition_is_taken_that_the_messages_fit(tmp_path, name, distribution):
     """As the distribution has it that wrote them, whatever the newest one has: each field has the value it had."""
     types, payloads = message(name, distribution)
