@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -31,6 +30,7 @@ from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from tests.bags import database
 from tests.box_reading import boxes_in
 from tests.commands import call
+from tests.logs import recorder
 from tests.tiers import one_in
 from tests.undefined import T0, message, names_no_definitions, package, store_of
 
@@ -125,14 +125,10 @@ def as_idl(types: dict, is_dds: bool) -> str:
 
 
 def write(path: Path, name: str, encoding: str, definition: str, payloads: list[bytes], word: str = "cdr") -> Path:
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start("ros2", "robot")
-        schema = writer.register_schema(name, encoding, definition.encode())
-        channel = writer.register_channel("/t", word, schema)
+    with recorder(path, "ros2") as writer:
+        channel = writer.add_channel("/t", (name, encoding, definition.encode()), word)
         for number, payload in enumerate(payloads):
             writer.add_message(channel, T0 + number * 100_000_000, payload, T0)
-        writer.finish()
     return path
 
 
@@ -463,12 +459,9 @@ def test_names_are_the_same_in_every_encoding(tmp_path, spelling):
     proto = foxglove.message_class(foxglove.IMAGE)(format="png", data=b"ab").SerializeToString()
     for of_foxglove in (foxglove.IMAGE, f".{foxglove.IMAGE}", spelling.format("foxglove_msgs", "CompressedImage")):
         path = tmp_path / "c.mcap"
-        with path.open("wb") as stream:
-            writer = McapWriter(stream)
-            writer.start("", "robot")
+        with recorder(path) as writer:
             schema = writer.register_schema(of_foxglove, "protobuf", foxglove.schema_record(foxglove.IMAGE)[2])
             writer.add_message(writer.register_channel("/t", "protobuf", schema), T0, proto, T0)
-            writer.finish()
         with log.read(path) as opened:
             assert asked(opened) == ["png"]
 

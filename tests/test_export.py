@@ -12,7 +12,6 @@ import pandas as pd
 import polars as pl
 import pyarrow.parquet as pq
 import pytest
-from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from mcaptrack import log, tables
@@ -22,7 +21,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.tables.export import LogTables, export, recording_name, topic_folder
-from tests.logs import add_rows, some_log
+from tests.logs import add_rows, recorder, some_log
 from tests.ros_messages import ros_writer
 from tests.worlds import ns, tracks_at
 
@@ -229,11 +228,8 @@ def test_a_foreign_channel_becomes_a_table_with_sql_names(tmp_path):
 @pytest.mark.parametrize("ros1", [False, True])
 def test_fields_of_ros_have_the_units_that_it_states(ros1, tmp_path):
     name, schema_encoding, definition, encoding = ros_writer("nav_msgs/Odometry", ros1=ros1).kind
-    with (tmp_path / "a.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.register_channel("/odom", encoding, writer.register_schema(name, schema_encoding, definition))
-        writer.finish()
+    with recorder(tmp_path / "a.mcap") as writer:
+        writer.add_channel("/odom", (name, schema_encoding, definition), encoding)
     with log.read(tmp_path / "a.mcap") as opened:
         schema = LogTables(opened).messages("/odom").schema
     units = {field.name: field.metadata[b"unit"].decode() for field in schema}

@@ -28,9 +28,9 @@ from mcaptrack.errors import call as proposed
 from mcaptrack.sources import demo
 from mcaptrack.transforms import ByteTrack
 from tests.commands import GROUP, call, done
+from tests.sources import PACKAGE, texts
 from tests.worlds import small_scene
 
-PACKAGE = Path(mcaptrack.__file__).parent
 FUNCTIONS = [name for name in mcaptrack.__all__ if inspect.isfunction(getattr(mcaptrack, name))]
 CLASSES = [name for name in mcaptrack.__all__ if inspect.isclass(getattr(mcaptrack, name))]
 #: The public methods of classes of the package, by name, also those that they inherit.
@@ -319,24 +319,8 @@ class TestWordsOfTheCommandLine:
         for path in PACKAGE.rglob("*.py"):
             if {"cli", "viewing"} & set(path.relative_to(PACKAGE).parts):
                 continue
-            text = path.read_text(encoding="utf-8")
-            if not option.search(text):
-                continue
-            tree = ast.parse(text)
-            documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-            if "transforms" in path.parts:  # help of options
-                documents |= {
-                    id(part)
-                    for node in ast.walk(tree)
-                    if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "setting")
-                    for part in ast.walk(node)
-                }
-            texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-            found += [
-                f"{path.relative_to(PACKAGE)}:{node.lineno}: {node.value}"
-                for node in texts
-                if id(node) not in documents and option.search(node.value)
-            ]
+            if option.search(path.read_text("utf-8")):
+                found += [(place, text) for place, text in texts(path) if option.search(text)]
         assert found == []
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 import mcaptrack
 from mcaptrack import log
@@ -16,6 +15,7 @@ from mcaptrack.notices import collected
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import named_detections
 from mcaptrack.sources.foreign.boxes import choosing, read_classes
+from tests.logs import recorder
 from tests.ros_messages import BAR, Ros, plain
 
 START_NS = 1_700_000_000_000_000_000
@@ -365,21 +365,17 @@ def whole(where: str, thing: dict) -> dict:
 
 def write(path: Path, channels: dict[str, tuple[str, list[dict]]], encoding: str) -> Path:
     """A log with messages of types, by topic; each is a tenth of a second after the last one."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with recorder(path) as writer:
         for topic, (name, messages) in channels.items():
             ros = Ros(name, DEFINITIONS.get(name, ""), ros1=encoding == "ros1")
             kind = ros.kind
             if encoding == "json":
                 kind = kind._replace(name=name, schema_encoding="jsonschema", schema=b"{}", encoding="json")
-            schema = writer.register_schema(kind.name, kind.schema_encoding, kind.schema)
-            channel = writer.register_channel(topic, kind.encoding, schema)
+            channel = writer.add_channel(topic, (kind.name, kind.schema_encoding, kind.schema), kind.encoding)
             for number, fields in enumerate(messages):
                 message = made(ros, ros.types, fields)
                 payload = json.dumps(plain(message)).encode() if encoding == "json" else ros.pack(message)
                 writer.add_message(channel, START_NS + number * 10**8, payload, START_NS + number * 10**8)
-        writer.finish()
     return path
 
 

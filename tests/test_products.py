@@ -226,7 +226,7 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize(("names", "form"), one_in(5, product(PAIRS, ["parquet", "csv", "jsonl", "arrow"])))
+@pytest.mark.parametrize(("names", "form"), one_in(7, product(PAIRS, ["parquet", "csv", "jsonl", "arrow"])))
 def test_tables_of_another_log_are_never_replaced_unasked(names, form, tmp_path):
     one, other = (log_of(tmp_path / name, offset) for offset, name in enumerate(names))
     folder = tmp_path / "T"
