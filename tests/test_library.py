@@ -353,11 +353,6 @@ class TestDocumentation:
             assert sections == [one for one in SECTIONS if one in sections], name
             assert not (parameters or needed["Returns"]) or sections[-1] == "Examples", name
 
-    @pytest.mark.parametrize("name", FUNCTIONS)
-    def test_types_of_parameters_and_results_are_there_for_those_who_ask(self, name):
-        hints = get_type_hints(getattr(mcaptrack, name))
-        assert hints.keys() == {*inspect.signature(getattr(mcaptrack, name)).parameters, "return"}
-
     @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name in GROUP.commands])
     def test_values_of_another_type_are_refused_by_the_name_of_their_parameter(self, name):
         function = getattr(mcaptrack, name)
