@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from mcaptrack.sources.fixed_frame import named_detections
 from mcaptrack.sources.foreign.boxes import choosing, read_classes
 from tests.logs import recorder
 from tests.ros_messages import BAR, Ros, plain
+from tests.tiers import one_in
 
 START_NS = 1_700_000_000_000_000_000
 HEAD = {"stamp": {"sec": 1_700_000_000, "nanosec": 0}, "frame_id": "map"}
@@ -385,8 +387,7 @@ def read(path: Path, topic: str = "/seen", **chosen: str):
     return found, [(notice.code, notice.message) for notice in said]
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("name", IN_SPACE)
+@pytest.mark.parametrize(("name", "encoding"), one_in(2, product(IN_SPACE, ENCODINGS)))
 def test_positions_ids_classes_and_scores_are_as_the_message_states_them(name, encoding, tmp_path):
     where, thing, has = IN_SPACE[name]
     empty = whole(where, thing) | {where: [], "header": {**HEAD, "stamp": {"sec": 1_700_000_000, "nanosec": 10**8}}}
@@ -413,8 +414,7 @@ def test_positions_ids_classes_and_scores_are_as_the_message_states_them(name, e
         assert foreign.holds_boxes(opened, "/seen", in_space=True)
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("name", IN_PICTURES)
+@pytest.mark.parametrize(("name", "encoding"), one_in(2, product(IN_PICTURES, ENCODINGS)))
 def test_boxes_in_pictures_are_as_the_message_states_them(name, encoding, tmp_path):
     where, thing = IN_PICTURES[name]
     path = write(tmp_path / "a.mcap", {"/humans/body": (name, [whole(where, thing)] * 2)}, encoding)
