@@ -7,12 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
+
+from tests.logs import recorder
 
 T0 = 1_700_000_000_123_456_789
 
@@ -118,9 +119,6 @@ MOT = "".join(f"{frame},7,{1 + frame},20,10,16,1,-1,-1,-1\n" for frame in range(
 
 def plain(path: Path, profile: str, library: str = "robot") -> Path:
     """A log with one channel of JSON."""
-    with path.open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start(profile, library)
+    with recorder(path, profile, library) as writer:
         writer.add_message(writer.register_channel("/a", "json", 0), 1, b"{}", 1)
-        writer.finish()
     return path

@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from mcap.writer import Writer
 
 from mcaptrack import log
 from mcaptrack.contracts import Box, Box3d
@@ -19,6 +18,7 @@ from mcaptrack.sources.foreign import MessageType, reading_of
 from mcaptrack.sources.foreign.boxes import _special
 from mcaptrack.sources.foreign.fields import Message3d
 from mcaptrack.sources.foreign.things import read_channel
+from tests.logs import recorder
 
 
 def _values(column: Any) -> list[Any]:
@@ -56,14 +56,10 @@ def boxes_of_each(kind: MessageType, payloads: Iterable[bytes]) -> list[Any]:
     """What each of the messages of a log holds; None for those that can't be read."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "a.mcap")
-        with path.open("wb") as file:
-            writer = Writer(file)
-            writer.start()
-            schema = writer.register_schema(kind.name, kind.schema_encoding, kind.schema)
-            channel = writer.register_channel("/t", kind.encoding, schema)
+        with recorder(path) as writer:
+            channel = writer.add_channel("/t", (kind.name, kind.schema_encoding, kind.schema), kind.encoding)
             for number, payload in enumerate(payloads, 1):
                 writer.add_message(channel, number, payload, number)
-            writer.finish()
         with log.read(path) as opened:
             return boxes_in(opened, "/t")
 

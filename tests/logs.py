@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
@@ -60,6 +62,23 @@ def provenance_of(path: Path | str, topic: str) -> Provenance:
     return made
 
 
+class Recorder(Writer):
+    """The stock writer, which adds a channel together with its schema."""
+
+    def add_channel(self, topic: str, schema: tuple[str, str, bytes], encoding: str = "json", **metadata: str) -> int:
+        return self.register_channel(topic, encoding, self.register_schema(*schema), metadata)
+
+
+@contextmanager
+def recorder(path: Path, profile: str = "", library: str = "other-software", **options: Any) -> Iterator[Recorder]:
+    """Record a log with the stock writer, as other software does."""
+    with path.open("wb") as stream:
+        writer = Recorder(stream, **options)
+        writer.start(profile, library)
+        yield writer
+        writer.finish()
+
+
 def write_log(path: Path, messages, kind: str = "rows") -> None:
     with log.create(path) as writer:
         numbers = {topic: writer.add_channel(topic, SCHEMA, "json", {"about": topic}, kind) for topic in "abc"}
@@ -69,9 +88,7 @@ def write_log(path: Path, messages, kind: str = "rows") -> None:
 
 def write_stock(path: Path, messages, **options) -> None:
     """A log that other software recorded, with an attachment and metadata."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)
-        writer.start("ros2", "other-software")
+    with recorder(path, "ros2", **options) as writer:
         schema = writer.register_schema(*SCHEMA)
         numbers = {topic: writer.register_channel(topic, "json", schema, {"about": topic}) for topic in "abc"}
         for count, (topic, t_ns, sequence, payload) in enumerate(messages):
@@ -79,7 +96,6 @@ def write_stock(path: Path, messages, **options) -> None:
             if count == 1:
                 writer.add_attachment(1, 2, "notes.txt", "text/plain", b"hello")
                 writer.add_metadata("about", {"robot": "r2"})
-        writer.finish()
 
 
 STOCK_OPTIONS = {

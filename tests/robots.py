@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from mcap.writer import Writer
 
+from tests.logs import recorder
 from tests.ros_messages import pixels, ros_writer, vision
 from tests.worlds import ns, small_scene
 
@@ -25,14 +25,12 @@ def write_log(path: Path, *topics: str, boxes: str | None = None) -> list:
     """A log as a robot writes it: a scene on these topics, boxes of what is truly there. Returns the scene's shots."""
     ros = ros_writer("sensor_msgs/CompressedImage")
     shots = list(small_scene(5.0).shots())
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2", library="theirs")
+    with recorder(path, "ros2") as writer:
         schema = writer.register_schema(ros.kind.name, "ros2msg", ros.kind.schema)
         channels = [writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""}) for topic in topics]
         if boxes:
             kind = vision("v4", [])[0]
-            found = writer.register_channel(boxes, "cdr", writer.register_schema(kind.name, "ros2msg", kind.schema))
+            found = writer.add_channel(boxes, (kind.name, "ros2msg", kind.schema), "cdr")
         for number, shot in enumerate(shots):
             t_ns = stamp_of(number) + LATE_NS
             data = cv2.imencode(".jpg", shot.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
@@ -44,7 +42,6 @@ def write_log(path: Path, *topics: str, boxes: str | None = None) -> list:
                     "v4", [(x + w / 2, y + h / 2, w, h, 0.0, [("person", 0.9)]) for x, y, w, h in shot.boxes.tolist()]
                 )[1]
                 writer.add_message(found, t_ns + 5, payload, t_ns)
-        writer.finish()
     return shots
 
 
@@ -58,9 +55,7 @@ def robot_log(path: Path, *topics: str, boxes: bool = False) -> Path:
     """Pictures as a robot logs them: late by another time each."""
     ros = ros_writer("sensor_msgs/CompressedImage")
     data = pixels(cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes())
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
+    with recorder(path) as writer:
         schema = writer.register_schema(ros.kind.name, "ros2msg", ros.kind.schema)
         channels = [writer.register_channel(topic, "cdr", schema) for topic in topics]
         for k in range(PICTURES):
@@ -68,7 +63,6 @@ def robot_log(path: Path, *topics: str, boxes: bool = False) -> Path:
             payload = ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(stamp), "jpeg", data))
             for channel in channels:
                 writer.add_message(channel, stamp + 1_000_000 * (k % 7), payload, stamp, 500 + 3 * k)
-        writer.finish()
     return path
 
 

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from mcap.writer import Writer
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcaptrack.foxglove import schema_record
 from mcaptrack.geometry.clocks import NS_PER_S
+from tests.logs import Recorder, recorder
 from tests.ros_messages import BAR, Ros
 
 START_NS = 1_700_000_000_000_000_000
@@ -268,14 +268,12 @@ def scene_update_json(stamp_ns: int, boxes: Sequence[Seen]) -> bytes:
 def write(
     path: Path,
     robot: Robot,
-    boxes: Callable[[Writer], Callable[[int, Shot], None]],
+    boxes: Callable[[Recorder], Callable[[int, Shot], None]],
     moving: str = "ros",
     keep=lambda stamp_ns: True,
 ) -> Path:
     """A log with the robot's transforms, and its boxes on /lidar/boxes, 40 ms late."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
+    with recorder(path) as writer:
         channels: dict[str, int] = {}
         if moving == "ros":
             for topic, theirs, stamp_ns, payload in transforms(robot):
@@ -286,7 +284,7 @@ def write(
                     writer.add_message(channels[topic], stamp_ns + 3_000_000, payload, stamp_ns)
         elif moving == "protobuf":
             name, encoding, data = schema_record("foxglove.FrameTransform")
-            channel = writer.register_channel("/tf", "protobuf", writer.register_schema(name, encoding, data))
+            channel = writer.add_channel("/tf", (name, encoding, data), "protobuf")
             moves = [
                 (at, "map", "base_link", turn, shift)
                 for at, turn, shift in zip(robot.stamps.tolist(), robot.turn, robot.place, strict=True)
@@ -303,16 +301,15 @@ def write(
         add = boxes(writer)
         for number, shot in enumerate(robot.shots):
             add(number, shot)
-        writer.finish()
     return path
 
 
 def by_ros(
     make: Callable[[int, Sequence[Seen]], tuple[Ros, bytes]], late_ns: int = LATE_NS
-) -> Callable[[Writer], Callable[[int, Shot], None]]:
+) -> Callable[[Recorder], Callable[[int, Shot], None]]:
     """Boxes as messages of ROS on /lidar/boxes."""
 
-    def begin(writer: Writer) -> Callable[[int, Shot], None]:
+    def begin(writer: Recorder) -> Callable[[int, Shot], None]:
         channel = None
 
         def add(number: int, shot: Shot) -> None:
@@ -332,12 +329,12 @@ def by_ros(
 
 def by_foxglove(
     make: Callable[[int, Sequence[Seen]], bytes], encoding: str = "protobuf", name: str = "foxglove.SceneUpdate"
-) -> Callable[[Writer], Callable[[int, Shot], None]]:
+) -> Callable[[Recorder], Callable[[int, Shot], None]]:
     """Boxes as messages of Foxglove on /lidar/boxes."""
 
-    def begin(writer: Writer) -> Callable[[int, Shot], None]:
+    def begin(writer: Recorder) -> Callable[[int, Shot], None]:
         record = schema_record(name) if encoding == "protobuf" else (name, "jsonschema", b"{}")
-        channel = writer.register_channel("/lidar/boxes", encoding, writer.register_schema(*record))
+        channel = writer.add_channel("/lidar/boxes", record, encoding)
 
         def add(number: int, shot: Shot) -> None:
             writer.add_message(channel, shot.stamp_ns + LATE_NS, make(shot.stamp_ns, shot.boxes), shot.stamp_ns, number)

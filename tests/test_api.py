@@ -17,7 +17,7 @@ from mcaptrack import log, tables
 from mcaptrack.api.scoring import Scores
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources import ingest
-from tests.logs import some_log
+from tests.logs import recorder, some_log
 from tests.worlds import write_clip
 
 ROOT = Path(__file__).parent.parent
@@ -159,17 +159,12 @@ def test_every_message_is_fetched_by_its_row_of_frames(tmp_path):
 
 
 def test_messages_outside_chunks_and_in_results_are_fetched(tmp_path):
-    from mcap.writer import Writer
 
     path = tmp_path / "loose.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, use_chunking=False)
-        writer.start()
-        schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
-        channel = writer.register_channel("/image", "json", schema)
+    with recorder(path, use_chunking=False) as writer:
+        channel = writer.add_channel("/image", ("foxglove.CompressedImage", "jsonschema", b"{}"))
         for n in range(3):
             writer.add_message(channel, n, b"{}", n)
-        writer.finish()
     with log.read(path, sidecar=True) as opened, log.extend(opened) as results:
         number = results.add_channel("/result", ("foxglove.CompressedImage", "jsonschema", b"{}"), "json", {})
         results.add_message(number, 8, 0, b'{"a": 1}')

@@ -13,7 +13,6 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import Writer as Writer1
@@ -30,6 +29,7 @@ from mcaptrack.sources.ingest.bags.recording import ReadingNotes
 from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
 from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database, plain
+from tests.logs import recorder
 
 
 def recorded(path: Path) -> list[tuple[str, int, int, bytes]]:
@@ -399,15 +399,12 @@ class TestBesideLabels:
 class TestInto:
     @pytest.mark.parametrize("chunks", [True, False])
     def test_an_mcap_file_is_added_with_all_that_is_in_it(self, tmp_path, chunks):
-        with (tmp_path / "a.mcap").open("wb") as stream:
-            writer = McapWriter(stream, compression=CompressionType.LZ4, use_chunking=chunks)
-            writer.start()
+        with recorder(tmp_path / "a.mcap", compression=CompressionType.LZ4, use_chunking=chunks) as writer:
             channel = writer.register_channel("/a", "json", 0, {"k": "v"})
             for number in range(5):
                 writer.add_message(channel, 10 + number, b"{}", 3, sequence=90 + number)
             writer.add_metadata("m", {"a": "b"})
             writer.add_attachment(1, 2, "file", "text/plain", b"hello")
-            writer.finish()
         bag2(tmp_path / "bag")
         make(tmp_path / "bag", tmp_path / "b.mcap")
         with log.read(tmp_path / "b.mcap") as opened:
@@ -617,13 +614,10 @@ def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeyp
     if kind == "db3":
         database(tmp_path / name, 3, [(1, n, data) for n, data in enumerate(packed)], [TALK])
     else:
-        with (tmp_path / name).open("wb") as stream:
-            writer = McapWriter(stream)
-            writer.start("ros2", "robot")
+        with recorder(tmp_path / name, "ros2") as writer:
             number = writer.register_channel("/talk", "cdr", 0)
             for n, data in enumerate(packed):
                 writer.add_message(number, n, data, n)
-            writer.finish()
     (tmp_path / "metadata.yaml").write_text(described(name, topics={"/talk": 3}, mode="MESSAGE"))
 
     def read(limit: int) -> list[int]:

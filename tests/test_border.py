@@ -673,7 +673,9 @@ def test_hidden_files_beside_labels_change_nothing(name, tmp_path):
     before = read_labels(path, name, "detections")
     for file in [*tmp_path.rglob("*")]:
         (file.parent / f"._{file.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X        \xff")
-    (tmp_path / "._a.names").write_bytes(b"\0\5\26\7")
+    for hidden in ("._a.names", "._9.jpg", "._9.txt"):
+        for folder in (tmp_path, path if path.is_dir() else path.parent):
+            (folder / hidden).write_bytes(b"\0\5\26\7")
     after = read_labels(path, name, "detections")
     assert (after.facts.found_by, after.remarks, after.doubts) == (before.facts.found_by, before.remarks, before.doubts)
     for column, values in before.columns().items():

@@ -556,18 +556,6 @@ def test_names_of_classes_are_beside_the_labels_or_above(files, named_by, names,
     assert labels.remarks[0] == f"{place}: 1 files, frames are numbered by their names"
 
 
-def test_hidden_files_are_no_labels(tmp_path):
-    """macOS lays one beside each file of a disk of others, with the same suffix."""
-    folder_of(tmp_path, {"1.txt": ROW, "a.names": "person\n"})
-    wanted = read_labels(tmp_path, role="detections")
-    for name in ("._1.txt", "._2.txt", "._3.jpg", "._a.names"):
-        (tmp_path / name).write_bytes(b"\0\5\x16\7")
-    labels = read_labels(tmp_path, role="detections")
-    assert (labels.frame.tolist(), labels.classes, labels.remarks) == (
-        wanted.frame.tolist(), {1: "person"}, wanted.remarks
-    )  # fmt: skip
-
-
 def test_a_folder_of_labels_has_no_more_than_its_limits(tmp_path, monkeypatch):
     folder_of(tmp_path, {"b.txt": ROW, "a.txt": f"{ROW}\n", "readme.txt": "x"})
     assert read_labels(tmp_path, role="detections").remarks[0].endswith("2 files, frames are numbered by their order")

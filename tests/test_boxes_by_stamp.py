@@ -9,12 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.fixed_frame import named_detections
 from mcaptrack.sources.foreign.boxes import choosing
+from tests.logs import recorder
 from tests.worlds import ns
 
 COUNT = 20
@@ -43,9 +43,7 @@ def written(path: Path, stamps, pictures=range(COUNT), header="header", data="YQ
         about = stamp(stamps(number))["header"] if stamps(number) is not None else {}
         message = {header: about, "detections": [{"bbox": box, "results": []}] * number}
         messages.append((ns(taken_s(number) + LATE_S + FOUND_S), 1, message))
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with recorder(path) as writer:
         ids = []
         for topic, name in (("/cam/image", "foxglove.CompressedImage"), ("/cam/boxes", "vision_msgs/Detection2DArray")):
             schema = writer.register_schema(name, "jsonschema", b"{}")
@@ -53,7 +51,6 @@ def written(path: Path, stamps, pictures=range(COUNT), header="header", data="YQ
         for t_ns, which, message in sorted(messages, key=lambda one: one[0]):
             whole = {"data": data, **message} if which == 0 else message
             writer.add_message(ids[which], t_ns, json.dumps(whole).encode(), t_ns)
-        writer.finish()
     return path
 
 
@@ -101,11 +98,9 @@ SIZE = (320, 240)
 def with_boxes(path: Path, box: dict, pictures: bool, calibrated: bool = False) -> Path:
     """A log with boxes of one kind, and pictures of 320 x 240 or the calibration of a camera with these."""
     png = base64.b64encode(cv2.imencode(".png", np.zeros(SIZE[::-1], np.uint8))[1].tobytes()).decode()
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with recorder(path) as writer:
         boxes, images, lens = (
-            writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", b"{}"))
+            writer.add_channel(topic, (name, "jsonschema", b"{}"))
             for topic, name in (
                 ("/cam/boxes", "vision_msgs/Detection2DArray"),
                 ("/cam/image", "foxglove.CompressedImage"),
@@ -122,7 +117,6 @@ def with_boxes(path: Path, box: dict, pictures: bool, calibrated: bool = False) 
                 writer.add_message(images, t_ns, json.dumps(image).encode(), t_ns)
             if calibrated:
                 writer.add_message(lens, t_ns, json.dumps({"width": SIZE[0], "height": SIZE[1]}).encode(), t_ns)
-        writer.finish()
     return path
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import log
@@ -24,6 +23,7 @@ from mcaptrack.sources.fixed_frame import named_detections, rows_of_boxes
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign.fields import Message3d
 from tests.box_reading import boxes_of, recorded
+from tests.logs import recorder
 from tests.ros_messages import Ros
 from tests.space_logs import (
     NAMES,
@@ -496,12 +496,9 @@ def test_what_is_round_is_a_thing_where_a_name_says_so(topic, space, is_read, tm
     writer = ros("visualization_msgs/MarkerArray")
     ball = writer.new("visualization_msgs/MarkerArray", [marker(writer, START_NS, SEEN, 2, space=space)])
     path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        out = Writer(stream)
-        out.start()
+    with recorder(path) as out:
         schema = out.register_schema(writer.kind.name, writer.kind.schema_encoding, writer.kind.schema)
         out.add_message(out.register_channel(topic, "cdr", schema), START_NS, writer.pack(ball), START_NS)
-        out.finish()
     with log.read(path) as opened:
         assert foreign.holds_boxes(opened, topic) == bool(is_read)
         assert list(foreign.uncertain_boxes(opened)) == [topic] * (not is_read)

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 import mcaptrack
 from mcaptrack import log
@@ -23,6 +23,7 @@ from mcaptrack.notices import collected
 from mcaptrack.tables import files
 from mcaptrack.tables import messages as tables_of_messages
 from mcaptrack.tables.export import channels
+from tests.logs import recorder
 
 DEFINITION = b"float64 x\nstring name\nuint8[] blob\n"
 TOPICS = ("/fast", "/large", "/a b/\u00fc", "/rare", "/empty")
@@ -44,16 +45,13 @@ def recording(path: Path, seed: int, compression: CompressionType = CompressionT
     events += [(draw.randrange(400_000), "/a b/\u00fc", payload(draw, 60)) for _ in range(50)]
     events += [(5, "/rare", payload(draw, 1))]
     events.sort(key=lambda event: event[0] + draw.choice([0, 0, 0, 30_000]))
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=draw.choice([600, 4000, 20_000]), compression=compression)
-        writer.start()
+    with recorder(path, chunk_size=draw.choice([600, 4000, 20_000]), compression=compression) as writer:
         schema = writer.register_schema("test_msgs/msg/A", "ros2msg", DEFINITION)
         of_lists = writer.register_schema("test_msgs/msg/B", "ros2msg", DEFINITION + b"string[] names\n")
         kinds = {"/empty": of_lists}
         numbers = {topic: writer.register_channel(topic, "cdr", kinds.get(topic, schema)) for topic in TOPICS}
         for t_ns, topic, data in events:
             writer.add_message(numbers[topic], t_ns, data, t_ns)
-        writer.finish()
     return path
 
 
@@ -167,15 +165,12 @@ def test_fields_and_periods_are_those_of_the_whole_table(tmp_path: Path, monkeyp
 
 def test_a_channel_that_can_not_be_read_loses_its_table_and_the_manifest_says_why(tmp_path: Path) -> None:
     for bad in (False, True):
-        with (tmp_path / "a.mcap").open("wb") as stream:
-            writer = Writer(stream)
-            writer.start()
+        with recorder(tmp_path / "a.mcap") as writer:
             schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data")
             for topic in ("/good", "/bad"):
                 number = writer.register_channel(topic, "cdr", schema)
                 data = b"\0" if bad and topic == "/bad" else b"\0\1\0\0" + bytes(8)
                 writer.add_message(number, 1, data, 1)
-            writer.finish()
         with collected():
             done = mcaptrack.export(tmp_path / "a.mcap", tmp_path / "t", all_topics=True)
     (text,) = (tmp_path / "t").glob("manifest/*/*.json")

@@ -8,12 +8,12 @@ import random
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from mcaptrack import log
 from mcaptrack.sources import foreign
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from tests.commands import done
+from tests.logs import recorder
 from tests.worlds import write_clip
 
 DAMAGED = (5, 6, 25)
@@ -26,20 +26,17 @@ def folder(tmp_path_factory):
     write_clip(folder / "a.mp4", 40, size=(320, 240))
     done("ingest", folder / "a.mp4", "-o", folder / "whole.mcap", "-q")
     rng = random.Random(1)
-    with (folder / "whole.mcap").open("rb") as source, (folder / "damaged.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2", "other-software")
+    damaged = recorder(folder / "damaged.mcap", "ros2")
+    with (folder / "whole.mcap").open("rb") as source, damaged as writer:
         topic = 0
         messages = make_reader(source).iter_messages(topics=["/camera/video"])
         for number, (schema, channel, message) in enumerate(messages):
-            topic = topic or writer.register_channel(
-                channel.topic, "protobuf", writer.register_schema(schema.name, schema.encoding, schema.data)
-            )
+            record = (schema.name, schema.encoding, schema.data)
+            topic = topic or writer.add_channel(channel.topic, record, "protobuf")
             data = bytearray(message.data)
             for at in [rng.randrange(len(data) // 2, len(data) - 10) for _ in range(6 * (number in DAMAGED))]:
                 data[at] ^= 0xFF
             writer.add_message(topic, message.log_time, bytes(data), message.publish_time, number)
-        writer.finish()
     return folder
 
 

@@ -12,17 +12,15 @@ import pandas as pd
 import polars as pl
 import pyarrow.parquet as pq
 import pytest
-from mcap.writer import Writer
-from typer.testing import CliRunner
 
 from mcaptrack import log, tables
-from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.tables.export import LogTables, export, recording_name, topic_folder
-from tests.logs import add_rows, some_log
+from tests.commands import call, done
+from tests.logs import add_rows, recorder, some_log
 from tests.ros_messages import ros_writer
 from tests.worlds import ns, tracks_at
 
@@ -63,8 +61,7 @@ def test_a_log_becomes_a_folder_that_duckdb_joins(tmp_path):
 def test_scores_are_those_of_evaluate(tmp_path):
     path = some_log(tmp_path / "a.mcap")
     exported(path, tmp_path / "tables")
-    outcome = CliRunner().invoke(app, ["evaluate", str(path), "--json"])
-    wanted = json.loads(outcome.stdout)["results"]
+    wanted = json.loads(done("evaluate", path, "--json").out)["results"]
     rows = pq.read_table(tmp_path / "tables/metrics/recording=a/part-0.parquet").to_pylist()
     assert len(rows) == len(wanted) == 3
     for result in wanted:
@@ -232,11 +229,8 @@ def test_a_foreign_channel_becomes_a_table_with_sql_names(tmp_path):
 @pytest.mark.parametrize("ros1", [False, True])
 def test_fields_of_ros_have_the_units_that_it_states(ros1, tmp_path):
     name, schema_encoding, definition, encoding = ros_writer("nav_msgs/Odometry", ros1=ros1).kind
-    with (tmp_path / "a.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        writer.register_channel("/odom", encoding, writer.register_schema(name, schema_encoding, definition))
-        writer.finish()
+    with recorder(tmp_path / "a.mcap") as writer:
+        writer.add_channel("/odom", (name, schema_encoding, definition), encoding)
     with log.read(tmp_path / "a.mcap") as opened:
         schema = LogTables(opened).messages("/odom").schema
     units = {field.name: field.metadata[b"unit"].decode() for field in schema}
@@ -248,11 +242,8 @@ def test_fields_of_ros_have_the_units_that_it_states(ros1, tmp_path):
 @pytest.mark.parametrize("form", ["csv", "jsonl", "arrow"])
 def test_other_formats_hold_the_same(tmp_path, form):
     path = some_log(tmp_path / "a.mcap")
-    outcome = CliRunner().invoke(
-        app, ["export", str(path), "-o", str(tmp_path / "t"), "--format", form, "--topic", "/imu", "--json"]
-    )
-    assert outcome.exit_code == 0, outcome.stderr
-    assert json.loads(outcome.stdout)["results"][0]["rows"]["tracks"] == 12
+    said = done("export", path, "-o", tmp_path / "t", "--format", form, "--topic", "/imu", "--json").out
+    assert json.loads(said)["results"][0]["rows"]["tracks"] == 12
     read = {
         "csv": lambda p: pl.read_csv(p, schema_overrides={"gyro_y": pl.Float64}),
         "jsonl": pl.read_ndjson,
@@ -275,7 +266,7 @@ def test_an_unreadable_message_is_reported_with_its_time(tmp_path):
         writer.add_message(number, 5, 0, b"{")
     with pytest.raises(McaptrackError, match=r"/x at 5 ns: 1 bytes are not a json message"):
         exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/x"])
-    outcome = CliRunner().invoke(app, ["export", str(tmp_path / "a.mcap"), "--blobs"])
-    assert (outcome.exit_code, "with --topic" in outcome.stderr) == (1, True)
+    outcome = call("export", tmp_path / "a.mcap", "--blobs")
+    assert (outcome.code, "with --topic" in outcome.err) == (1, True)
     with pytest.raises(McaptrackError, match="has no channel /y"):
         exported(tmp_path / "a.mcap", tmp_path / "t", topics=["/y"])

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from google.protobuf.message_factory import GetMessages
-from mcap.writer import Writer
 
 import mcaptrack
 from mcaptrack import log, testing
@@ -35,7 +34,7 @@ from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources import fixed_frame
 from mcaptrack.testing import LawError
 from tests.commands import call, done
-from tests.logs import provenance_of
+from tests.logs import provenance_of, recorder
 from tools import pages
 
 PAGE = pages.blocks(pages.ROOT / "docs" / "extend.md")
@@ -276,14 +275,11 @@ def test_boxes_on_the_ground_give_what_a_table_gives(site):
 
 def robot(path: str, schema: str, messages: list[dict[str, Any]]) -> None:
     """A recording of JSON messages of one type."""
-    with Path(path).open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="", library="test")
-        channel = writer.register_channel("/robot/things", "json", writer.register_schema(schema, "jsonschema", b"{}"))
+    with recorder(Path(path)) as writer:
+        channel = writer.add_channel("/robot/things", (schema, "jsonschema", b"{}"))
         for number, message in enumerate(messages):
             t_ns = 10**18 + number * 10**8
             writer.add_message(channel, t_ns, json.dumps(message).encode(), t_ns, number)
-        writer.finish()
 
 
 def things(number: int) -> dict[str, Any]:
@@ -326,15 +322,12 @@ def test_messages_in_protobuf_and_of_ros_2_are_read_by_their_definitions_in_the_
         ),
         "my_msgs/msg/Rows": ("cdr", "ros2msg", b"float64[] left", cdr),
     }
-    with Path("a.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="", library="test")
+    with recorder(Path("a.mcap")) as writer:
         for name, (encoding, schema_encoding, schema, payload) in kinds.items():
             number = writer.register_channel(
                 f"/{encoding}/rows", encoding, writer.register_schema(name, schema_encoding, schema)
             )
             writer.add_message(number, 10**18, payload, 10**18)
-        writer.finish()
     with log.read(Path("a.mcap")) as opened:
         for encoding in ("protobuf", "cdr"):
             (frame,) = fixed_frame.named_detections(opened, f"/{encoding}/rows").frames

@@ -12,11 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
-from typer.testing import CliRunner
 
 import mcaptrack
 from mcaptrack import log, notices, pipeline
-from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.forecasts import find_forecast_errors, score_forecasts, smoothed_predictions
@@ -26,7 +24,7 @@ from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRAC
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
-from tests.commands import printed
+from tests.commands import done, printed
 from tests.forecasts import forecasts, positions, predicted
 from tests.logs import add_rows
 from tests.worlds import ns, replace_channel, walk, write_channels
@@ -371,18 +369,14 @@ def test_a_recorded_channel_is_never_replaced(tmp_path):
 def test_drop_takes_errors_along_and_tables_have_them(tmp_path):
     path = write_channels(tmp_path / "a.mcap", **ALL)
 
-    def call(*words):
-        result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-        assert result.exit_code == 0, result.output
-
-    call("events", path)
-    call("export", path, "-o", tmp_path / "tables")
+    done("events", path)
+    done("export", path, "-o", tmp_path / "tables")
     for name, schema in (("forecast_errors", FORECAST_ERRORS), ("forecast_scores", FORECAST_SCORES)):
         table = pq.read_table(tmp_path / "tables" / name / "recording=a" / "part-0.parquet")
         assert {column.name for column in schema.columns} <= set(table.column_names)
     table = pq.read_table(tmp_path / "tables" / "forecast_errors" / "recording=a" / "part-0.parquet").to_pylist()
     assert [row["ade_m"] for row in table][-4:] == [pytest.approx(0.25), None, None, None]
-    call("drop", path, "/camera/predictions")
+    done("drop", path, "/camera/predictions")
     with log.read(path) as opened:
         assert not [topic for topic in opened.channels if topic.startswith("/camera/predictions")]
 

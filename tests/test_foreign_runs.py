@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaptrack import log, pipeline
@@ -22,6 +21,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import KnnDetector
 from tests.commands import GROUP, call
+from tests.logs import recorder
 from tests.robots import START_NS, stamp_of, write_log
 from tests.ros_messages import pixels, ros_writer, vision
 from tests.tiers import thorough
@@ -155,13 +155,9 @@ def test_a_damaged_message_is_reported_and_the_log_left_unchanged(robot, tmp_pat
     path = tmp_path / "bad.mcap"
     ros = ros_writer("sensor_msgs/CompressedImage")
     broken = ros.pack(ros.new("sensor_msgs/CompressedImage", ros.header(), "jpeg", pixels(b"no picture")))
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema(ros.kind.name, "ros2msg", ros.kind.schema)
-        channel = writer.register_channel("/eye/image", "cdr", schema)
+    with recorder(path) as writer:
+        channel = writer.add_channel("/eye/image", (ros.kind.name, "ros2msg", ros.kind.schema), "cdr")
         writer.add_message(channel, 77, broken if payload is None else payload, 77)
-        writer.finish()
     before = path.read_bytes()
     with log.read(path) as opened, pytest.raises(McaptrackError, match=r"bad\.mcap: /eye/image at 77 ns: ") as error:
         pipeline.run(opened, "/eye", pipeline.plan_stage(opened, "/eye", "detect", KnnDetector()))
@@ -187,9 +183,7 @@ def test_a_real_log_of_images_is_processed_in_place(data, tmp_path):
 
 def boxes_log(path: Path, *names: str, damaged: bool = False) -> list[int]:
     """Write messages with one more box each, of these classes in turn; return their numbers of boxes."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2", library="theirs")
+    with recorder(path, "ros2") as writer:
         kind = vision("v4", [])[0]
         channel = writer.register_channel(
             "/lidar/boxes", "cdr", writer.register_schema(kind.name, "ros2msg", kind.schema)
@@ -198,7 +192,6 @@ def boxes_log(path: Path, *names: str, damaged: bool = False) -> list[int]:
             seen = [(10.0 * n, 20.0, 4.0, 8.0, 0.0, [(names[n % len(names)], 0.5)]) for n in range(number)]
             payload = b"\0\1\0\0damaged" if damaged and number == 2 else vision("v4", seen)[1]
             writer.add_message(channel, START_NS + ns(number / 10), payload, START_NS)
-        writer.finish()
     return [0, 1, 2, 3]
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from mcap.writer import Writer
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcaptrack import foxglove, log
@@ -18,6 +17,7 @@ from mcaptrack.notices import collected
 from mcaptrack.sources import fixed_frame
 from mcaptrack.sources.foreign import MessageType
 from tests.commands import done
+from tests.logs import recorder
 from tests.ros_messages import BAR, Ros
 
 START_NS = 1_700_000_000_000_000_000
@@ -337,15 +337,11 @@ MESSAGES = {
 
 def write(path: Path, *channels) -> Path:
     """A log of channels: (topic, message type, [(log time, payload)])."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
+    with recorder(path) as writer:
         for topic, kind, messages in channels:
-            schema = writer.register_schema(kind.name, kind.schema_encoding, kind.schema)
-            channel = writer.register_channel(topic, kind.encoding, schema)
+            channel = writer.add_channel(topic, (kind.name, kind.schema_encoding, kind.schema), kind.encoding)
             for t_ns, payload in messages:
                 writer.add_message(channel, t_ns, payload, t_ns)
-        writer.finish()
     return path
 
 

@@ -114,7 +114,7 @@ def check(text: str) -> None:
         assert not line.lstrip().startswith("PWNED"), ascii(text)
 
 
-@pytest.mark.parametrize(("command", "line"), one_in(8, LINES), ids=[line for _, line in LINES])
+@pytest.mark.parametrize(("command", "line"), one_in(12, LINES), ids=[line for _, line in LINES])
 def test_no_name_reaches_the_terminal_as_it_is(command, line, run):
     for outcome in (run(f"{line} -v"), run(f"{line} --json") if "--json" not in line else run(line)):
         check(outcome.err)

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from mcaptrack import foxglove, log
 from mcaptrack.choices import Role
@@ -29,6 +28,7 @@ from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.tables.compared import compare_files, detections_and_ground_truth
 from tests.bags import camera_bag
+from tests.logs import recorder
 from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
 from tests.tiers import one_in
 from tests.worlds import ns, write_clip
@@ -349,11 +349,9 @@ def test_pictures_that_are_added_to_labels_have_their_times(tmp_path, stock):
 def test_parameter_sets_that_stand_alone_in_a_message_are_no_pictures(tmp_path):
     """Some robots log them by themselves: labels count pictures."""
     encoder, times, path = H264Encoder(64, 48, Fraction(FPS)), [], tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
+    with recorder(path) as writer:
         name, encoding, data = foxglove.schema_record(foxglove.VIDEO)
-        channel = writer.register_channel("/front/h264", "protobuf", writer.register_schema(name, encoding, data))
+        channel = writer.add_channel("/front/h264", (name, encoding, data), "protobuf")
         for k in range(6):
             unit = encoder.encode(np.full((48, 64, 3), 20 * k, np.uint8))
             alone = b"".join(b"\0\0\0\1" + nal for nal in CODECS["h264"].inspect(unit).sets)
@@ -363,7 +361,6 @@ def test_parameter_sets_that_stand_alone_in_a_message_are_no_pictures(tmp_path):
                 message = CompressedVideo(data=part or b"\0\0\0\1\x06", format="h264")
                 writer.add_message(channel, 1000 * k + number, message.SerializeToString(), 1000 * k)
             times.append(1000 * k + number)
-        writer.finish()
     add(lines(tmp_path / "gt.txt", *range(1, 7)), path, role="truth")
     ingest(path, tmp_path / "b.mcap", IngestOptions(labels={"detections": lines(tmp_path / "det.txt", 1, 6)}))
     for made, role, schema in ((path, "truth", TRACKS), (tmp_path / "b.mcap", "detections", DETECTIONS)):

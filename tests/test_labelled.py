@@ -21,6 +21,7 @@ from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.labels.frames import FrameRanges, Frames, parse_first_frames
 from mcaptrack.transforms import Predict
+from tests.tiers import one_in
 from tests.worlds import walk, write_clip
 
 PICTURES, FPS, PEOPLE = 60, 10, 2
@@ -161,7 +162,7 @@ def scored(scores: mcaptrack.Scores) -> dict[str, Any]:
     return {name: value for name, value in row.items() if name not in ("sequence", "tracks", "mode", "class")}
 
 
-@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
+@pytest.mark.parametrize("way", one_in(2, WAYS.values()), ids=WAYS)
 def test_a_file_and_the_log_that_it_is_ingested_into_give_the_same_scores(tmp_path, clip, way, recwarn):
     """Tracks of every picture: right in all that were labelled but one, with a ghost that is there all the time."""
     truth, path = way.make(tmp_path), tmp_path / "log.mcap"

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from mcap.writer import Writer
 from pyarrow import feather
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +19,7 @@ from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_corners, columns_to_o
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.framing import join_frames
 from tests.commands import call
+from tests.logs import recorder
 from tests.space_logs import START_NS, WAYS, Robot, write
 
 T0 = 315_966_253_660_357_001  # a float64 can't hold it
@@ -434,11 +434,8 @@ def test_3d_labels_do_not_go_with_pictures(tmp_path):
 
 def test_frames_of_labels_have_the_stamps_of_recorded_boxes(tmp_path):
     log = tmp_path / "robot.mcap"
-    with log.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
-        schema = writer.register_schema("foxglove.SceneUpdate", "jsonschema", b"{}")
-        channel = writer.register_channel("/lidar/boxes", "json", schema)
+    with recorder(log) as writer:
+        channel = writer.add_channel("/lidar/boxes", ("foxglove.SceneUpdate", "jsonschema", b"{}"))
         for n in range(3):
             stamp = {"sec": 100 + n, "nsec": 7}
             cube = {"pose": {"position": {"x": n, "y": 0, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}}}
@@ -450,7 +447,6 @@ def test_frames_of_labels_have_the_stamps_of_recorded_boxes(tmp_path):
             }
             message = {"deletions": [], "entities": [entity]}
             writer.add_message(channel, (100 + n) * 10**9 + 40_000_000, json.dumps(message).encode(), 0)
-        writer.finish()
     frames = table(tmp_path, "0,7,1,2", "2,7,3,2", header="frame,id,x_m,y_m")
     result = mcaptrack.ingest(frames, into=log, role="truth")
     assert list(result.messages) == ["/lidar/truth"]

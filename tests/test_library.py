@@ -28,9 +28,9 @@ from mcaptrack.errors import call as proposed
 from mcaptrack.sources import demo
 from mcaptrack.transforms import ByteTrack
 from tests.commands import GROUP, LACKS, call, done
+from tests.sources import PACKAGE, texts
 from tests.worlds import small_scene
 
-PACKAGE = Path(mcaptrack.__file__).parent
 FUNCTIONS = [name for name in mcaptrack.__all__ if inspect.isfunction(getattr(mcaptrack, name))]
 CLASSES = [name for name in mcaptrack.__all__ if inspect.isclass(getattr(mcaptrack, name))]
 #: The public methods of classes of the package, by name, also those that they inherit.
@@ -323,24 +323,8 @@ class TestWordsOfTheCommandLine:
             prints = {"cli", "viewing"} & set(path.relative_to(PACKAGE).parts) or path.name == "command.py"
             if prints or (path.parent / "templates").exists():
                 continue
-            text = path.read_text(encoding="utf-8")
-            if not option.search(text):
-                continue
-            tree = ast.parse(text)
-            documents = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-            if "transforms" in path.parts:  # help of options
-                documents |= {
-                    id(part)
-                    for node in ast.walk(tree)
-                    if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "setting")
-                    for part in ast.walk(node)
-                }
-            texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-            found += [
-                f"{path.relative_to(PACKAGE)}:{node.lineno}: {node.value}"
-                for node in texts
-                if id(node) not in documents and option.search(node.value)
-            ]
+            if option.search(path.read_text("utf-8")):
+                found += [(place, text) for place, text in texts(path) if option.search(text)]
         assert found == []
 
 
@@ -372,11 +356,6 @@ class TestDocumentation:
             assert named == parameters, name
             assert sections == [one for one in SECTIONS if one in sections], name
             assert not (parameters or needed["Returns"]) or sections[-1] == "Examples", name
-
-    @pytest.mark.parametrize("name", FUNCTIONS)
-    def test_types_of_parameters_and_results_are_there_for_those_who_ask(self, name):
-        hints = get_type_hints(getattr(mcaptrack, name))
-        assert hints.keys() == {*inspect.signature(getattr(mcaptrack, name)).parameters, "return"}
 
     @pytest.mark.parametrize("name", [name for name in FUNCTIONS if name in GROUP.commands])
     def test_values_of_another_type_are_refused_by_the_name_of_their_parameter(self, name):

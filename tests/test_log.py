@@ -8,13 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import records
 from mcaptrack.schema import TRACKS
-from tests.logs import MESSAGES, SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_log, write_stock
+from tests.logs import (
+    MESSAGES,
+    SCHEMA,
+    SOME,
+    STOCK_OPTIONS,
+    our_messages,
+    recorder,
+    stock_messages,
+    write_log,
+    write_stock,
+)
 
 
 @given(messages=MESSAGES, kind=st.sampled_from(["rows", "media"]))
@@ -71,13 +80,10 @@ def test_a_channel_that_is_dropped_takes_nothing_with_it(tmp_path, options):
 @pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
 def test_a_channel_without_messages_is_empty_also_where_no_statistics_count_it(tmp_path, options):
     path = tmp_path / "theirs.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)
-        writer.start()
+    with recorder(path, **options) as writer:
         schema = writer.register_schema("text", "jsonschema", b"{}")
         some, _ = (writer.register_channel(topic, "json", schema) for topic in ("some", "none"))
         writer.add_message(some, 1, b"{}", 1)
-        writer.finish()
     with log.read(path) as opened:
         assert opened.channel("none").messages == 0
         assert list(opened.messages("none")) == []

@@ -16,7 +16,7 @@ from mcap.opcode import Opcode as StockOpcode
 from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import IndexType, Writer
+from mcap.writer import IndexType
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
@@ -26,7 +26,7 @@ from mcaptrack.log.index import Index, read_index
 from mcaptrack.log.writer import LogWriter
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import done
-from tests.logs import FORTY, SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_stock
+from tests.logs import FORTY, SCHEMA, SOME, STOCK_OPTIONS, our_messages, recorder, write_stock
 
 MIB = 2**20
 
@@ -62,9 +62,7 @@ def test_a_schema_goes_with_the_last_channel_that_has_it(tmp_path, options):
     path = tmp_path / "a.mcap"
 
     def write() -> None:
-        with path.open("wb") as stream:
-            writer = Writer(stream, **options)
-            writer.start()
+        with recorder(path, **options) as writer:
             schemas = {name: writer.register_schema(name, "jsonschema", b"{}") for name in ("own", "shared", "unused")}
             numbers = {
                 topic: writer.register_channel(topic, "json", schemas[schema])
@@ -72,7 +70,6 @@ def test_a_schema_goes_with_the_last_channel_that_has_it(tmp_path, options):
             }
             for topic, number in numbers.items():
                 writer.add_message(number, 1, topic.encode(), 1)
-            writer.finish()
 
     for dropped, left in (
         (["a"], {"shared", "unused"}),
@@ -99,16 +96,13 @@ def test_a_fingerprint_is_another_when_anything_has_changed(tmp_path):
     path = tmp_path / "a.mcap"
 
     def write(channel="x", other="x", metadata="x", attachment=b"x", payload=b"x", **options) -> tuple[str, str]:
-        with path.open("wb") as stream:
-            writer = Writer(stream, **options)
-            writer.start()
+        with recorder(path, **options) as writer:
             schema = writer.register_schema(*SCHEMA)
             numbers = [writer.register_channel(t, "json", schema, {"m": m}) for t, m in (("a", channel), ("b", other))]
             for number in numbers:
                 writer.add_message(number, 1, payload if number == numbers[0] else b"x", 1)
             writer.add_metadata("about", {"what": metadata})
             writer.add_attachment(1, 2, "notes", "text/plain", attachment)
-            writer.finish()
         return prints(path)
 
     for options in ({"chunk_size": 1}, {"chunk_size": 1, "enable_crcs": False}, {"use_chunking": False}):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 import mcaptrack
 from mcaptrack import log
@@ -16,7 +16,9 @@ from mcaptrack.notices import collected
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import named_detections
 from mcaptrack.sources.foreign.boxes import choosing, read_classes
+from tests.logs import recorder
 from tests.ros_messages import BAR, Ros, plain
+from tests.tiers import one_in
 
 START_NS = 1_700_000_000_000_000_000
 HEAD = {"stamp": {"sec": 1_700_000_000, "nanosec": 0}, "frame_id": "map"}
@@ -365,21 +367,17 @@ def whole(where: str, thing: dict) -> dict:
 
 def write(path: Path, channels: dict[str, tuple[str, list[dict]]], encoding: str) -> Path:
     """A log with messages of types, by topic; each is a tenth of a second after the last one."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with recorder(path) as writer:
         for topic, (name, messages) in channels.items():
             ros = Ros(name, DEFINITIONS.get(name, ""), ros1=encoding == "ros1")
             kind = ros.kind
             if encoding == "json":
                 kind = kind._replace(name=name, schema_encoding="jsonschema", schema=b"{}", encoding="json")
-            schema = writer.register_schema(kind.name, kind.schema_encoding, kind.schema)
-            channel = writer.register_channel(topic, kind.encoding, schema)
+            channel = writer.add_channel(topic, (kind.name, kind.schema_encoding, kind.schema), kind.encoding)
             for number, fields in enumerate(messages):
                 message = made(ros, ros.types, fields)
                 payload = json.dumps(plain(message)).encode() if encoding == "json" else ros.pack(message)
                 writer.add_message(channel, START_NS + number * 10**8, payload, START_NS + number * 10**8)
-        writer.finish()
     return path
 
 
@@ -389,8 +387,7 @@ def read(path: Path, topic: str = "/seen", **chosen: str):
     return found, [(notice.code, notice.message) for notice in said]
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("name", IN_SPACE)
+@pytest.mark.parametrize(("name", "encoding"), one_in(2, product(IN_SPACE, ENCODINGS)))
 def test_positions_ids_classes_and_scores_are_as_the_message_states_them(name, encoding, tmp_path):
     where, thing, has = IN_SPACE[name]
     empty = whole(where, thing) | {where: [], "header": {**HEAD, "stamp": {"sec": 1_700_000_000, "nanosec": 10**8}}}
@@ -417,8 +414,7 @@ def test_positions_ids_classes_and_scores_are_as_the_message_states_them(name, e
         assert foreign.holds_boxes(opened, "/seen", in_space=True)
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize("name", IN_PICTURES)
+@pytest.mark.parametrize(("name", "encoding"), one_in(2, product(IN_PICTURES, ENCODINGS)))
 def test_boxes_in_pictures_are_as_the_message_states_them(name, encoding, tmp_path):
     where, thing = IN_PICTURES[name]
     path = write(tmp_path / "a.mcap", {"/humans/body": (name, [whole(where, thing)] * 2)}, encoding)

@@ -24,12 +24,13 @@ from mcap.decoder import DecoderFactory
 from mcap.exceptions import DecoderNotFoundError
 from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import messages as batches
+from tests.logs import recorder
 
 FILES: dict[str, dict[str, Any]] = {
     "one chunk": {},
@@ -45,9 +46,7 @@ RANGES = [(None, None), (20, None), (None, 40), (20, 40), (30, 30), (-5, 2**63),
 def write_mixed(path: Path, **options: Any) -> Path:
     """Messages that are out of order, with equal times in and across chunks; two channels of a topic, one without schema."""
     chance = random.Random(5)
-    with path.open("wb") as stream:
-        writer = Writer(stream, **options)
-        writer.start()
+    with recorder(path, **options) as writer:
         schema = writer.register_schema("test.Thing", "jsonschema", b"{}")
         other = writer.register_schema("test.Other", "jsonschema", b"{}")
         channels = [
@@ -57,7 +56,6 @@ def write_mixed(path: Path, **options: Any) -> Path:
         for n in range(300):
             t_ns = chance.choice([n // 4, chance.randint(0, 80), 2**63 + n % 3])
             writer.add_message(chance.choice(channels), t_ns, json.dumps({"n": n}).encode(), t_ns // 2, n)
-        writer.finish()
     return path
 
 
@@ -130,13 +128,10 @@ def test_times_are_numbers_or_moments(mixed):
 
 def test_only_chunks_in_the_period_are_read(tmp_path):
     path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=100)
-        writer.start()
+    with recorder(path, chunk_size=100) as writer:
         channel = writer.register_channel("/a", "json", 0)
         for n in range(40):
             writer.add_message(channel, n, bytes(90), n)
-        writer.finish()
     with log.read(path) as opened:
         content, chunks = bytearray(path.read_bytes()), list(opened.index.chunks)
     assert len(chunks) > 10
@@ -243,18 +238,14 @@ class Texts(DecoderFactory):
 def strange(tmp_path) -> Path:
     """A recording of ROS 1, with a channel of JSON and one in an encoding that nobody reads."""
     path = tmp_path / "strange.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros1")
-        text = writer.register_schema("std_msgs/String", "ros1msg", b"string data\n")
-        said = writer.register_channel("/said", "ros1", text)
+    with recorder(path, "ros1") as writer:
+        said = writer.add_channel("/said", ("std_msgs/String", "ros1msg", b"string data\n"), "ros1")
         plain_json = writer.register_channel("/json", "json", 0)
-        own = writer.register_channel("/own", "own", writer.register_schema("own", "own", b""))
+        own = writer.add_channel("/own", ("own", "own", b""), "own")
         for n in range(2):
             writer.add_message(said, 3 * n, struct.pack("<I", 2) + b"hi", 0)
             writer.add_message(plain_json, 3 * n + 1, json.dumps({"n": [n, None]}).encode(), 0)
             writer.add_message(own, 3 * n + 2, b"?", 0)
-        writer.finish()
     return path
 
 
@@ -281,13 +272,10 @@ def test_what_nothing_decodes_is_refused_as_the_mcap_package_does(strange):
 
 def test_payloads_that_are_damaged_are_refused_in_a_line_and_given_as_they_are(tmp_path):
     path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with recorder(path) as writer:
         channel = writer.register_channel("/a", "json", 0)
         for payload in (b"{}", b"{", b"\xff"):
             writer.add_message(channel, 5, payload, 0)
-        writer.finish()
     with mcaptrack.open(path) as opened:
         found = opened.messages("/a")
         assert next(found).decoded == {}
@@ -318,14 +306,11 @@ class Kept(DecoderFactory):
 
 
 def write_named(path: Path, name: str, topics: Sequence[str]) -> Path:
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with recorder(path) as writer:
         schema = writer.register_schema(name, "jsonschema", b"")
         for topic in topics:
             channel = writer.register_channel(topic, "json", schema)
             writer.add_message(channel, 7, name.encode(), 0)
-        writer.finish()
     return path
 
 
@@ -403,12 +388,9 @@ def test_files_of_a_protobuf_definition_come_in_any_order(tmp_path):
     outer.message_type.add(name="Outer").field.add(name="inner", number=1, type=11, label=1, type_name=".p.Inner")
     for files in ([inner, outer], [outer, inner]):
         path = tmp_path / "a.mcap"
-        with path.open("wb") as stream:
-            writer = Writer(stream)
-            writer.start()
+        with recorder(path) as writer:
             schema = writer.register_schema("p.Outer", "protobuf", FileDescriptorSet(file=files).SerializeToString())
             writer.add_message(writer.register_channel("/a", "protobuf", schema), 1, b"\x0a\x02\x08\x05", 1)
-            writer.finish()
         with mcaptrack.open(path) as opened:
             assert [plain(one.decoded) for one in opened.messages()] == [{"inner": {"x": 5}}]
             assert opened.table("/a").column("inner_x").to_pylist() == [5]

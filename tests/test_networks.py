@@ -219,6 +219,7 @@ def test_saved_files_are_aligned_and_in_order_whatever_the_card_says(tmp_path):
         assert load(tmp_path / "w.safetensors").card["note"] == "x" * length
 
 
+@pytest.mark.usefixtures("networks_here")
 class TestOnnx:
     def file(self, folder, text):
         path = folder / "net.onnx"

@@ -12,14 +12,14 @@ from threading import Thread
 from typing import get_args
 
 import pytest
-from typer.testing import CliRunner
 
 import mcaptrack
 from mcaptrack import log, notices, pipeline
-from mcaptrack.cli import app, common
+from mcaptrack.cli import common
 from mcaptrack.notices import Code, McaptrackWarning, Notice
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.transforms import Sort
+from tests.commands import done
 
 PACKAGE = Path(mcaptrack.__file__).parent
 NO_PLANE = "no ground plane is known"
@@ -34,16 +34,11 @@ def boxes(tmp_path) -> Path:
     return path
 
 
-def call(*words: object):
-    return copy_context().run(CliRunner().invoke, app, [str(word) for word in words])
-
-
 def test_a_warning_is_shown_even_when_quiet_and_stands_in_the_json(boxes):
-    outcome = call("track", boxes, "--json", "-q")
-    assert outcome.exit_code == 0
-    (line,) = outcome.stderr.splitlines()
+    outcome = copy_context().run(done, "track", boxes, "--json", "-q")
+    (line,) = outcome.err.splitlines()
     assert line.startswith(f"warning: {boxes}: {NO_PLANE}")
-    (said,) = json.loads(outcome.stdout)["warnings"]
+    (said,) = json.loads(outcome.out)["warnings"]
     assert (said["code"], said["log"]) == ("assumed-ground-plane", str(boxes))
     assert line == f"warning: {boxes}: {said['message']}"
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import networks, notices
+from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.schema.provenance import Provenance
@@ -44,10 +44,7 @@ BLOCK = (64, 32, 32, 32)
 PICTURE = blue_blocks(SIZE, BLOCK)
 
 
-@pytest.fixture(autouse=True)
-def _here(monkeypatch):
-    """Networks run in this process, which takes less time; tests/test_strange_networks.py has the other one."""
-    monkeypatch.setattr(networks, "_runs_apart", lambda is_trusted: False)
+pytestmark = pytest.mark.usefixtures("networks_here")
 
 
 @pytest.fixture

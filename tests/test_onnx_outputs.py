@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mcaptrack import networks, notices
+from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import OnnxDetector
@@ -112,10 +112,7 @@ REFUSED = {
 }
 
 
-@pytest.fixture(autouse=True)
-def _here(monkeypatch):
-    """Networks run in this process, which takes less time; tests/test_strange_networks.py has the other one."""
-    monkeypatch.setattr(networks, "_runs_apart", lambda is_trusted: False)
+pytestmark = pytest.mark.usefixtures("networks_here")
 
 
 def detect(data: bytes, folder: Any, **options: Any) -> tuple[list[tuple[int, ...]], str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 import subprocess
@@ -23,6 +22,7 @@ from typer.main import get_command
 from mcaptrack import __version__
 from mcaptrack.cli import app
 from tests.commands import call
+from tests.sources import PACKAGE, texts
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -124,24 +124,11 @@ def help_texts() -> Iterator[tuple[str, str]]:
         )
 
 
-def strings() -> Iterator[tuple[str, str]]:
-    """Every string in the package but its docstrings; those of commands are their help."""
-    for path in sorted((ROOT / "mcaptrack").rglob("*.py")):
-        tree = ast.parse(path.read_text())
-        kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-        documented = [
-            node.body[0].value
-            for node in ast.walk(tree)
-            if isinstance(node, kinds) and isinstance(node.body[0], ast.Expr)
-        ]
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in documented:
-                yield f"{path.relative_to(ROOT)}:{node.lineno}", node.value
-
-
 @cache
 def said() -> list[tuple[str, str]]:
-    return [*help_texts(), *strings()]
+    """Every text of the package but docstrings; those of commands are their help."""
+    modules = sorted(PACKAGE.rglob("*.py"))
+    return [*help_texts(), *(text for path in modules for text in texts(path, with_help=True))]
 
 
 def test_pages_that_help_and_errors_name_are_in_the_wheel(shipped):

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import Writer
 
 import mcaptrack
 from tests.commands import call
-from tests.logs import provenance_of
+from tests.logs import provenance_of, recorder
 from tests.ros_messages import pixels, ros_writer
+from tests.tiers import one_in
 from tests.worlds import small_scene
 
 TOPIC = "/cam/image_raw"
@@ -76,18 +76,15 @@ class Channel:
 
 
 def written(path: Path, channels: Mapping[str, Channel], seconds: float = 4.0) -> Path:
-    with path.open("wb") as stream:
-        writer, ids = Writer(stream), dict[str, int]()
-        writer.start()
+    ids: dict[str, int] = {}
+    with recorder(path) as writer:
         for number, shot in enumerate(small_scene(seconds).shots()):
             for topic, channel in channels.items():
                 t_ns = 10**18 + number * 10**8
                 kind, content = channel.message(shot.image, t_ns)
                 if topic not in ids:
-                    schema = writer.register_schema(kind.name, "ros2msg", kind.schema)
-                    ids[topic] = writer.register_channel(topic, "cdr", schema)
+                    ids[topic] = writer.add_channel(topic, (kind.name, "ros2msg", kind.schema), "cdr")
                 writer.add_message(ids[topic], t_ns, content, t_ns)
-        writer.finish()
     return path
 
 
@@ -123,7 +120,7 @@ def boxes(tmp_path_factory) -> int:
     return mcaptrack.detect(path).rows["/cam/detections"]
 
 
-@pytest.mark.parametrize(("channel", "span"), SAME.values(), ids=SAME)
+@pytest.mark.parametrize(("channel", "span"), one_in(3, SAME.values()), ids=SAME)
 def test_the_same_people_are_found_and_the_range_is_said_and_kept(tmp_path, boxes, channel, span):
     path = written(tmp_path / "a.mcap", {TOPIC: channel})
     result = mcaptrack.detect(path)
@@ -186,7 +183,7 @@ DEPTHS = {
 }
 
 
-@pytest.mark.parametrize(("depth", "topic"), DEPTHS.values(), ids=DEPTHS)
+@pytest.mark.parametrize(("depth", "topic"), one_in(3, DEPTHS.values()), ids=DEPTHS)
 def test_people_are_not_looked_for_in_depths(tmp_path, depth, topic):
     alone = written(tmp_path / "alone.mcap", {topic: depth}, 2.0)
     for name in ("run", "detect"):
@@ -230,13 +227,11 @@ def test_the_eyes_of_a_stereo_camera_are_two_cameras(tmp_path):
 
 def test_pictures_that_are_not_read_are_named(tmp_path):
     path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema("theora_image_transport/msg/Packet", "ros2msg", b"uint8[] data")
-        channel = writer.register_channel("/cam/image_raw/theora", "cdr", schema)
+    with recorder(path) as writer:
+        channel = writer.add_channel(
+            "/cam/image_raw/theora", ("theora_image_transport/msg/Packet", "ros2msg", b"uint8[] data"), "cdr"
+        )
         writer.add_message(channel, 5, b"\0\1\0\0", 5)
-        writer.finish()
     done = call("run", path)
     assert done.code == 1
     assert "/cam/image_raw/theora is Theora video, which is not read" in done.err

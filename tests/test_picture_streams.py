@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 import mcaptrack
 from mcaptrack import log
@@ -21,6 +20,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import EncodedPicture, Recogniser, decode_gray
 from tests.commands import call
+from tests.logs import recorder
 from tests.ros_messages import pixels, ros_writer
 from tests.worlds import _own_priority
 
@@ -125,9 +125,7 @@ def written(path: Path, kind: str, called: str, payloads: list[bytes], topic: st
         more = BAR + "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
         more += BAR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
         ros = ros_writer(name, PACKET + more)
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with recorder(path) as writer:
         channel = None
         for number, data in enumerate(payloads):
             t_ns = 10**18 + number * 10**8
@@ -145,9 +143,8 @@ def written(path: Path, kind: str, called: str, payloads: list[bytes], topic: st
             if channel is None:
                 about = (schema.name, "ros2msg", schema.schema) if schema else None
                 about = about or ("foxglove.CompressedVideo", "jsonschema", b"{}")
-                channel = writer.register_channel(topic, encoding, writer.register_schema(*about))
+                channel = writer.add_channel(topic, about, encoding)
             writer.add_message(channel, t_ns, content, t_ns)
-        writer.finish()
     return path
 
 

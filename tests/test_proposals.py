@@ -28,10 +28,10 @@ from tests.commands import GROUP, call, done, zones_file
 from tests.interrupted import interrupt
 from tests.models import stocked
 from tests.robots import write_log
+from tests.sources import PACKAGE, texts
 from tests.stores import Store, only_in
 from tests.tiers import one_in
 
-PACKAGE = Path(mcaptrack.__file__).parent
 #: A name that is difficult for a shell, an option parser and a parser of messages.
 NAME = "-a  b'c$(x)`.mcap".replace("`", "")
 VERBS = "|".join(GROUP.commands)
@@ -315,28 +315,10 @@ def test_every_proposal_has_a_scene():
 
 def test_commands_are_proposed_in_one_way():
     """Texts other than documentation name commands through ``errors.command`` only."""
-    found = []
+    named, found = re.compile(rf"\bmcaptrack ({VERBS})\b"), []
     for path in PACKAGE.rglob("*.py"):
-        text = path.read_text(encoding="utf-8")
-        if not re.search(rf"\bmcaptrack ({VERBS})\b", text):
-            continue
-        tree = ast.parse(text)
-        documents = {
-            id(node.body[0].value)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module)
-            and node.body
-            and isinstance(node.body[0], ast.Expr)
-        }
-        documents |= {
-            id(part)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.keyword) and node.arg == "help"
-            for part in ast.walk(node)
-        }
-        texts = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-        texts = [node for node in texts if id(node) not in documents and not node.value.startswith("Example: ")]
-        found += [f"{path}:{node.lineno}" for node in texts if re.search(rf"\bmcaptrack ({VERBS})\b", node.value)]
+        if named.search(path.read_text("utf-8")):
+            found += [place for place, text in texts(path) if named.search(text) and not text.startswith("Example: ")]
     assert found == []
 
 

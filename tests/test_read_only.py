@@ -157,7 +157,7 @@ SURROUNDINGS = {"nothing": None, "noise": os.urandom(4096), "emptiness": b""}
 @pytest.mark.usefixtures("never_waits")
 @pytest.mark.parametrize(
     ("beside", "command"),  # train needs torch, and calibrate several cameras
-    one_in(2, product(SURROUNDINGS, sorted(set(GROUP.commands) - {"calibrate", "demo", "models", "train"}))),
+    one_in(3, product(SURROUNDINGS, sorted(set(GROUP.commands) - {"calibrate", "demo", "models", "train"}))),
 )
 def test_commands_that_read_change_nothing(command: str, beside: str, template: Path, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)

@@ -9,7 +9,6 @@ from typing import get_args
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from mcaptrack import log
 from mcaptrack.choices import Role
@@ -18,6 +17,7 @@ from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.transforms import TRANSFORMS
 from tests.bags import camera_bag
 from tests.commands import call
+from tests.logs import recorder
 from tests.robots import lines, robot_log
 from tests.tiers import one_in
 from tests.worlds import write_clip
@@ -34,9 +34,7 @@ def mcaptrack(*words: object) -> tuple[int, str]:
 
 def record(path: Path, *topics: str, source: Path | None = None) -> Path:
     """A log with 5 messages of others on each topic, and all that is in ``source``, as others would write it."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
+    with recorder(path) as writer:
         if source:
             with source.open("rb") as other:
                 known: dict[int, int] = {}
@@ -54,7 +52,6 @@ def record(path: Path, *topics: str, source: Path | None = None) -> Path:
             channel = writer.register_channel(topic, "json", schema)
             for n in range(5):
                 writer.add_message(channel, n * 100_000_000, b'{"n": %d}' % n, n)
-        writer.finish()
     return path
 
 

@@ -42,14 +42,14 @@ def edge(decides: Callable[[float], bool], low: float, high: float) -> float:
     """Bisect for the value at which a decision flips that holds at ``low`` and not at ``high``."""
     assert decides(low)
     assert not decides(high)
-    for _ in range(16):
+    for _ in range(12):
         middle = (low + high) / 2
         low, high = (middle, high) if decides(middle) else (low, middle)
     return (low + high) / 2
 
 
 def compare(ours: Callable[[float], bool], reference: Callable[[float], bool], low: float, high: float) -> None:
-    assert edge(ours, low, high) == pytest.approx(edge(reference, low, high), abs=(high - low) / 2**15)
+    assert edge(ours, low, high) == pytest.approx(edge(reference, low, high), abs=(high - low) / 2**11)
 
 
 def by_reference(frames: list[Frame]):

@@ -31,7 +31,7 @@ def passed(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("robot")
     path, truth = write_passing(folder, shots=SHOTS)
     mcaptrack.ingest(truth, into=path, role="truth", frame="map", sidecar=False)
-    mcaptrack.run(path, sidecar=False)
+    mcaptrack.run(path, sidecar=False, tables=False)
     return path
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -28,6 +27,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.bags import metadata_yaml
 from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
+from tests.logs import recorder
 from tests.space_logs import WAYS, Robot, write
 from tests.test_ros_recordings import record
 
@@ -331,13 +331,10 @@ def test_topics_that_ros_does_not_accept_are_said(copied):
 
 def odd(path: Path, topic: str, record: tuple[str, str, bytes], payloads: list[bytes], t_ns: int = T0) -> Path:
     """A recording of ROS 2 with a channel as other software, or another version, wrote it."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2", "robot")
-        channel = writer.register_channel(topic, "cdr", writer.register_schema(*record))
+    with recorder(path, "ros2") as writer:
+        channel = writer.add_channel(topic, record, "cdr")
         for number, payload in enumerate(payloads):
             writer.add_message(channel, t_ns + number * 100_000_000, payload, t_ns, number)
-        writer.finish()
     return path
 
 

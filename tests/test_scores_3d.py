@@ -10,7 +10,6 @@ import motmetrics as mm
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log as LogMessage
-from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 import mcaptrack
@@ -24,6 +23,7 @@ from mcaptrack.evaluation.metrics.matchup import Matchup
 from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call
+from tests.logs import recorder
 from tests.worlds import ns
 
 NAMES = {1: "pedestrian", 2: "car", 3: "truck"}
@@ -238,11 +238,8 @@ def test_the_default_gate_is_two_metres_for_boxes_in_space_and_one_for_positions
 
 def transforms(path, poses: dict[int, tuple[Rotation, np.ndarray]]) -> None:
     """A recording with the poses of "odom" in "map", as JSON."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(library="theirs")
-        schema = writer.register_schema("foxglove.FrameTransform", "jsonschema", b"{}")
-        channel = writer.register_channel("/tf", "json", schema)
+    with recorder(path) as writer:
+        channel = writer.add_channel("/tf", ("foxglove.FrameTransform", "jsonschema", b"{}"))
         for t_ns, (turn, shift) in poses.items():
             stamp = {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}
             x, y, z, w = turn.as_quat().tolist()
@@ -250,7 +247,6 @@ def transforms(path, poses: dict[int, tuple[Rotation, np.ndarray]]) -> None:
             words["translation"] = dict(zip("xyz", shift.tolist(), strict=True))
             words["rotation"] = {"x": x, "y": y, "z": z, "w": w}
             writer.add_message(channel, t_ns, json.dumps(words).encode(), t_ns)
-        writer.finish()
 
 
 def test_ground_truth_in_another_frame_is_brought_to_that_of_the_tracks(tmp_path):

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import TRACKS, Frame
+from tests.logs import recorder
 from tests.worlds import tracks_at
 
 #: Definitions that decode alike, and one that doesn't.
@@ -33,9 +33,7 @@ CHANNELS = st.lists(
 
 def write(path: Path, channels: list[tuple[str, str, str, list[int]]], chunk_size: int = 2**20) -> None:
     """Channels by the stock writer, their messages in turns; without chunks for a ``chunk_size`` of 0."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=chunk_size, use_chunking=chunk_size > 0)
-        writer.start()
+    with recorder(path, chunk_size=chunk_size, use_chunking=chunk_size > 0) as writer:
         turns = []
         for number, (topic, definition, encoding, times) in enumerate(channels):
             schema = writer.register_schema("std_msgs/String", "ros1msg", definition.encode())
@@ -43,7 +41,6 @@ def write(path: Path, channels: list[tuple[str, str, str, list[int]]], chunk_siz
             turns += [(place, channel, t_ns) for place, t_ns in enumerate(times)]
         for place, channel, t_ns in sorted(turns):
             writer.add_message(channel, t_ns, bytes([channel, place]), t_ns)
-        writer.finish()
 
 
 def stock(path: Path) -> tuple[int, list[tuple[str, int]], list[tuple[str, int, bytes]]]:

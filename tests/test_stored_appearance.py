@@ -44,7 +44,7 @@ def test_colours_are_stored_only_on_request_and_go_with_the_next_run_without_it(
     table = pq.read_table(file)
     assert table.num_rows == len(rows)
     assert "near 19.9" in table.schema.field("lightness_2").metadata[b"description"].decode()
-    done("run", there, "--force", "-q")  # as before
+    done("run", there, "--force", "--no-tables", "-q")  # as before
     with log.Log(there) as opened:
         assert TOPIC in opened.channels
     done("retrack", there, "-q")

@@ -389,6 +389,6 @@ def at_work(pid: int) -> int:
     while True:
         for one in strange_processes(pid):
             used = Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split()
-            if (int(used[11]) + int(used[12])) / os.sysconf("SC_CLK_TCK") > 2:
+            if (int(used[11]) + int(used[12])) / os.sysconf("SC_CLK_TCK") > 1:
                 return one
         sleep(0.02)

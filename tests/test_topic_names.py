@@ -119,12 +119,12 @@ def test_the_end_of_a_topic_is_the_topic(template, tmp_path, end, work):
     with log.read(template) as opened:
         (whole,) = [name for name in opened.channels if name.endswith(f"/{end}")]
     out = []
-    for topic in (whole, end, whole[1:]):
+    for topic in (whole, end):
         folder = tmp_path / str(len(out))
         folder.mkdir()
         path = Path(shutil.copy(template, folder / "log.mcap"))
         out.append(work(path, topic, folder))
-    assert out[0] == out[1] == out[2]
+    assert out[0] == out[1]
     assert out[0]
 
 

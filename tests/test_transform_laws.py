@@ -63,8 +63,8 @@ def describe(value: object) -> str:
 
 
 def _variants() -> list[object]:
-    """All variants, of which those after the defaults run in the thorough tier, but for one in three."""
-    return [*variants()[: len(TRANSFORMS)], *one_in(3, variants()[len(TRANSFORMS) :])]
+    """All variants, of which those after the defaults run in the thorough tier, but for one in five."""
+    return [*variants()[: len(TRANSFORMS)], *one_in(5, variants()[len(TRANSFORMS) :])]
 
 
 every = pytest.mark.parametrize(("name", "transform"), _variants(), ids=describe)

@@ -20,6 +20,7 @@ from numpy import ndarray
 import mcaptrack
 from mcaptrack.log import CheckResult, Finding
 from tests.test_library import CLASSES, FUNCTIONS, METHODS
+from tests.tiers import thorough
 from tools import pages
 from tools.pages import ROOT
 
@@ -97,6 +98,7 @@ CHECKERS = pytest.mark.parametrize(
 )
 
 
+@thorough
 @CHECKERS
 def test_checkers_pass_over_the_documentation_and_over_a_script_that_uses_every_name(
     checker: Callable[[Path], list[str]], tmp_path

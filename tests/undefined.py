@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tests.bags import database
+from tests.logs import recorder
 
 T0 = 1_700_000_000_000_000_000
 _HYPOTHESIS = "geometry_msgs/PoseWithCovariance pose"
@@ -135,13 +135,10 @@ def write_undefined(folder: Path) -> None:
     """Messages whose definition is that of the workspace ``src`` alone: a log, and a database."""
     place, name, payloads = package(folder)
     place.rename(folder / "src")
-    with (folder / "bare.mcap").open("wb") as stream:
-        writer = McapWriter(stream)
-        writer.start("ros2", "robot")
-        channel = writer.register_channel("/t", "cdr", writer.register_schema(name, "ros2msg", b""))
+    with recorder(folder / "bare.mcap", "ros2") as writer:
+        channel = writer.add_channel("/t", (name, "ros2msg", b""), "cdr")
         for number, payload in enumerate(payloads):
             writer.add_message(channel, T0 + number, payload, T0)
-        writer.finish()
     database(
         folder / "bare.db3",
         2,

@@ -24,6 +24,8 @@ from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")
 _LITTLE_BYTES: Final = 1_000_000_000
+#: The line of a module in the list of files that pip keeps of a package.
+_MODULES: Final = re.compile(r"^([^/,\n]+)/__init__\.py,", re.MULTILINE)
 _REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([\d.]+))?[^;]*(?:;(.*))?")
 
 
@@ -314,9 +316,8 @@ def _overwritten(packages: Collection[str]) -> Iterator[str]:
     owners: dict[str, set[str]] = {}
     for package in metadata.distributions():
         with suppress(Exception):  # metadata of another package that can't be read
-            for path in package.files or ():
-                if len(path.parts) == 2 and path.name == "__init__.py":
-                    owners.setdefault(path.parts[0], set()).add(package.name)
+            for module in _MODULES.findall(package.read_text("RECORD") or ""):
+                owners.setdefault(module, set()).add(package.name)
     for module, names in owners.items():
         several = sorted(names)
         needed = [name for name in several if name in packages]

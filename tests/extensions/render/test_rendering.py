@@ -12,7 +12,6 @@ import pytest
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from scipy.spatial.transform import Rotation
 
 from mcaptrack import foxglove, log
@@ -24,6 +23,7 @@ from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.legend import with_legend
 from mcaptrack.viewing.painting import draw, message_at
 from tests.commands import call, printed
+from tests.logs import recorder
 from tests.robots import write_log
 
 GREY = np.full((100, 200, 3), 100, np.uint8)
@@ -244,16 +244,14 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
 def test_a_log_with_pictures_that_cannot_be_decoded_is_processed_and_drawn_without_them(tmp_path):
     whole, path, output = tmp_path / "whole.mcap", tmp_path / "eye.mcap", tmp_path / "eye.mp4"
     write_log(whole, "/eye/image")
-    with whole.open("rb") as source, path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="ros2", library="theirs")
+    with whole.open("rb") as source, recorder(path, "ros2") as writer:
         for number, (schema, channel, message) in enumerate(make_reader(source).iter_messages()):
             if number == 0:
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channel_id = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
+                channel_id = writer.add_channel(
+                    channel.topic, (schema.name, schema.encoding, schema.data), channel.message_encoding
+                )
             data = message.data[:60] + b"\x55" * (len(message.data) - 60) if number in (7, 20) else message.data
             writer.add_message(channel_id, message.log_time, data, message.publish_time)
-        writer.finish()
     left_out = "2 of 50 pictures"
     assert f"{left_out} can't be decoded and are left out, the first: " in call("run", str(path), "--no-tables").err
     with log.read(path) as opened:
