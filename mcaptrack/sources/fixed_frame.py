@@ -657,7 +657,10 @@ def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> f
         warn(f"{opened.path}: {topic}: {repeated:,} of {len(frame):,} {remark}", "left-out")
     is_taken = is_known & ~is_repeated
     boxes, frame = boxes.select(is_taken), frame[is_taken]
-    _warn_odd(opened, topic, boxes)
+    odd = boxes.times()[1]
+    if odd:
+        text = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
+        warn(f"{opened.path}: {topic}: {odd:,} of {len(boxes.stamp_ns):,} boxes {text}", "clock")
     rows = rows_of_boxes(boxes, rotation[is_taken], shift[is_taken], f"{opened.path}: {topic}")
     if unclassed := int((rows["class_id"] == UNKNOWN).sum()):
         remark = "boxes have no class, or 0: they move as objects of unknown class do"
@@ -670,7 +673,7 @@ def _in_space(opened: log.Log, topic: str, reading: Reading, frame_id: str) -> f
     kept = np.flatnonzero(~is_left_out).tolist()
     times = start_ns.tolist()
     frames = [Frame(times[at], index, by_frame[at]) for index, at in enumerate(kept)]
-    clock = "stamps" if not boxes.times()[1] else "stamps, and log times where they are missing or off"
+    clock = "stamps" if not odd else "stamps, and log times where they are missing or off"
     facts = facts_of(choice_for(opened, topic), reading, clock=clock, classes=boxes.classes.source, scale="metres")
     return foreign.NamedFrames(frames, boxes.classes.names, fixed, facts)
 
@@ -773,14 +776,6 @@ def _connected(opened: log.Log, boxes: Recorded3d) -> str:
     transforms = transforms_of(opened)
     frames = list_names(transforms.frames() if transforms else [], _LISTED)
     return f"boxes are in {list_names(boxes.names, _LISTED)}, and transforms have {frames};"
-
-
-def _warn_odd(opened: log.Log, topic: str, boxes: Recorded3d) -> None:
-    """Warn of boxes that have the log time instead of their stamp."""
-    _, count = boxes.times()
-    if count:
-        text = "have no stamp, or one that is more than 60 s from the log time: their time is the log time"
-        warn(f"{opened.path}: {topic}: {count:,} of {len(boxes.stamp_ns):,} boxes {text}", "clock")
 
 
 def rows_of_boxes(boxes: Recorded3d, rotation: Floats, shift: Floats, where: str = "") -> Rows:

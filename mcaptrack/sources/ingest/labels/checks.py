@@ -192,13 +192,15 @@ def check_shares(table: BoxTable, _: Asked) -> None:
 
 def check_scores(table: BoxTable, _: Asked) -> None:
     """Scores lie between 0 and 1."""
-    high, low = table.score > 1, table.score < 0
-    if high.any():
-        text = ": of {rows} scores {0} above 1 (up to {most:g}); they stay as they are"
-        table.find(text, "scores", int(high.sum()), most=float(table.score[high].max()))
-    if low.any():
-        text = ": of {rows} scores {0} below 0 (down to {most:g}); they stay as they are"
-        table.find(text, "scores", int(low.sum()), most=float(table.score[low].min()))
+    for wrong, where in (
+        (table.score > 1, "above 1 (up to {most:g})"),
+        (table.score < 0, "below 0 (down to {most:g})"),
+    ):
+        if wrong.any():
+            most = float(max(table.score[wrong], key=abs))
+            table.find(
+                f": of {{rows}} scores {{0}} {where}; they stay as they are", "scores", int(wrong.sum()), most=most
+            )
 
 
 def check_repeated(table: BoxTable, _: Asked) -> None:
