@@ -16,10 +16,11 @@ from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.bags import plain_yaml
-from mcaptrack.sources.ingest.bags.plain_yaml import Fields, UnsupportedYamlError
+from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError, field
 from mcaptrack.sources.sidecar import METADATA
 
 ROOT: Final = "rosbag2_bagfile_information"
+_TOPIC: Final = "topic_metadata"
 
 
 @dataclass
@@ -55,16 +56,18 @@ def read_metadata(path: Path) -> tuple[Bag, list[str]]:
 
     text = read_beginning(path, plain_yaml.MAX_BYTES + 1)
     try:
-        fields = Fields(plain_yaml.load(text), "it").map(ROOT)
-        mode, compression = fields.text("compression_mode", ""), fields.text("compression_format", "")
-        entries = [Fields(entry, "a topic") for entry in fields.values("topics_with_message_count")]
-        counts = [entry.whole("message_count") for entry in entries]
+        fields = field(plain_yaml.load(text), ROOT, dict)
+        mode, compression, distro = (
+            field(fields, name, str, "") for name in ("compression_mode", "compression_format", "ros_distro")
+        )
+        entries = field(fields, "topics_with_message_count", list, [])
+        counts = [field(entry, "message_count", int) for entry in entries]
         # Numbers as numbers, for profiles of quality of service.
         typed = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))[ROOT]  # noqa: S506  # a safe loader
         both = zip(entries, typed.get("topics_with_message_count") or (), counts, strict=False)
-        topics = [(*_topic(entry.map("topic_metadata"), values["topic_metadata"]), n) for entry, values, n in both]
-        names = [_name(entry) for entry in fields.values("relative_file_paths")]
-        bag = Bag(text, fields.text("ros_distro", ""), mode.lower() == "message", topics)
+        topics = [(*_topic(field(entry, _TOPIC, dict), values[_TOPIC]), count) for entry, values, count in both]
+        names = [_name(entry) for entry in field(fields, "relative_file_paths", list, [])]
+        bag = Bag(text, distro, mode.lower() == "message", topics)
     except ValueError as error:
         raise McaptrackError(f"{path} is not the metadata of a rosbag2 bag ({str(error)[:200]})") from None
     twice = next((name for name, times in Counter(names).items() if times > 1), "")
@@ -75,14 +78,15 @@ def read_metadata(path: Path) -> tuple[Bag, list[str]]:
     return bag, names
 
 
-def _topic(topic: Fields, typed: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
+def _topic(topic: Mapping[str, Any], typed: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
     import yaml
 
-    name, kind, encoding = topic.text("name"), topic.text("type"), topic.text("serialization_format", "cdr")
+    name, kind = field(topic, "name", str), field(topic, "type", str)
+    encoding, digest = field(topic, "serialization_format", str, CDR), field(topic, "type_description_hash", str, "")
     qos = typed.get("offered_qos_profiles") or ""
     # Text before ROS 2 Jazzy; since then nested YAML.
     profiles = qos if isinstance(qos, str) else yaml.safe_dump(qos, sort_keys=False, width=10_000)
-    return name, kind, encoding, profiles, topic.text("type_description_hash", "")
+    return name, kind, encoding, profiles, digest
 
 
 def _name(entry: Any) -> str:
@@ -164,7 +168,7 @@ def _update(metadata: Path) -> bool:
     version = version if isinstance(version, int) else 0
     entries += [_entry(topic, kinds[topic], totals[topic], version) for topic in sorted(totals.keys() - dict(old))]
     info["topics_with_message_count"] = entries
-    new = [(str(entry["topic_metadata"]["name"]), int(entry["message_count"])) for entry in entries]
+    new = [(str(entry[_TOPIC]["name"]), int(entry["message_count"])) for entry in entries]
     if isinstance(info.get("message_count"), int):
         info["message_count"] += sum(n for _, n in new) - sum(n for _, n in old)
     _set_times(info, [file for file in files.values() if file.messages])
@@ -206,7 +210,7 @@ def _entry(topic: str, kind: str, count: int, version: int) -> dict[str, Any]:
         values["offered_qos_profiles"] = [] if version >= _QOS_LIST else ""
     if version >= _HASH:
         values["type_description_hash"] = ""
-    return {"topic_metadata": values, "message_count": count}
+    return {_TOPIC: values, "message_count": count}
 
 
 def _set_times(entry: dict[str, Any], files: list[_Content]) -> None:

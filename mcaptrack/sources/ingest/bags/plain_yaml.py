@@ -7,7 +7,7 @@ reader of a field determines its type.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Final, NoReturn
 from xml.parsers import expat
@@ -92,62 +92,24 @@ def _build(yaml: Any, events: Iterator[Any], tags: Collection[str]) -> Any:
     return documents[0]
 
 
-class Fields:
-    """The fields of a map, each of the kind that its reader asks for.
+#: The kinds of values that fields may have, in words; whole numbers are from 0 to 2^63 - 1.
+_KINDS: Final = {str: "text", int: "a whole number", list: "a list", dict: "a map"}
 
-    ``where`` says which map it is. Every method raises NotPlainError, with the field and what it is, for another kind.
+
+def field(fields: Any, name: str, kind: type, default: Any = None) -> Any:
+    """The value of a field of a map, of this kind; ``default``, if there is one, for an empty or missing field.
+
+    Raises UnsupportedYamlError, with the field and what it is, for another kind.
     """
-
-    def __init__(self, value: Any, where: str) -> None:
-        if not isinstance(value, dict):
-            raise UnsupportedYamlError(f"{where} is {_kind(value)}, not a map")
-        self._fields: Mapping[str, Any] = value
-        self._where = where
-
-    def text(self, name: str, default: str | None = None) -> str:
-        """A text field; ``default``, if given, for an empty or missing one."""
-        value = self._fields.get(name)
-        if default is not None and (value is None or _is_null(value)):
-            return default
-        if not isinstance(value, str):
-            raise self._wrong(name, value, "text")
-        return str(value)
-
-    def whole(self, name: str) -> int:
-        """An integer field from 0 to 2^63 - 1."""
-        value = self._fields.get(name)
-        number = int(value) if isinstance(value, str) and _WHOLE.fullmatch(value) else -1
-        if not 0 <= number < 2**63:
-            raise self._wrong(name, value, "a whole number")
-        return number
-
-    def values(self, name: str) -> list[Any]:
-        """A list field; empty for an empty or missing one."""
-        value = self._fields.get(name)
-        if value is None or _is_null(value):
-            return []
-        if not isinstance(value, list):
-            raise self._wrong(name, value, "a list")
-        return value
-
-    def map(self, name: str) -> Fields:
-        """A map field."""
-        return Fields(self._fields.get(name), f"{self._where}: {name}")
-
-    def _wrong(self, name: str, value: Any, wanted: str) -> UnsupportedYamlError:
-        return UnsupportedYamlError(f"{self._where}: {name} is {_kind(value)}, not {wanted}")
-
-
-def _is_null(value: Any) -> bool:
-    return isinstance(value, str) and value in _NULL
-
-
-def _kind(value: Any) -> str:
-    if value is None:
-        return "missing"
-    if isinstance(value, str):
-        return repr(value[:40])
-    return "a list" if isinstance(value, list) else "a map"
+    value = fields.get(name) if isinstance(fields, dict) else None
+    if default is not None and (value is None or (isinstance(value, str) and value in _NULL)):
+        return default
+    if kind is int and isinstance(value, str) and _WHOLE.fullmatch(value) and int(value) < 2**63:
+        return int(value)
+    if kind is int or not isinstance(value, kind):
+        stated = "missing" if value is None else repr(value[:40]) if isinstance(value, str) else _KINDS[type(value)]
+        raise UnsupportedYamlError(f"{name} is {stated}, not {_KINDS[kind]}")
+    return value
 
 
 # XML that others wrote, read piece by piece without document types, which may hold entities.

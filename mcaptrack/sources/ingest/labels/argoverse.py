@@ -76,9 +76,8 @@ def _read(path: Path) -> BoxTable:
     except ValueError as error:
         raise McaptrackError(f"{path}: {error}") from None
     remarks.append(f"{path}: tracks are numbered from 1 on, a number for each track_uuid")
-    facts = LabelFacts(
-        path, "argoverse", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=frame_id
-    )
+    facts = LabelFacts(path, "argoverse", is_timed=True, frame_id=frame_id)
+    facts.name(names.names)
     return BoxTable(
         facts=facts, at=at, frame=t_ns, id=numbered([f"#{track}" for track in table["track_uuid"]]),
         boxes_m=np.column_stack([place, _floats(path, table, _SIZE), heading]), score=np.full(count, np.nan),

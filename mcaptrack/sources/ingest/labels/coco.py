@@ -5,7 +5,6 @@ Letters: N rows, F frames.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -226,15 +225,12 @@ class _Images(NamedTuple):
         facts, frames = table.facts, self.by_id.values()
         facts.first_frame = min(frames, default=0)
         facts.is_first_assumed = facts.first_frame > 0
-        facts.sizes = {
+        sizes = {
             frame: (as_float(image["width"]), as_float(image["height"]))
             for frame, image in zip(frames, self.entries, strict=True)
             if is_number(image.get("width")) and is_number(image.get("height"))
         }
-        sizes = {size for size in facts.sizes.values() if all(map(math.isfinite, size))}
-        if len(sizes) == 1 and len(facts.sizes) == len(self.entries):
-            ((width, height),) = sizes
-            facts.size = (int(width), int(height))
+        facts.measure(sizes, len(self.entries))
         facts.names, facts.named_by = self.names, named_by if self.names else ""
         if self.order == _BY_LIST and len(self.entries) > 1:
             text = ": its images have neither frame_id nor names with numbers of one sequence; the order in `images`"

@@ -324,16 +324,10 @@ class Cvat(Format):
 
 def _table(path: Path, parser: _Parser) -> BoxTable:
     values: Floats = np.frombuffer(parser.values, np.float64).reshape(-1, _COLUMNS)
-    names = parser.labels.names
-    facts = LabelFacts(path, "cvat", first_frame=0, names=names or None, numbering={} if names else None)
-    facts.named_by, facts.size = (
-        "file" if names else "",
-        _size(*(parser.meta.get(of, "") for of in ("width", "height"))),
-    )
+    facts = LabelFacts(path, "cvat", first_frame=0, size=_size(*map(parser.meta.get, ("width", "height"))))
+    facts.name(parser.labels.names)
     sizes = {frame: size for frame, texts in parser.images.items() if (size := _size(*texts)) is not None}
-    facts.sizes = sizes or None
-    if sizes and set(sizes) == set(parser.images) and len(set(sizes.values())) == 1:
-        facts.size = next(iter(sizes.values()))
+    facts.measure(sizes, len(parser.images))
     facts.labelled, facts.states_labelled, doubt = _frames(parser, values[:, 0])
     rows = BoxTable(
         facts=facts, at=lambda row: f"{path}:{values[row, 8]:.0f}", frame=values[:, 0], id=values[:, _ID],
@@ -359,8 +353,9 @@ def _table(path: Path, parser: _Parser) -> BoxTable:
     return rows
 
 
-def _size(width: str, height: str) -> tuple[int, int] | None:
+def _size(width: str | None, height: str | None) -> tuple[int, int] | None:
     """Width and height of pictures; None if they aren't stated."""
+    width, height = width or "", height or ""
     return (int(width), int(height)) if is_count(width, 6) and is_count(height, 6) and int(width) else None
 
 

@@ -258,10 +258,8 @@ class _Cells:
                 facts.names = {int(own): self.names.names[int(other)] for own, other in pairs.items()}
             if name is None or facts.names is not None:
                 return number
-        kind, facts.names = (kind, texts) if name is None else (name, self.names.names)
-        facts.numbering = {}
-        if kind is None or not facts.names:
-            facts.named_by, facts.names, facts.numbering = "", None, None
+        kind, names = (kind, texts) if name is None else (name, self.names.names)
+        facts.name({} if kind is None else names)
         return np.nan_to_num(self.none if kind is None else kind, nan=NO_CLASS)
 
 
@@ -706,8 +704,8 @@ def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
         track_id[is_known] = numbered(known_ids)
         if not are_numbers(known_ids):
             remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
-    facts = LabelFacts(path, "csv", is_timed="t" in places, named_by="file", numbering={})
-    facts.names = (cells.names if "name" in places else cells.classes).names
+    facts = LabelFacts(path, "csv", is_timed="t" in places)
+    facts.name((cells.names if "name" in places else cells.classes).names)
     boxes = np.column_stack([cells.stacked((*_PLACE, *_SIZE)), heading])
     kind = cells.column("name" if "name" in places else "class")
     rows = BoxTable(
@@ -721,8 +719,6 @@ def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
     if rate is not None and float(rate[1]) > 0:
         rows.frame, facts.is_timed = np.rint(rows.frame * NS_PER_S / float(rate[1])), True
         rows.remark(f": times by its {rate[0]}")
-    if not facts.names:
-        facts.names, facts.numbering, facts.named_by = None, None, ""
     return rows.with_boxes(boxes[:, :6])
 
 

@@ -85,8 +85,7 @@ class GatheredRows:
         boxes: Floats = np.frombuffer(self._boxes, np.float64).reshape(count, -1).copy()
         frame, own, kind, score, observed, counts, aside = values.T
         track_id, said = self._ids.of(facts.path, own)
-        names = self._names.names
-        facts.names, facts.numbering, facts.named_by = (names, {}, "file") if names else (None, None, "")
+        facts.name(self._names.names)
         places = self._places
         return BoxTable(
             facts=facts, at=lambda row: f"{facts.path}: {self._noun} {places[row]}", frame=frame, id=track_id,

@@ -53,7 +53,7 @@ class LevelX(Format):
             rows = csv.DictReader(line for _, line in lines_of(meta))
             kinds = {row.get(id_name): names_of.number(row.get("class") or "") for row in rows}
             out.class_id = np.array([kinds.get(str(own), NO_CLASS) for own in out.id.astype(int).tolist()], np.int64)
-            out.facts.names, out.facts.numbering, out.facts.named_by = names_of.names, {}, str(meta)
+            out.facts.name(names_of.names, by=str(meta))
         if is_highd and out.boxes_m is not None:
             out.boxes_m[:, :2] += out.boxes_m[:, 3:5] / 2
             out.remark(": x and y are the upper left corners of boxes in highD; positions are their centres")

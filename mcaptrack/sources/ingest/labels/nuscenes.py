@@ -121,9 +121,8 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     remarks = [f"{folder}: {len(samples)} samples; tracks are numbered from 1 on, a number for each instance"]
     if unseen:
         remarks.append(f"{folder}: {unseen} of {len(boxes)} boxes have no points of lidar or radar; they stay")
-    facts = LabelFacts(
-        path, "nuscenes", is_timed=True, names=names.names, numbering={}, named_by="file", frame_id=FRAME
-    )
+    facts = LabelFacts(path, "nuscenes", is_timed=True, frame_id=FRAME)
+    facts.name(names.names)
     facts.usual, facts.states_labelled = frozenset(_CLASSES), True
     facts.labelled = np.unique(np.array(list(samples.values()), np.int64))
     return BoxTable(

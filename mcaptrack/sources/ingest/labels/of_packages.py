@@ -88,9 +88,9 @@ def _table_of(path: Path, name: str, given: LabelBoxes, in_space: bool) -> BoxTa
         raise ValueError(f"first_frame={first!r:.40}, which is no whole number")
     facts = LabelFacts(
         path, name, first_frame=int(first), times_s=times_s, labelled=labelled, frame_id=str(given.frame_id),
-        states_labelled=given.labelled is not None, names=names or None, numbering={} if names else None,
-        named_by="file" if names else "",
+        states_labelled=given.labelled is not None,
     )  # fmt: skip
+    facts.name(names)
     table = BoxTable(
         facts=facts, at=lambda row: f"{path}: box {row + 1}", frame=frame, id=_ids(given, count), score=score,
         class_id=kind, boxes_px=None if in_space else boxes, boxes_m=boxes if in_space else None,

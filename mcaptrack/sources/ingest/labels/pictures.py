@@ -112,11 +112,7 @@ class PictureFormat(Format):
         facts.first_frame, facts.is_first_assumed = int(frames.min()), int(frames.min()) > 0
         facts.region = "DontCare" if table.aside is not None else ""
         sizes = ((frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True))
-        stated = {frame: size for frame, size in sizes if size is not None and np.isfinite(size).all()}
-        facts.sizes = {frame: size for frame, size in stated.items() if min(size) > 0} or None
-        if len(different := set(stated.values())) == 1 and len(facts.sizes or ()) == len(pictures):
-            ((width, height),) = different
-            facts.size = (int(width), int(height))
+        facts.measure({frame: size for frame, size in sizes if size is not None}, len(pictures))
         table.remark(f": {len(pictures)} pictures, frames are numbered by {by}")
         if other:
             counted = ", ".join(f"{count} {kind}" for kind, count in other.most_common())

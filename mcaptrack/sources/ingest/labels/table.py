@@ -134,6 +134,17 @@ class LabelFacts:
         """The meaning of classes, which is the same in all parts of a file."""
         return self.names, self.named_by, self.is_normalised
 
+    def name(self, names: Mapping[int, str], numbering: Mapping[str, int] | None = None, by: str = "file") -> None:
+        """Take classes as texts, of which ``names`` are numbered as they came; they have no names if there are none."""
+        self.names, self.numbering, self.named_by = (names, numbering or {}, by) if names else (None, None, "")
+
+    def measure(self, sizes: Mapping[int, tuple[float, float]], pictures: int) -> None:
+        """Take the sizes of pictures by frame, as far as they can be; all of ``pictures`` may have one."""
+        self.sizes = {frame: size for frame, size in sizes.items() if all(0 < side < np.inf for side in size)} or None
+        if self.sizes and len(self.sizes) == pictures and len(different := {*self.sizes.values()}) == 1:
+            ((width, height),) = different
+            self.size = (int(width), int(height))
+
     def to_json(self) -> dict[str, Any]:
         """The facts that a reader of ``--json`` can use."""
         return {
