@@ -1,0 +1,221 @@
+"""The questions about identities whose answers would change most, and what becomes of their answers.
+
+What is not sure is what differs between worlds: re-tracking decided again with noise (``retrack --worlds``). A question
+is worth the probability that its answer is another one than was decided, times the rows that would change.
+
+Letters: W worlds, K tracklets, E pairs of tracklets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from mcaptrack import log, pipeline
+from mcaptrack.errors import McaptrackError, call
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.ragged import find_rows, run_starts
+from mcaptrack.pipeline.rebuild import rebuild
+from mcaptrack.schema import DECISIONS, TRACKS, WORLDS, DecisionKind, Frame, Rows
+from mcaptrack.schema.framing import join_frames
+from mcaptrack.sources.cameras import provenance_of
+from mcaptrack.sources.corrections import ANSWERS
+from mcaptrack.transforms import STAGES
+from mcaptrack.transforms.retrack.options import LikelihoodOptions
+
+#: The worlds that questions are found in.
+_WORLDS: Final = 100
+#: Answers that are less likely to change anything are not asked for.
+_LEAST: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Tracklet:
+    """A certain part of a track: its id in the input of re-tracking, and its first and last samples."""
+
+    source_id: int
+    begin_ns: int
+    end_ns: int
+
+
+@dataclass(frozen=True)
+class Question:
+    """A question: whether the ends of two tracklets are one person, or, without ``after``, whether one is a person.
+
+    ``probability`` is that of yes, ``decided`` what re-tracking has decided, and ``rows`` what changes otherwise.
+    """
+
+    before: Tracklet
+    after: Tracklet | None
+    probability: float
+    decided: bool
+    rows: int
+
+    @property
+    def key(self) -> tuple[int, int, int, int]:
+        """What it is about: the same question has the same key, also after other answers."""
+        after = self.after or Tracklet(-1, -1, -1)
+        return self.before.source_id, self.before.end_ns, after.source_id, after.begin_ns
+
+    @property
+    def value(self) -> float:
+        """The rows that its answer is expected to change."""
+        return (1 - self.probability if self.decided else self.probability) * self.rows
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What re-tracking makes of samples: tracks, decisions and worlds of a camera."""
+
+    samples: Sequence[Frame]
+    tracks: Sequence[Frame]
+    decisions: Sequence[Frame]
+    worlds: Sequence[Frame]
+
+
+def solve(opened: log.Log, prefix: str, answers: Sequence[Frame] | None = None) -> Solved:
+    """Re-track a camera as before, with worlds, in memory; with these answers, or else with those of the log.
+
+    Raises McaptrackError if the log can't be reviewed.
+    """
+    topic = f"{prefix}/{STAGES['retrack'].output_topic}"
+    how = provenance_of(opened, topic) if topic in opened.channels else None
+    if how is None:
+        raise McaptrackError(f"{opened.path} has no {topic} to review; {call('run', opened.path)} makes it")
+    transform = rebuild(STAGES["retrack"], how, {})
+    if not isinstance(transform, LikelihoodOptions):
+        raise McaptrackError(f"{opened.path}: {topic} was made by a method that knows no probabilities")
+    frames, context = pipeline.input_of(opened, prefix, "retrack", transform, how.input)
+    given = {} if answers is None else {"answers": answers}
+    transform = replace(transform, **context | given, worlds=_WORLDS)
+    if transform.leaves_unchanged:
+        raise McaptrackError(f"{opened.path}: without a measured ground plane {prefix} has no decisions to review")
+    outputs = dict(zip(transform.writes, zip(*transform(frames), strict=True), strict=True))  # type: ignore[operator]
+    return Solved(frames, outputs[""], outputs["decisions"], outputs["worlds"])
+
+
+def questions(solved: Solved, answered: Sequence[Frame], count: int) -> list[Question]:
+    """The most valuable questions, the best first, without those that were answered; the same for the same log."""
+    worlds = join_frames(WORLDS, solved.worlds)
+    if not len(worlds.rows):
+        return []
+    of = worlds.rows["world"]
+    many = int(of.max())
+    one = of == 1
+    begins = worlds.row_ns[one]
+    tracklets = worlds.rows[one]
+    track = worlds.rows["track_id"].reshape(-1)
+    order = np.lexsort((worlds.rows["source_id"], worlds.row_ns, of))
+    track = track[order].reshape(many, -1)
+    by_time = np.lexsort((tracklets["source_id"], begins))
+    tracklets, begins = tracklets[by_time], begins[by_time]
+    decided = _decided(solved.tracks, tracklets, begins)
+    asked = [*_of_pairs(track, decided, tracklets, begins), *_of_people(track, decided, tracklets, begins)]
+    done = {key for frame in answered for key in _keys(frame)}
+    asked = [question for question in asked if question.key not in done and question.value >= _LEAST]
+    asked.sort(key=lambda question: (-question.value, question.key))
+    out: list[Question] = []
+    ends: set[tuple[int, int]] = set()
+    for question in asked:  # one question for each end and each beginning: the others follow from its answer
+        sides = {question.key[:2], (question.key[2], -1 - question.key[3])}
+        if not sides & ends or question.after is None:
+            out.append(question)
+            ends |= sides if question.after else set()
+    return out[:count]
+
+
+def _decided(tracks: Sequence[Frame], tracklets: Rows, begins: Ints) -> Ints:
+    """The track of each tracklet (K,) as it was decided; those that are left out have negative numbers of their own."""
+    joined = join_frames(TRACKS, tracks)
+    at = find_rows((joined.row_ns, joined.rows["source_id"]), (begins, tracklets["source_id"]))
+    return np.where(at >= 0, joined.rows["track_id"][at], -1 - np.arange(len(at)))
+
+
+def _of_pairs(track: Ints, decided: Ints, tracklets: Rows, begins: Ints) -> list[Question]:
+    """A question for each two tracklets that follow each other in a world (W, K), or as was decided."""
+    ends = begins + np.round(tracklets["duration_s"] * NS_PER_S).astype(np.int64)
+    pairs = np.unique(np.concatenate([_following(of, begins) for of in (decided, *track)], axis=1), axis=1)
+    a, b = pairs
+    together = (track[:, a] == track[:, b]) & (track[:, a] >= 0)
+    is_one = decided[a] == decided[b]
+    heads, tails = _sides(decided, tracklets["frames"].astype(np.int64))
+    rows = np.minimum(heads[a], tails[b])
+    return [
+        Question(*(Tracklet(int(tracklets["source_id"][k]), int(begins[k]), int(ends[k])) for k in (i, j)), p, one, n)
+        for i, j, p, one, n in zip(
+            a.tolist(), b.tolist(), together.mean(axis=0).tolist(), is_one.tolist(), rows.tolist(), strict=True
+        )
+    ]
+
+
+def _following(track: Ints, begins: Ints) -> Ints:
+    """Pairs (2, E) of tracklets that follow each other in a track (K,)."""
+    order = np.lexsort((begins, track))
+    same = np.flatnonzero((track[order][1:] == track[order][:-1]) & (track[order][1:] >= 0))
+    return np.stack([order[same], order[same + 1]])
+
+
+def _sides(track: Ints, frames: Ints) -> tuple[Ints, Ints]:
+    """The samples of the track of each tracklet (K,) up to its end, and from its beginning on."""
+    order = np.argsort(track, kind="stable")
+    total = np.cumsum(frames[order])
+    starts = run_starts(track[order])
+    before = (total - frames[order])[starts][np.cumsum(starts) - 1]
+    heads, tails = np.empty_like(frames), np.empty_like(frames)
+    heads[order] = total - before
+    whole = np.bincount(np.cumsum(starts) - 1, frames[order])[np.cumsum(starts) - 1].astype(np.int64)
+    tails[order] = whole - (total - before) + frames[order]
+    return heads, tails
+
+
+def _of_people(track: Ints, decided: Ints, tracklets: Rows, begins: Ints) -> list[Question]:
+    """A question for each tracklet: whether it is a person."""
+    ends = begins + np.round(tracklets["duration_s"] * NS_PER_S).astype(np.int64)
+    share = (track >= 0).mean(axis=0)
+    return [
+        Question(
+            Tracklet(int(row["source_id"]), int(begin), int(end)), None, float(p), bool(one >= 0), int(row["frames"])
+        )
+        for row, begin, end, p, one in zip(tracklets, begins, ends, share, decided, strict=True)
+    ]
+
+
+def _keys(frame: Frame) -> list[tuple[int, int, int, int]]:
+    rows = frame.rows
+    gap_ns = np.round(rows["duration_s"] * NS_PER_S).astype(np.int64)
+    return [
+        (int(row["previous_id"]), frame.t_ns - int(gap), int(row["source_id"]), frame.t_ns)
+        if row["kind"] == DecisionKind.JOINED
+        else (int(row["source_id"]), frame.t_ns + int(gap), -1, -1)
+        for row, gap in zip(rows, gap_ns, strict=True)
+    ]
+
+
+def answer_row(question: Question, yes: float, samples: Sequence[Frame]) -> tuple[int, Rows]:
+    """The time and the row of an answer: ``yes`` is the probability that it is yes."""
+    rows = DECISIONS.empty(1)
+    about = question.after or question.before
+    t_ns = about.begin_ns
+    rows["kind"] = DecisionKind.JOINED if question.after else DecisionKind.KEPT
+    rows["track_id"] = rows["alternative_id"] = -1
+    rows["previous_id"] = question.before.source_id if question.after else -1
+    rows["source_id"], rows["probability"] = about.source_id, yes
+    since = (t_ns - question.before.end_ns) if question.after else question.before.end_ns - t_ns
+    rows["duration_s"], rows["frames"] = since / NS_PER_S, 0
+    rows["additional"] = np.nan
+    number = int(np.searchsorted([frame.t_ns for frame in samples], t_ns))
+    sample = samples[number].rows[samples[number].rows["track_id"] == about.source_id][0]
+    for axis in "xy":
+        rows[f"{axis}_m"] = sample[f"{axis}_m"]
+        rows[f"{axis}_px"] = sample[f"{axis}_px"] + sample[f"{'wh'['xy'.index(axis)]}_px"] / 2
+    return t_ns, DECISIONS.check(rows)
+
+
+def read_answers(opened: log.Log, prefix: str) -> list[Frame]:
+    """The answers in a log."""
+    topic = f"{prefix}/{ANSWERS}"
+    return list(opened.frame_columns(topic, DECISIONS)) if topic in opened.channels else []
