@@ -1,6 +1,7 @@
 """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 __version__ = "0.3.0.dev0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
@@ -29,8 +30,6 @@ _PARTS = {
     "scoring": ["Scores", "evaluate"],
     "reading": ["FetchedMessage"],
     "stages": ["detect", "motion", "predict", "retrack", "sample", "stage", "track"],
-    "training": ["train"],
-    "tuning": ["TuneResult", "tune"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
     "viewing": ["LogServer", "view"],
     "zones": ["draw_zones", "zones"],
@@ -40,9 +39,7 @@ _MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() 
     "McaptrackError": "mcaptrack.errors",
     "McaptrackWarning": "mcaptrack.notices",
     "Notice": "mcaptrack.notices",
-    "TrainResult": "mcaptrack.training.result",
 }
-__all__ = sorted(_MODULES)  # noqa: PLE0605  # __init__.pyi lists them for tools
 
 
 def _lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], object]:
@@ -61,9 +58,39 @@ def _lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], object]
     return imported
 
 
-__getattr__ = _lazily(__name__, _MODULES)  # `import mcaptrack` stays light
+_imported = _lazily(__name__, _MODULES)  # `import mcaptrack` stays light
+
+
+def __getattr__(name: str) -> object:
+    """Import a name when it is first used: of the package, or of an entry point for commands or for names.
+
+    A module of the package is never one of these.
+    """
+    if name == "__all__":
+        return sorted({*_MODULES, *_of_entry_points(own=True)})
+    from importlib.util import find_spec
+
+    if name in _MODULES or name.startswith("_") or find_spec(f"{__name__}.{name}"):
+        return _imported(name)
+    from mcaptrack.installed import missing_extension
+    from mcaptrack.registry import find
+
+    if kind := _of_entry_points().get(name):
+        return find(kind, name).cls
+    if text := missing_extension(name):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}: {text}")
+    return _imported(name)
+
+
+def _of_entry_points(*, own: bool = False) -> dict[str, Any]:
+    """The kinds of the entry points that give names to the package, by name; with ``own`` those of extensions alone."""
+    from mcaptrack.registry import Kind, points
+
+    kinds: tuple[Kind, ...] = ("command", "name")
+    names = {point.name: kind for kind in kinds for point in points(kind) if point.is_own or not own}
+    return {name: kind for name, kind in names.items() if name.isidentifier()}
 
 
 def __dir__() -> list[str]:
     """List the names of the package, also those that were not imported yet."""
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *_MODULES, *_of_entry_points()})

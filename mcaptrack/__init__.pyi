@@ -49,9 +49,6 @@ from mcaptrack.api.stages import retrack as retrack
 from mcaptrack.api.stages import sample as sample
 from mcaptrack.api.stages import stage as stage
 from mcaptrack.api.stages import track as track
-from mcaptrack.api.training import train as train
-from mcaptrack.api.tuning import TuneResult as TuneResult
-from mcaptrack.api.tuning import tune as tune
 from mcaptrack.api.upkeep import DropResult as DropResult
 from mcaptrack.api.upkeep import LogCheck as LogCheck
 from mcaptrack.api.upkeep import LogRecovery as LogRecovery
@@ -63,9 +60,12 @@ from mcaptrack.api.viewing import view as view
 from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.extensions.training.api import train as train
+from mcaptrack.extensions.training.result import TrainResult as TrainResult
+from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
+from mcaptrack.extensions.tuning.api import tune as tune
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
-from mcaptrack.training.result import TrainResult as TrainResult
 
 _MODULES: dict[str, str]
 

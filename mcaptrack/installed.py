@@ -1,7 +1,8 @@
 """Installed packages: the entry points that they declare, and the package that a module is of.
 
 Entry points are read from the files that pip writes. ``importlib.metadata`` reads them, too, but its import takes
-longer than all else that lists the commands.
+longer than all else that lists the commands. Extensions, the parts of mcaptrack that it can do without, declare
+theirs in its own pyproject.toml.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final, NamedTuple
 
 _OWN: Final = "mcaptrack."
+_EXTENSIONS: Final = f"{_OWN}extensions"
 #: A folder with what pip says of a package, and the name of the package in it.
 _INFO: Final = re.compile(r"(.+?)(-.*)?\.(dist|egg)-info")
 _FILES: Final = ("METADATA", "PKG-INFO")
@@ -34,6 +37,11 @@ class Point(NamedTuple):
         """Name and version of the package; "" for what its metadata lack."""
         return _name_and_version(self.info)
 
+    @property
+    def is_own(self) -> bool:
+        """Whether it is of an extension, and not of the package of a stranger."""
+        return _name_of(self.info.name) == _OWN[:-1]
+
 
 class Declared(NamedTuple):
     """The entry points of all packages for mcaptrack, and the names of packages where they can't be read."""
@@ -51,6 +59,26 @@ def entry_points(group: str) -> list[Point]:
 def declared() -> Declared:
     """The entry points of all packages; kept until something is installed."""
     return _declared(_places())
+
+
+def missing_extension(name: str) -> str:
+    """Say what to do about a name of mcaptrack that is of an extension which isn't installed; "" for other names.
+
+    The stub for type checkers says which names those are: it alone names extensions from outside.
+    """
+    stub = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
+    match = re.search(rf"^from {_EXTENSIONS}\.(\w+)\S* import {re.escape(name)} as", stub, re.M)
+    folder = f"mcaptrack/extensions/{match[1]}" if match else ""
+    return f"{name} is an extension that isn't installed; install mcaptrack again, with {folder}" if folder else ""
+
+
+def _is_extension(name: str) -> bool:
+    """Whether the folder of an extension is there, with more than what Python has compiled of it."""
+    try:
+        spec = find_spec(f"{_EXTENSIONS}.{name}")
+    except ModuleNotFoundError:  # the folder of all extensions
+        return False
+    return spec is not None and spec.origin is not None
 
 
 def distribution_of(module: str) -> tuple[str, str]:
@@ -117,9 +145,11 @@ def _declared(places: tuple[tuple[str, int], ...]) -> Declared:
         if _OWN.encode() not in data:
             continue
         try:
-            points += [Point(*entry, info) for entry in _entries(data.decode()) if entry[0].startswith(_OWN)]
+            declared = [Point(*entry, info) for entry in _entries(data.decode()) if entry[0].startswith(_OWN)]
         except ValueError:
             unreadable.append(_name_and_version(info)[0])
+            continue
+        points += [point for point in declared if not point.is_own or _is_extension(point.value.split(".")[2])]
     return Declared(tuple(points), tuple(unreadable))
 
 
@@ -132,11 +162,16 @@ def _packages(places: Iterator[str]) -> Iterator[Path]:
         except OSError:
             continue
         for entry in entries:
-            match = _INFO.fullmatch(entry)
-            name = re.sub(r"[-_.]+", "-", match[1]).lower() if match else ""
-            if match and name not in names:
+            name = _name_of(entry)
+            if name and name not in names:
                 names.add(name)
                 yield Path(place, entry)
+
+
+def _name_of(info: str) -> str:
+    """The name of the package that a folder is about; "" for other folders."""
+    match = _INFO.fullmatch(info)
+    return re.sub(r"[-_.]+", "-", match[1]).lower() if match else ""
 
 
 def _entries(text: str) -> Iterator[tuple[str, str, str]]:

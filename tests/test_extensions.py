@@ -23,6 +23,7 @@ import mcaptrack
 from mcaptrack import log, testing
 from mcaptrack.api.declared import declared
 from mcaptrack.choices import BagFormat, ExchangeFormat, TableFormat
+from mcaptrack.cli.group import _LISTED
 from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS
@@ -110,7 +111,7 @@ def test_the_names_of_options_are_those_of_the_registry():
 
     exporters = (*get_args(TableFormat), *get_args(BagFormat), *get_args(ExchangeFormat))
     assert exporters == tuple(BUILT_IN["exporter"])
-    assert set(BUILT_IN["command"]) == set(__import__("mcaptrack.cli.group", fromlist=["ENTRIES"]).ENTRIES)
+    assert set(BUILT_IN["command"]) == {name for name, *_ in _LISTED}
 
 
 def test_doctor_lists_what_packages_bring_and_what_of_it_fails(site):
@@ -486,8 +487,53 @@ def test_many_logs_are_exported_by_a_package_each_to_its_own_file(site, tracked,
 def test_help_lists_commands_without_an_import(site):
     outcome = done("--help")
     assert "longest" in outcome.out
-    assert "Of my-trackers 1.0." in outcome.out
+    assert "Print the tracks that were seen longest, in seconds (my-trackers 1.0)." in " ".join(outcome.out.split())
+    assert "longest" in dir(mcaptrack)
     assert not is_imported("longest")
+    assert mcaptrack.longest is __import__("longest").longest
+
+
+@pytest.mark.parametrize(
+    ("code", "line"),
+    [
+        ('@declared(most_used=("a",), heading="Results")\ndef Part(a: int = (1)):\n    """Count\n    it.\n\n    Yes.\n    """', "Count it (another 2.0)."),
+        ("@declared()\ndef Part():\n    'Do.'\n\ndef other():\n    \"\"\"No.\"\"\"", "Of another 2.0."),
+        ('def Part():\n    """\x1b[31mRed."""', "[31mRed (another 2.0)."),
+        ("\0", "Of another 2.0."),
+    ],
+)  # fmt: skip
+def test_the_line_of_a_command_is_read_from_its_source(site, code, line):
+    add(site, "command", "odd", code)
+    heading = "Results:" if "heading" in code else "Of installed packages:"
+    section = done("--help").out.partition(heading)[2].partition("\n\n")[0]
+    assert f"odd {line}" in " ".join(section.split())
+    assert not is_imported("another")
+
+
+def test_a_class_of_a_package_prints_for_its_command(site):
+    code = (
+        "from mcaptrack.api.declared import declared\nfrom mcaptrack.cli.declared import Once\nfrom mcaptrack.cli.text import show\n"
+        "class Printer(Once[int]):\n    def show(self, done, talk):\n        show(f'{done} it is')\n"
+        '@declared(printed_by=\'another:Printer\')\ndef Part(count: int = 3) -> int:\n    """Count."""\n    return count\n'
+    )
+    add(site, "command", "odd", code)
+    assert done("odd", "--count", "5").out == "5 it is\n"
+    (site / "another.py").write_text(code.replace("another:Printer", "another:Lost"))
+    sys.modules.pop("another")
+    assert "command odd (another 2.0): another has no class Lost" in one_line("odd")
+
+
+def test_names_of_extensions_and_of_the_core_are_not_replaced(site):
+    add(site, "command", "train", "raise ImportError")
+    install(site, {"mcaptrack.names": dict.fromkeys(("TrainResult", "Notice", "log"), "another:Part")}, "more", "1.0")
+    assert "another 2.0" not in done("--help").out
+    assert [getattr(mcaptrack, name).__module__.partition(".")[0] for name in ("train", "TrainResult", "Notice")] == [
+        "mcaptrack"
+    ] * 3
+    assert mcaptrack.log is log
+    ignored = json.loads(done("doctor", "--json").out)["plugins"]
+    assert "there is a built-in command train" in ignored["command train (another 2.0)"]
+    assert "there is a built-in name TrainResult" in ignored["name TrainResult (more 1.0)"]
 
 
 def test_help_loads_neither_packages_nor_their_metadata(site):

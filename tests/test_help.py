@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from mcaptrack import environment
-from mcaptrack.cli.group import ENTRIES
+from mcaptrack.cli.group import entries
 from mcaptrack.cli.help import FIRST_PANEL, LAST_PANELS
 from mcaptrack.cli.many import NAMES
 from mcaptrack.cli.stages import shown_default
@@ -50,7 +50,7 @@ class TestHelp:
 
     def test_the_line_of_a_command_on_the_first_page_is_the_first_of_its_own_help(self):
         first = {name: " ".join(command.help.split("\n\n")[0].split()) for name, command in COMMANDS.items()}
-        assert {name: ENTRIES[name].summary for name in COMMANDS} == first
+        assert {name: entry.summary for name, entry in entries().items()} == first
 
     @EVERY_COMMAND
     @pytest.mark.parametrize("width", one_in(2, ["80", "120"]))

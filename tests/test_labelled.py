@@ -12,10 +12,12 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.api import ingesting, labels, scoring, training, tuning
+from mcaptrack.api import ingesting, labels, scoring
 from mcaptrack.api.declared import hints_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.forecasts import score_forecasts
+from mcaptrack.extensions.training import api as training
+from mcaptrack.extensions.tuning import api as tuning
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance

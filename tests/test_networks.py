@@ -13,6 +13,8 @@ import pytest
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
+from mcaptrack.extensions.training.walks import walks
+from mcaptrack.extensions.training.windows import Windows, ar1
 from mcaptrack.predictors import OnClock, PeopleSeen, make, weights_sha256
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm
@@ -20,8 +22,6 @@ from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.predictors.red import Red
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
 from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.training.walks import walks
-from mcaptrack.training.windows import Windows, ar1
 from mcaptrack.transforms import Predict
 from tests.logs import provenance_of
 from tests.onnx_graphs import INT64, model, node, tensor, value
@@ -61,7 +61,7 @@ class TestAgainstTorch:
 
     def test_networks_for_training_give_the_same_forecasts(self):
         torch = pytest.importorskip("torch", reason="training needs torch")
-        from mcaptrack.training.network import LstmNetwork, RedNetwork
+        from mcaptrack.extensions.training.network import LstmNetwork, RedNetwork
 
         torch.manual_seed(1)
         path = walks(32, 20, 0.4, seed=3)[0]

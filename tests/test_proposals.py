@@ -19,9 +19,9 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.errors import McaptrackError, command
+from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.training.sources import SourceOptions, read_scenes
 from mcaptrack.viewing import serving
 from tests import places
 from tests.bags import bag1

@@ -11,11 +11,11 @@ from mcap.records import Channel, Header, Schema
 
 from mcaptrack import log
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
+from mcaptrack.extensions.training.recipe import RECIPES
+from mcaptrack.extensions.training.sources import SourceOptions, read_scenes, windows_of
+from mcaptrack.extensions.training.windows import ar1
 from mcaptrack.log import records
 from mcaptrack.predictors import make
-from mcaptrack.training.recipe import RECIPES
-from mcaptrack.training.sources import SourceOptions, read_scenes, windows_of
-from mcaptrack.training.windows import ar1
 from tests.commands import printed
 
 

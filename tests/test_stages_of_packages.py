@@ -58,7 +58,8 @@ def test_settings_of_a_stage_are_its_own_and_no_matter_for_other_commands(path):
 
 @pytest.mark.usefixtures("site")
 def test_the_speed_of_the_page_is_that_of_the_positions(path):
-    assert "A stage of my-trackers 1.0." in done("--help").out
+    line = "speed Speed and heading of each track, from its positions (my-trackers 1.0)."
+    assert line in " ".join(done("--help").out.split())
     done("speed", path, "--max-gap-s", "0.5")
     with log.read(path) as opened:
         rows = np.concatenate([frame.rows for frame in opened.frames("/camera/retracks", TRACKS)])

@@ -15,8 +15,8 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
 from mcaptrack.log import find_topic
-from mcaptrack.training.sources import SourceOptions, read_scenes
 
 
 def _results(path: Path) -> dict[str, tuple[int, ...]]:

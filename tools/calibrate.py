@@ -32,14 +32,14 @@ from mcaptrack import pipeline
 from mcaptrack.evaluation import sequence_of_log
 from mcaptrack.evaluation.forecasts import score_forecasts
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, forecast_scores
+from mcaptrack.extensions.training.recipe import RECIPES
+from mcaptrack.extensions.training.sources import SourceOptions, read_scenes, synthetic, windows_of
+from mcaptrack.extensions.training.windows import Windows, ar1
 from mcaptrack.pipeline.rebuild import rebuild
 from mcaptrack.predictors import NAMES, make
 from mcaptrack.schema import Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions
-from mcaptrack.training.recipe import RECIPES
-from mcaptrack.training.sources import SourceOptions, read_scenes, synthetic, windows_of
-from mcaptrack.training.windows import Windows, ar1
 from mcaptrack.transforms import PROFILES, STAGES, Predict, Sample
 
 NOISES_M = (0.0, 0.1, 0.2, 0.3)

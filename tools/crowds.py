@@ -21,7 +21,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import STEP_S, Corruption, Rows
 
-from mcaptrack.training import walks
+from mcaptrack.extensions.training import walks
 
 SCENES, PEOPLE = walks._SCENES, walks._PEOPLE
 SHAPES = ("square", "street", "crossing", "open")

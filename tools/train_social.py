@@ -27,12 +27,12 @@ import torch
 from torch import nn
 
 from mcaptrack import __version__
+from mcaptrack.extensions.training import walks
+from mcaptrack.extensions.training.windows import ar1
 from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import social
 from mcaptrack.predictors.forecast import PeopleSeen
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
-from mcaptrack.training import walks
-from mcaptrack.training.windows import ar1
 
 STEPS, PAST, STEP_S = 12, 8, 0.4
 SCENES, PEOPLE, K = walks._SCENES, walks._PEOPLE, social.MOST_PEOPLE

@@ -316,17 +316,21 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-def declared(*, most_used: tuple[str, ...] = ()) -> Callable[[Callable[P, T]], Callable[P, T]]:
+def declared(
+    *, most_used: tuple[str, ...] = (), heading: str = "", printed_by: str = ""
+) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help.
 
-    What the annotations say of parameters that the docstring leaves out is added to it.
+    What the annotations say of parameters that the docstring leaves out is added to it. For commands of entry points:
+    ``heading`` is theirs in ``mcaptrack --help``, which reads it from the source, and ``printed_by`` the class that
+    prints the result, as MODULE:CLASS (of the kind ``mcaptrack.cli.declared.Once``, or ``mcaptrack.cli.many.EachLog``).
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         if function.__doc__:  # there is none with python -OO
             function.__doc__ = _completed(function)
         call = checked(function)
-        vars(call)["most_used"] = most_used
+        vars(call).update(most_used=most_used, heading=heading, printed_by=printed_by)
         return call
 
     return decorate

@@ -370,7 +370,7 @@ def _plugins() -> dict[str, str]:
         for name, reason in ignored(kind).items():
             reasons[name] = reason
             warn(reason, "other")
-        for point in points(kind):
+        for point in [point for point in points(kind) if not point.is_own]:
             name = titled(kind, point.name, point.package)
             reasons[name] = ""
             try:

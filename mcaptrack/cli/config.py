@@ -1,4 +1,4 @@
-"""Read and edit mcaptrack.toml, which sets options in one table for each command.
+"""Read mcaptrack.toml, which sets options in one table for each command.
 
 A file that ``--config`` names and the file in the user's config folder may set all options. A file in the working
 folder may set tuning options only, because it may have come with other people's data.
@@ -7,10 +7,8 @@ folder may set tuning options only, because it may have come with other people's
 from __future__ import annotations
 
 import os
-import re
 import stat
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -18,13 +16,12 @@ import typer
 
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import missing, publish_bytes, unreadable
+from mcaptrack.files import missing, unreadable
 
 NAME: Final = "mcaptrack.toml"
 #: A larger file is refused before it is read.
 MAX_BYTES: Final = 2**20
-_BOM: Final = "\N{ZERO WIDTH NO-BREAK SPACE}"
-_BARE_NEWLINE: Final = re.compile(r"(?<!\r)\n")
+BOM: Final = "\N{ZERO WIDTH NO-BREAK SPACE}"
 
 
 class ConfigFile(NamedTuple):
@@ -106,51 +103,8 @@ def read_toml(path: Path) -> Toml | None:
         raise McaptrackError(f"{path} has {about.st_size} bytes; a file of options has at most {MAX_BYTES}")
     try:
         text = data.decode("utf-8")
-        return Toml(text, tomllib.loads(text.removeprefix(_BOM)))
+        return Toml(text, tomllib.loads(text.removeprefix(BOM)))
     except RecursionError:
         raise McaptrackError(f"{path} is not valid TOML: it is nested too deeply") from None
     except ValueError as error:
         raise McaptrackError(f"{path} is not valid TOML: {error}") from None
-
-
-def write_settings(path: Path, command: str, settings: Mapping[str, Any]) -> None:
-    """Write settings of a command, such as ``{"max-age-s": 2.0}``, into a file of options.
-
-    The rest of the file stays as it is, with comments and line endings. Raises McaptrackError for a file that can't be
-    read or edited.
-    """
-    old = read_toml(path)
-    text = edited(path, old.text if old else "", command, settings)
-    publish_bytes(path, text.encode("utf-8"))
-
-
-def edited(path: Path, text: str, command: str, settings: Mapping[str, Any]) -> str:
-    """Return the edited text of ``path``; see ``write_settings``."""
-    import tomlkit
-    from tomlkit.exceptions import TOMLKitError
-
-    bom = _BOM if text.startswith(_BOM) else ""
-    text = text.removeprefix(_BOM)
-    tables = tomllib.loads(text)
-    settings_before = tables.get(command, {})
-    if not isinstance(settings_before, dict):
-        raise McaptrackError(f"{path}: {command} is a command; write its options below [{command}]")
-    wanted = dict(settings_before)
-    try:
-        document: Any = tomlkit.parse(text)
-        if command not in document:
-            document[command] = tomlkit.table()
-        table = document[command]
-        for name, value in settings.items():
-            spelt = [key for key in wanted if key.replace("_", "-") == name]
-            for key in spelt or [name]:
-                table[key] = wanted[key] = value
-        new: str = tomlkit.dumps(document)
-        if "\r\n" in text and not _BARE_NEWLINE.search(text):
-            new = _BARE_NEWLINE.sub("\r\n", new)
-        same = tomllib.loads(new) == {**tables, command: wanted}
-    except (TOMLKitError, ValueError):
-        same = False
-    if not same:  # refuse rather than lose a part of the file
-        raise McaptrackError(f"{path} is written in a way that can't be edited; write to another file with -o")
-    return bom + new

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from importlib import import_module
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Generic, TypeVar, get_type_hints
 
 import typer
 
 import mcaptrack
-from mcaptrack import _MODULES
 from mcaptrack.api.declared import (
     Argument,
     OneOfMany,
@@ -34,6 +33,7 @@ from mcaptrack.cli.command import Set, Settable, values_set
 from mcaptrack.cli.help import LAST_PANELS, arranged
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
+from mcaptrack.registry import blamed, find
 
 T = TypeVar("T")
 #: Heading of the options of all commands.
@@ -55,6 +55,23 @@ class Printed:
     force: Force = False
 
 
+@dataclass(frozen=True)
+class OfPackage:
+    """The function of a command of another package. Workers get it by its name; its errors name the package."""
+
+    name: str
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        return inspect.signature(find("command", self.name).cls)
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """Call the function."""
+        entry = find("command", self.name)
+        with blamed(entry, "failed"):
+            return entry.cls(*arguments, **options)
+
+
 class Called(Generic[T]):
     """A command that calls its function: how options become arguments, and how it prints what this returns.
 
@@ -71,16 +88,16 @@ class Called(Generic[T]):
 
     @classmethod
     def declaration(cls, name: str) -> Callable[..., T]:
-        """Return the function that declares the command: that of its name in the library."""
-        function: Callable[..., T] = getattr(import_module(_MODULES[name]), name)
+        """Return the function that declares the command: that of the library, of an extension or of a package."""
+        function: Callable[..., T] = find("command", name).cls
         return function
 
     @property
     def function(self) -> Callable[..., T]:
         """The function that is called. It is looked up when the command runs, because another one may stand for it."""
-        function: Callable[..., T]
-        function = getattr(mcaptrack, self.name) if self.name in _MODULES else self.declaration(self.name)
-        return function
+        entry = find("command", self.name)
+        own: Callable[..., T] = getattr(mcaptrack, self.name, entry.cls)
+        return own if entry.is_built_in else OfPackage(self.name)
 
     @classmethod
     def options(cls) -> list[Parameter]:

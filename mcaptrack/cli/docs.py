@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -66,11 +65,6 @@ class Docs(Once[Pages]):
     """List the pages, or print one."""
 
     More = Printed
-
-    @classmethod
-    def declaration(cls, name: str) -> Callable[..., Pages]:
-        """Return the function that declares the command."""
-        return documentation
 
     def print_result(self, done: Pages, talk: common.Talk) -> None:
         """Print the list, or the page."""

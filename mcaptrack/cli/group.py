@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from functools import cache
-from importlib import import_module
-from importlib.util import find_spec
+from functools import lru_cache
+from importlib.machinery import PathFinder
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -15,13 +14,14 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from mcaptrack import _MODULES
 from mcaptrack.cli.command import Command, refuse_several, usage_in_one_line, values_of
 from mcaptrack.cli.help import ALL, HELP, write_page, write_paragraph, write_section
 from mcaptrack.cli.settings import may_be_set, nearest
 from mcaptrack.cli.text import log_format, refuse_usage
 from mcaptrack.environment import variable
 from mcaptrack.errors import command
+from mcaptrack.installed import Declared, declared, missing_extension
+from mcaptrack.registry import BUILT_IN, Kind, load, points, titled
 
 _FIRST, _STEP, _RESULTS, _IMPROVE = "Start here", "One step alone", "Results", "Improve and repair"
 _OF_PACKAGES = "Of installed packages"
@@ -30,75 +30,98 @@ PROGRAM_OPTIONS: Final = ("--config", "--log-format")
 
 
 class Listed(NamedTuple):
-    """A command: its heading in the help, and where in ``mcaptrack.cli`` its class is, as MODULE:CLASS."""
+    """A command: its heading in the help, and where its class and its function are, as MODULE:NAME.
+
+    A command without a class of its own prints what its function returns. ``package`` is that of a stranger.
+    """
 
     name: str
     panel: str
     place: str
+    function: str
+    package: str = ""
 
     @property
     def command(self) -> Any:
         """The class of the command (``cli.declared.Called``), which is imported now."""
-        module, _, name = self.place.partition(":")
-        return getattr(import_module(f"mcaptrack.cli.{module}"), name)
+        if self.place:
+            return load(titled("command", self.name), self.place)
+        from mcaptrack.cli.installed import class_of
+
+        return class_of(self.name)
 
     @property
     def summary(self) -> str:
-        """Its line in the help: the first paragraph of the docstring of its function.
+        """Its line in the help: the first paragraph of the docstring of its function, and the package.
 
         It is read from the source, because an import of all commands takes half a second.
         """
-        source = _source_of(_MODULES[self.name]) if self.name in _MODULES else ""
-        match = re.search(rf'^def {self.name}\(.*?"""(.*?)(?:\n\n|""")', source, re.MULTILINE | re.DOTALL)
-        doc = match[1] if match else (self.command.declaration(self.name).__doc__ or "").partition("\n\n")[0]
-        return " ".join(doc.split())
+        text = _in_source(self.function).get("doc") or ""
+        if not (text or self.package):
+            text = (self.command.declaration(self.name).__doc__ or "").partition("\n\n")[0]
+        line = "".join(character for character in " ".join(text.split()) if character.isprintable())
+        if self.package:
+            line = f"{line.removesuffix('.')} ({self.package})." if line else f"Of {self.package}."
+        return line
 
 
-@cache
+def _in_source(reference: str) -> dict[str, str | None]:
+    """Read in the source of MODULE:NAME how the function is ``declared``, and its first paragraph; {} if unknown."""
+    module, _, name = reference.partition(":")
+    pattern = (
+        r"^(?:@(?:\w+\.)*declared\((?P<declared>(?:(?!^@|^def ).)*?)\)\n)?"
+        rf'(?:def|class) {re.escape(name)}\b(?:(?!\n[^\s)]).)*?:\n\s+r?"""(?P<doc>.*?)(?:\n\n|""")'
+    )
+    match = re.search(pattern, _source_of(module), re.MULTILINE | re.DOTALL)
+    return match.groupdict() if match else {}
+
+
 def _source_of(module: str) -> str:
-    """The source of a module; "" if there is none, as in a frozen program."""
-    spec = find_spec(module)
+    """The source of a module, without importing the packages that it is in; "" if there is none."""
+    parts = module.split(".")
+    spec = None
     try:
+        for number in range(len(parts)):
+            places = spec.submodule_search_locations if spec else None
+            spec = PathFinder.find_spec(".".join(parts[: number + 1]), places)
         return Path((spec and spec.origin) or "").read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+    except (OSError, UnicodeDecodeError, ImportError):
         return ""
 
 
+_STAGE: Final = "stages:StageCommand"
+#: The commands of the core: name, heading, and the class in ``mcaptrack.cli``.
 _LISTED: Final = (
-    Listed("demo", _FIRST, "demo:Demo"),
-    Listed("ingest", _FIRST, "ingest:Ingest"),
-    Listed("run", _FIRST, "running:Run"),
-    Listed("view", _FIRST, "view:ViewCommand"),
-    Listed("info", _FIRST, "show:Info"),
-    Listed("report", _FIRST, "report:ReportCommand"),
-    Listed("detect", _STEP, "stages:StageCommand"),
-    Listed("motion", _STEP, "stages:StageCommand"),
-    Listed("track", _STEP, "stages:StageCommand"),
-    Listed("sample", _STEP, "stages:StageCommand"),
-    Listed("predict", _STEP, "stages:StageCommand"),
-    Listed("retrack", _STEP, "stages:StageCommand"),
-    Listed("fuse", _STEP, "running:Fuse"),
-    Listed("models", _STEP, "models:Models"),
-    Listed("render", _RESULTS, "render:Render"),
-    Listed("query", _RESULTS, "query:Query"),
-    Listed("export", _RESULTS, "show:Export"),
-    Listed("cut", _RESULTS, "files:Cut"),
-    Listed("evaluate", _RESULTS, "evaluate:Evaluate"),
-    Listed("events", _RESULTS, "running:Events"),
-    Listed("zones", _RESULTS, "zones:Zones"),
-    Listed("tune", _IMPROVE, "tune:Tune"),
-    Listed("train", _IMPROVE, "train:Train"),
-    Listed("calibrate", _IMPROVE, "calibrate:Calibrate"),
-    Listed("check", _IMPROVE, "files:Check"),
-    Listed("recover", _IMPROVE, "files:Recover"),
-    Listed("drop", _IMPROVE, "files:Drop"),
-    Listed("doctor", _IMPROVE, "doctor:Doctor"),
-    Listed("docs", _IMPROVE, "docs:Docs"),
+    ("demo", _FIRST, "demo:Demo"),
+    ("ingest", _FIRST, "ingest:Ingest"),
+    ("run", _FIRST, "running:Run"),
+    ("view", _FIRST, "view:ViewCommand"),
+    ("info", _FIRST, "show:Info"),
+    ("report", _FIRST, "report:ReportCommand"),
+    ("detect", _STEP, _STAGE),
+    ("motion", _STEP, _STAGE),
+    ("track", _STEP, _STAGE),
+    ("sample", _STEP, _STAGE),
+    ("predict", _STEP, _STAGE),
+    ("retrack", _STEP, _STAGE),
+    ("fuse", _STEP, "running:Fuse"),
+    ("models", _STEP, "models:Models"),
+    ("render", _RESULTS, "render:Render"),
+    ("query", _RESULTS, "query:Query"),
+    ("export", _RESULTS, "show:Export"),
+    ("cut", _RESULTS, "files:Cut"),
+    ("evaluate", _RESULTS, "evaluate:Evaluate"),
+    ("events", _RESULTS, "running:Events"),
+    ("zones", _RESULTS, "zones:Zones"),
+    ("calibrate", _IMPROVE, "calibrate:Calibrate"),
+    ("check", _IMPROVE, "files:Check"),
+    ("recover", _IMPROVE, "files:Recover"),
+    ("drop", _IMPROVE, "files:Drop"),
+    ("doctor", _IMPROVE, "doctor:Doctor"),
+    ("docs", _IMPROVE, "docs:Docs"),
 )
-#: The commands by name.
-ENTRIES: Final = {entry.name: entry for entry in _LISTED}
-#: Commands with options of plug-ins.
-_WITH_PLUGINS: Final = ("run", *(entry.name for entry in _LISTED if entry.place == "stages:StageCommand"))
+#: Those with options of plug-ins.
+_WITH_PLUGINS: Final = ("run", *(name for name, _, place in _LISTED if place == _STAGE))
 
 
 def make(entry: Listed, function: Any = None) -> Any:
@@ -115,56 +138,34 @@ def make(entry: Listed, function: Any = None) -> Any:
     return get_command(app)
 
 
-class OfPackage(Listed):
-    """A command of an installed package, which is imported when the command is called."""
-
-    @property
-    def summary(self) -> str:
-        """Its line in the help: the package."""
-        return f"Of {self.place}."
-
-    @property
-    def command(self) -> Any:
-        """The class of the command."""
-        from mcaptrack.cli.installed import class_of
-
-        return class_of(self.name)
-
-
-class StageOfPackage(OfPackage):
-    """The command of a stage of an installed package."""
-
-    @property
-    def summary(self) -> str:
-        """Its line in the help: the package."""
-        return f"A stage of {self.place}."
-
-    @property
-    def command(self) -> Any:
-        """The class of the command."""
-        from mcaptrack.cli.stages import StageCommand
-
-        return StageCommand
+def entries() -> dict[str, Listed]:
+    """The commands of mcaptrack by name: those of the core, and of its extensions. Imports none of them."""
+    core = [Listed(name, panel, f"mcaptrack.cli.{place}", BUILT_IN["command"][name]) for name, panel, place in _LISTED]
+    return {entry.name: entry for entry in (*core, *_by_entry_point(declared())) if not entry.package}
 
 
 def of_packages() -> dict[str, Listed]:
-    """The commands of installed packages by name, and those of their stages. Imports none of them.
+    """The commands of other packages by name, and those of their stages. Imports none of them.
 
     Those with a name of ours, or one that is no word, are left out.
     """
-    from mcaptrack.installed import entry_points
+    return {entry.name: entry for entry in _by_entry_point(declared()) if entry.package}
 
-    out: dict[str, Listed] = {}
-    for group, kind in (("mcaptrack.commands", OfPackage), ("mcaptrack.stages", StageOfPackage)):
-        for point in sorted(entry_points(group), key=lambda point: point.name):
-            if _is_free(point.name):
-                place = " ".join(point.package).strip() or point.value
-                out.setdefault(point.name, kind(point.name, _OF_PACKAGES, place))
+
+@lru_cache(maxsize=4)
+def _by_entry_point(_: Declared) -> list[Listed]:
+    """The commands of all packages, extensions among them; kept until something is installed."""
+    kinds: tuple[Kind, ...] = ("command", "stage")
+    out = []
+    for kind in kinds:
+        place = f"mcaptrack.cli.{_STAGE}" if kind == "stage" else ""
+        for point in sorted(points(kind), key=lambda point: point.name):
+            if re.fullmatch(r"\w[\w-]*", point.name):
+                package = "" if point.is_own else " ".join(point.package).strip() or point.value
+                heading = re.search(r'\bheading="([ -~]+?)"', _in_source(point.value).get("declared") or "")
+                panel = heading[1] if heading else _OF_PACKAGES if package else _STEP
+                out.append(Listed(point.name, panel, place, point.value, package))
     return out
-
-
-def _is_free(name: str) -> bool:
-    return name not in ENTRIES and re.fullmatch(r"\w[\w-]*", name) is not None
 
 
 class Commands(Mapping[str, Any]):
@@ -177,17 +178,17 @@ class Commands(Mapping[str, Any]):
         if name in self._changed:
             return self._changed[name]
         if name not in self._made:
-            self._made[name] = make(ENTRIES[name])
+            self._made[name] = make(entries()[name])
         return self._made[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter({**ENTRIES, **self._changed})
+        return iter({**entries(), **self._changed})
 
     def __len__(self) -> int:
-        return len({**ENTRIES, **self._changed})
+        return sum(1 for _ in self)
 
     def __contains__(self, name: object) -> bool:
-        return name in ENTRIES or name in self._changed
+        return name in entries() or name in self._changed
 
     def changed(self, commands: Mapping[str, Any]) -> Commands:
         """Return a copy of the table, with others in the place of some commands, or with one more."""
@@ -212,7 +213,7 @@ class Group(TyperGroup):
 
         One of a package that can't be imported ends the program with one line.
         """
-        entry = ENTRIES.get(cmd_name) or of_packages().get(cmd_name)
+        entry = entries().get(cmd_name) or of_packages().get(cmd_name)
         if entry is None:
             return None
         if not self._lists:
@@ -227,7 +228,7 @@ class Group(TyperGroup):
         formatter.write_usage(ctx.command_path, "[OPTIONS] COMMAND ...")
         write_paragraph(formatter, self.help or "")
         panels: dict[str, list[tuple[str, str]]] = {}
-        for entry in {**ENTRIES, **of_packages()}.values():
+        for entry in {**entries(), **of_packages()}.values():
             panels.setdefault(entry.panel, []).append((entry.name, entry.summary))
         for panel, rows in panels.items():
             write_section(formatter, panel, rows)
@@ -253,12 +254,12 @@ class Group(TyperGroup):
         ctx.with_resource(log_format(said, next((word for word in rest if not word.startswith("-")), "")))
         if len(rest) == 2 and rest[1] in HELP and rest[0] in self._own:
             formatter = ctx.make_formatter()
-            path, function = f"{ctx.command_path} {rest[0]}", ENTRIES[rest[0]].command.function_of(rest[0])
+            path, function = f"{ctx.command_path} {rest[0]}", entries()[rest[0]].command.function_of(rest[0])
             write_page(formatter, path, function, rest[1] == ALL)
             typer.echo(formatter.getvalue().rstrip("\n"))
             ctx.exit()
         functions = _with_plugins(self._own, rest, config)
-        self.commands = self._own.changed({name: make(ENTRIES[name], functions[name]) for name in functions})
+        self.commands = self._own.changed({name: make(entries()[name], functions[name]) for name in functions})
         with usage_in_one_line():
             for option in PROGRAM_OPTIONS:
                 refuse_several(own, [option])
@@ -271,6 +272,8 @@ class Group(TyperGroup):
         if name not in every and not name.startswith("-"):
             if Path(name).exists():
                 refuse_usage(f"{name} is a file; the command comes first, as in {command('info', Path(name))}")
+            if missing := missing_extension(name):
+                refuse_usage(missing)
             text = f"there is no command {name}{nearest(name, every)}"
             refuse_usage(f"{text}{'' if text.endswith('?') else ';'} `mcaptrack --help` lists the commands")
         with usage_in_one_line():

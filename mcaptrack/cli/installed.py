@@ -1,11 +1,10 @@
-"""Commands of installed packages: functions that ``mcaptrack.api.declared`` declares, by their entry points."""
+"""Commands by their entry points, of extensions and of other packages: functions that ``api.declared`` declares."""
 
 from __future__ import annotations
 
 import dataclasses
-import inspect
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -17,51 +16,23 @@ from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
-from mcaptrack.registry import blamed, find
+from mcaptrack.registry import blamed, find, load
 
 
-@dataclass(frozen=True)
-class Function:
-    """The function of a command. Workers get it by its name; its errors name the package."""
-
-    name: str
-
-    @property
-    def __signature__(self) -> inspect.Signature:
-        return inspect.signature(find("command", self.name).cls)
-
-    def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """Call the function."""
-        entry = find("command", self.name)
-        with blamed(entry, "failed"):
-            return entry.cls(*arguments, **options)
-
-
-class FromPackage(Called[Any]):
-    """A command of a package, however often it calls its function."""
-
-    @classmethod
-    def declaration(cls, name: str) -> Callable[..., Any]:
-        """Return the function of the package."""
-        function: Callable[..., Any] = find("command", name).cls
-        return function
+class Plain(Called[Any]):
+    """A command that prints what its function returns."""
 
     @classmethod
     def options(cls) -> list[Parameter]:
         """Return the options that the function has no use for: also where to print to."""
         return [*parameters_of(Printed), *super().options()]
 
-    @property
-    def function(self) -> Callable[..., Any]:
-        """The function, with its name in errors."""
-        return Function(self.name)
-
     def data(self, done: Any) -> dict[str, Any]:
         """Return a result as values of JSON."""
         return {"result": plain(done)}
 
 
-class OnceOfPackage(FromPackage, Once[Any]):
+class PlainOnce(Plain, Once[Any]):
     """A command that calls its function once."""
 
     def print_result(self, done: Any, talk: common.Talk) -> None:
@@ -75,7 +46,7 @@ class OnceOfPackage(FromPackage, Once[Any]):
             show(*lines)
 
 
-class EachLogOfPackage(FromPackage, EachLog[Any]):
+class PlainEachLog(Plain, EachLog[Any]):
     """A command that calls its function with each log."""
 
     writes = False
@@ -89,14 +60,18 @@ class EachLogOfPackage(FromPackage, EachLog[Any]):
                 show(*lines)
 
 
-def class_of(name: str) -> type[FromPackage]:
-    """The class of a command: one that takes a log can take many. Raises McaptrackError for what is no command."""
+def class_of(name: str) -> type[Called[Any]]:
+    """The class of a command: the one that its function names, or one that prints what the function returns.
+
+    One that takes a log can take many. Raises McaptrackError for what is no command.
+    """
     entry = find("command", name)
     if not hasattr(entry.cls, "most_used"):
         raise McaptrackError(f"{entry} is not declared; `@declared()` of mcaptrack.api.declared makes it a command")
-    with blamed(entry, "can't be a command"):
+    with blamed(entry, "can't be a command") if not entry.is_built_in else nullcontext():
         each = any(isinstance(about, OneOfMany) for about in arguments_of(entry.cls).values())
-        kind = EachLogOfPackage if each else OnceOfPackage
+        usual = PlainEachLog if each else PlainOnce
+        kind: type[Called[Any]] = load(str(entry), entry.cls.printed_by) if entry.cls.printed_by else usual
         own = {option.name for option in options_of(entry.cls)}
         if taken := sorted(own & {option.name for option in (*kind.options(), *parameters_of(OfAll))}):
             raise McaptrackError(f"a parameter can't have the name of the option {', '.join(taken)}")

@@ -11,10 +11,11 @@ There are three kinds of names, on the command line, in files for ``--config`` a
 
 * ``module:Class``, as in ``my_module:NearestTracker``. Installed modules are searched first, then the working folder.
 
-Entry points can't replace built-in names, and their names hold no colon. ``names`` imports nothing; ``find`` imports
-the module of the entry that it finds. ``entry_of`` is the inverse: from a class to its entry. The provenance of a
-channel stores the fields of an ``Entry``: name, module and class, and the name and version of the distribution (the
-installed package).
+Extensions (``mcaptrack.extensions``) name theirs in the same way, in mcaptrack's own ``pyproject.toml``. Entry points
+of other packages can't replace these, or built-in names, and their names hold no colon. ``names`` imports nothing;
+``find`` imports the module of the entry that it finds. ``entry_of`` is the inverse: from a class to its entry. The
+provenance of a channel stores the fields of an ``Entry``: name, module and class, and the name and version of the
+distribution (the installed package).
 
 Interfaces are defined in ``mcaptrack.transforms.protocol``, ``mcaptrack.predictors.forecast`` and
 ``mcaptrack.contracts``. To add a built-in entry: a line in ``BUILT_IN``.
@@ -35,7 +36,7 @@ from typing import Any, Final, Literal, get_args
 
 from mcaptrack import _MODULES, __version__
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.installed import Point, declared, distribution_of, entry_points
+from mcaptrack.installed import Point, declared, distribution_of, entry_points, missing_extension
 from mcaptrack.registry.guard import Guard, contained_import
 
 Kind = Literal[
@@ -49,6 +50,7 @@ Kind = Literal[
     "message_reader",
     "exporter",
     "command",
+    "name",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
@@ -61,10 +63,10 @@ _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares.
 _COMMANDS: Final = (
     "ingest demo run detect motion track sample predict retrack fuse models info view render report query export "
-    "evaluate events zones calibrate tune train check recover cut drop doctor"
+    "evaluate events zones calibrate check recover cut drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command")
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "name")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -155,6 +157,8 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         },
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
+        # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
+        "name": {},
     }
 )
 
@@ -191,8 +195,8 @@ class Entry:
 
     @property
     def is_built_in(self) -> bool:
-        """Whether it is part of mcaptrack."""
-        return self.name in BUILT_IN.get(self.kind, ())
+        """Whether it is a part of mcaptrack, in the core or in an extension."""
+        return self.distribution == _OWN and ":" not in self.name
 
     def __str__(self) -> str:
         """Its name in messages: ``tracker nearest (my-package 1.0)``."""
@@ -230,20 +234,21 @@ def names(kind: Kind) -> tuple[str, ...]:
 
 def points(kind: Kind) -> list[Point]:
     """The entry points of a kind; those with a name that is taken don't count."""
-    return [point for point in entry_points(_group(kind)) if not _owner(kind, point.name)]
+    return [point for point in entry_points(_group(kind)) if not _owner(kind, point)]
 
 
 def ignored(kind: Kind) -> dict[str, str]:
     """Why entry points of a kind don't count, by their title. Imports nothing."""
-    owners = {titled(kind, point.name, point.package): _owner(kind, point.name) for point in entry_points(_group(kind))}
+    owners = {titled(kind, point.name, point.package): _owner(kind, point) for point in entry_points(_group(kind))}
     return {what: f"{what} is ignored: there is {owner}; rename it" for what, owner in owners.items() if owner}
 
 
-def _owner(kind: Kind, name: str) -> str:
-    """The entry with this name, which no entry point of the kind can have: a built-in one, or a command; "" if none."""
-    if name in BUILT_IN[kind]:
-        return f"a built-in {titled(kind, name)}"
-    return f"a {titled('command', name)}" if kind == "stage" and name in names("command") else ""
+def _owner(kind: Kind, point: Point) -> str:
+    """The entry with the name of an entry point, which can't have it: a built-in one, or a command; "" if none."""
+    is_extension = any(own.is_own and own.name == point.name for own in entry_points(_group(kind)))
+    if point.name in BUILT_IN[kind] or (is_extension and not point.is_own):
+        return f"a built-in {titled(kind, point.name)}"
+    return f"a {titled('command', point.name)}" if kind == "stage" and point.name in names("command") else ""
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:
@@ -273,23 +278,23 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     'mcaptrack.transforms.sort.ocsort:OcSort'
     """
     if name in BUILT_IN[kind]:
-        implementation = _load(titled(kind, name), BUILT_IN[kind][name])
+        implementation = load(titled(kind, name), BUILT_IN[kind][name])
         return Entry(name, kind, implementation, implementation.__module__, _OWN, __version__)
     if ":" in name:
         with _working_folder():
-            implementation = _load(titled(kind, name), name)
+            implementation = load(titled(kind, name), name)
         return Entry(name, kind, implementation, implementation.__module__, *distribution_of(implementation.__module__))
     named = [point for point in points(kind) if point.name == name]
     if not named:
-        raise McaptrackError(_unknown(kind, name))
+        raise McaptrackError((missing_extension(name) if kind == "command" else "") or _unknown(kind, name))
     named = [point for point in named if point.package[0] == distribution] or named
     if len(named) > 1:
         values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))
         what = f"{'an' if kind[0] in 'aeiou' else 'a'} {titled(kind, name)}"
         hint = "remove one of them" if kind in _BY_ENTRY_POINT else "name one as module:Class"
         raise McaptrackError(f"several installed packages have {what}: {values}; {hint}")
-    package = named[0].package
-    implementation = _load(titled(kind, name, package), named[0].value)
+    package = (_OWN, __version__) if named[0].is_own else named[0].package
+    implementation = load(titled(kind, name, package), named[0].value)
     return Entry(name, kind, implementation, implementation.__module__, *package)
 
 
@@ -300,7 +305,7 @@ def entry_of(kind: str, cls: type) -> Entry:
     """
     built_in = BUILT_IN.get(kind, {})
     for name, where in built_in.items():
-        if where.partition(":")[2] == cls.__qualname__ and _load(name, where) is cls:
+        if where.partition(":")[2] == cls.__qualname__ and load(name, where) is cls:
             return Entry(name, kind, cls, cls.__module__, _OWN, __version__)
     top = cls.__module__.partition(".")[0]
     for point in entry_points(_group(kind)):
@@ -376,12 +381,12 @@ def _words(error: BaseException) -> str:
 
 def _is(point: Point, cls: type) -> bool:
     try:
-        return _load(f"the package of {point.name}", point.value) is cls
+        return load(f"the package of {point.name}", point.value) is cls
     except McaptrackError:  # an entry point that can't be imported is another class
         return False
 
 
-def _load(what: str, reference: str) -> Any:
+def load(what: str, reference: str) -> Any:
     """Import ``module:Class``. Raises McaptrackError, also if its module raises any exception."""
     module, _, path = reference.partition(":")
     parts = path.split("[")[0].strip().split(".")

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from mcaptrack.extensions.training.windows import Windows
 from mcaptrack.predictors import NAMES, make
-from mcaptrack.training.windows import Windows
 
 
 def seconds(run: Callable[[], object]) -> float:
@@ -36,7 +36,7 @@ def in_torch(name: str, past: np.ndarray, known: np.ndarray) -> Callable[[], obj
     try:
         import torch
 
-        from mcaptrack.training.network import LstmNetwork, RedNetwork
+        from mcaptrack.extensions.training.network import LstmNetwork, RedNetwork
     except ImportError:
         return None
     torch.set_num_threads(1)

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from mcaptrack.evaluation import EvaluateOptions
-from mcaptrack.evaluation.tuning import Task, trial_scores
+from mcaptrack.extensions.tuning.search import Task, trial_scores
 from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import detections_and_ground_truth
 from mcaptrack.transforms import Sort

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import nn
 
+from mcaptrack.extensions.training.windows import Windows
 from mcaptrack.predictors import red
 from mcaptrack.predictors.linear import LinearPredictor
-from mcaptrack.training.windows import Windows
 
 #: A torch.Tensor; torch may be missing when types are checked.
 Tensor = Any

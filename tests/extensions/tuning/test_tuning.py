@@ -13,7 +13,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions
-from mcaptrack.evaluation.tuning import Range, Task, tune
+from mcaptrack.extensions.tuning.search import Range, Task, tune
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import STAGES, Sort
 from tests.commands import call, printed

@@ -32,7 +32,7 @@ class Train(Once["TrainResult"]):
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function: patterns and folders become files."""
-        from mcaptrack.training.sources import SYNTHETIC
+        from mcaptrack.extensions.training.sources import SYNTHETIC
 
         sources, validate = self.values["sources"], self.values["validate"]
         synthetic = [SYNTHETIC] if Path(SYNTHETIC) in sources else []

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Final, Literal, Self
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.training.windows import Corruption
+from mcaptrack.extensions.training.windows import Corruption
 
 Network = Literal["red", "lstm"]
 

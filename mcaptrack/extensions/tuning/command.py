@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -12,16 +14,18 @@ from mcaptrack.cli import common
 from mcaptrack.cli.chosen import has_flag, options_of
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
-from mcaptrack.cli.config import NAME, read_toml, write_settings
+from mcaptrack.cli.config import BOM, NAME, read_toml
 from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import publish_bytes
 from mcaptrack.location import sibling
 from mcaptrack.transforms import STAGES
 
 if TYPE_CHECKING:
     from mcaptrack import TuneResult
 
+_BARE_NEWLINE: Final = re.compile(r"(?<!\r)\n")
 _SHOWN: Final = ("IDF1", "MOTA", "HOTA", "IDSW", "FP", "FN")
 
 
@@ -112,3 +116,46 @@ def _range(text: str) -> tuple[str, tuple[float, float] | None]:
     except ValueError:
         raise McaptrackError(f"--search needs a range like {name}=0.1:0.5, not {text}") from None
     return name.replace("-", "_"), (low, high)
+
+
+def write_settings(path: Path, command: str, settings: Mapping[str, Any]) -> None:
+    """Write settings of a command, such as ``{"max-age-s": 2.0}``, into a file of options.
+
+    The rest of the file stays as it is, with comments and line endings. Raises McaptrackError for a file that can't be
+    read or edited.
+    """
+    old = read_toml(path)
+    text = edited(path, old.text if old else "", command, settings)
+    publish_bytes(path, text.encode("utf-8"))
+
+
+def edited(path: Path, text: str, command: str, settings: Mapping[str, Any]) -> str:
+    """Return the edited text of ``path``; see ``write_settings``."""
+    import tomlkit
+    from tomlkit.exceptions import TOMLKitError
+
+    bom = BOM if text.startswith(BOM) else ""
+    text = text.removeprefix(BOM)
+    tables = tomllib.loads(text)
+    settings_before = tables.get(command, {})
+    if not isinstance(settings_before, dict):
+        raise McaptrackError(f"{path}: {command} is a command; write its options below [{command}]")
+    wanted = dict(settings_before)
+    try:
+        document: Any = tomlkit.parse(text)
+        if command not in document:
+            document[command] = tomlkit.table()
+        table = document[command]
+        for name, value in settings.items():
+            spelt = [key for key in wanted if key.replace("_", "-") == name]
+            for key in spelt or [name]:
+                table[key] = wanted[key] = value
+        new: str = tomlkit.dumps(document)
+        if "\r\n" in text and not _BARE_NEWLINE.search(text):
+            new = _BARE_NEWLINE.sub("\r\n", new)
+        same = tomllib.loads(new) == {**tables, command: wanted}
+    except (TOMLKitError, ValueError):
+        same = False
+    if not same:  # refuse rather than lose a part of the file
+        raise McaptrackError(f"{path} is written in a way that can't be edited; write to another file with -o")
+    return bom + new

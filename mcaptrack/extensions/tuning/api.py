@@ -33,8 +33,8 @@ from mcaptrack.api.running import transform_of
 from mcaptrack.choices import Similarity
 from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.evaluation import EvaluateOptions, ground_truth_of_log
-from mcaptrack.evaluation import tuning as searching
-from mcaptrack.evaluation.tuning import Metric, Range, Task, Trial, declared_ranges, uses_optuna
+from mcaptrack.extensions.tuning import search as searching
+from mcaptrack.extensions.tuning.search import Metric, Range, Task, Trial, declared_ranges, uses_optuna
 from mcaptrack.notices import Notice, collected
 from mcaptrack.registry import Entry, blamed
 from mcaptrack.sources.ingest import IngestOptions
@@ -91,6 +91,8 @@ class TuneResult:
 
 @declared(
     most_used=("truth", "stage", "tracker", "metric", "trials", "search", "topic", "output", "force"),
+    heading="Improve and repair",
+    printed_by="mcaptrack.extensions.tuning.command:Tune",
 )
 def tune(
     inputs: Annotated[

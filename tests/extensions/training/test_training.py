@@ -16,17 +16,17 @@ import pytest
 from typer.testing import CliRunner
 
 from mcaptrack import __version__, log, tables
-from mcaptrack.api import training
 from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.training import api as training
+from mcaptrack.extensions.training.recipe import RECIPES, Recipe
+from mcaptrack.extensions.training.result import TrainResult
+from mcaptrack.extensions.training.sources import Scene, SourceOptions, read_scenes, split, synthetic, windows_of
+from mcaptrack.extensions.training.walks import walks
+from mcaptrack.extensions.training.windows import Corruption, Windows, ar1
 from mcaptrack.predictors.weights import load
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.tables.export import export
-from mcaptrack.training.recipe import RECIPES, Recipe
-from mcaptrack.training.result import TrainResult
-from mcaptrack.training.sources import Scene, SourceOptions, read_scenes, split, synthetic, windows_of
-from mcaptrack.training.walks import walks
-from mcaptrack.training.windows import Corruption, Windows, ar1
 from tests.commands import call, done
 
 RED, PAPER = RECIPES["red"], RECIPES["paper"]
@@ -232,7 +232,7 @@ class TestRecipes:
 @pytest.fixture
 def fit():
     pytest.importorskip("torch", reason="training needs torch")
-    from mcaptrack.training.loop import train
+    from mcaptrack.extensions.training.loop import train
 
     def run(recipe: Recipe, windows: Windows, folder, **options):
         folder.mkdir(exist_ok=True)
@@ -394,7 +394,7 @@ def given(monkeypatch) -> list[tuple]:
         )
 
     stand_in = SimpleNamespace(train=train, find_device=lambda name: f"on {name}")
-    monkeypatch.setitem(sys.modules, "mcaptrack.training.loop", stand_in)
+    monkeypatch.setitem(sys.modules, "mcaptrack.extensions.training.loop", stand_in)
     return calls
 
 

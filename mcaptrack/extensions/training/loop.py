@@ -15,15 +15,15 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
+from mcaptrack.extensions.training.recipe import Recipe
+from mcaptrack.extensions.training.result import TrainResult
+from mcaptrack.extensions.training.windows import Windows, ar1
 from mcaptrack.files import publish_bytes
 from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import make, red
 from mcaptrack.predictors.forecast import Predictor
 from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.weights import Weights, load, save
-from mcaptrack.training.recipe import Recipe
-from mcaptrack.training.result import TrainResult
-from mcaptrack.training.windows import Windows, ar1
 
 _LOG: Final = "epochs.csv"
 _STATE: Final = "state.safetensors"
@@ -183,7 +183,7 @@ class _Run:
     def __init__(
         self, torch: Any, recipe: Recipe, training: Windows, device: str, folder: Path, source: dict[str, str]
     ) -> None:
-        from mcaptrack.training.network import LstmNetwork, RedNetwork
+        from mcaptrack.extensions.training.network import LstmNetwork, RedNetwork
 
         torch.manual_seed(recipe.seed)
         is_red = recipe.network == "red"

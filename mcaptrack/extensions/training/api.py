@@ -14,11 +14,11 @@ from mcaptrack.api.common import Notes, as_path, paths_of
 from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.options import FILES, Force, GroundPlane, PathLike, Reports, Topic, no_progress
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.training.recipe import RECIPES, Recipe
+from mcaptrack.extensions.training.result import TrainResult
+from mcaptrack.extensions.training.sources import SYNTHETIC, SourceOptions, read_scenes, split, synthetic, windows_of
+from mcaptrack.extensions.training.windows import Windows
 from mcaptrack.notices import collected
-from mcaptrack.training.recipe import RECIPES, Recipe
-from mcaptrack.training.result import TrainResult
-from mcaptrack.training.sources import SYNTHETIC, SourceOptions, read_scenes, split, synthetic, windows_of
-from mcaptrack.training.windows import Windows
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 RecipeName = Literal["red", "paper"]
@@ -30,7 +30,11 @@ _LICENCE: Final = "that of the data it was trained on"
 _VALIDATION_SHARE: Final = 0.1
 
 
-@declared(most_used=("recipe", "epochs", "device", "validate", "topic", "output", "force"))
+@declared(
+    most_used=("recipe", "epochs", "device", "validate", "topic", "output", "force"),
+    heading="Improve and repair",
+    printed_by="mcaptrack.extensions.training.command:Train",
+)
 def train(
     sources: Annotated[
         PathLike | Sequence[PathLike],
@@ -145,8 +149,8 @@ def train(
     chosen = RECIPES[recipe].changed(hyperparameters, {"noise_m": noise_m, "gaps": gaps, "scale": scale})
     folder, notes = as_path(output), Notes()
     _refuse_folder(folder, chosen, resume=resume, force=force)
-    from mcaptrack.training.loop import find_device
-    from mcaptrack.training.loop import train as fit
+    from mcaptrack.extensions.training.loop import find_device
+    from mcaptrack.extensions.training.loop import train as fit
 
     where = find_device(device)  # before anything takes long
     how = labels.label_options(label_format=label_format, classes=classes, fps=fps, ground_plane=ground_plane)

@@ -1,0 +1,135 @@
+"""The house stands when an extension is taken away: its folder, and the entry points that name it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mcaptrack.installed import declared
+
+ROOT = Path(__file__).parent.parent
+POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+EXTENSIONS = sorted(path.parent.name for path in (ROOT / "mcaptrack" / "extensions").glob("*/__init__.py"))
+#: Says of a house which commands its help lists, what becomes of names, and which modules of the core can't be imported.
+ASK = """
+import importlib, io, json, pkgutil, sys
+from contextlib import redirect_stderr, redirect_stdout
+import mcaptrack
+from mcaptrack.cli import app
+
+def call(*words):
+    with redirect_stdout(io.StringIO()) as out, redirect_stderr(out):
+        try:
+            app(words)
+        except SystemExit:
+            return out.getvalue()
+
+names, core = json.loads(sys.argv[1])
+said = {}
+for name in names:
+    try:
+        said[name] = getattr(mcaptrack, name).__module__
+    except AttributeError as error:
+        said[name] = str(error)
+broken = []
+for module in pkgutil.walk_packages(mcaptrack.__path__, "mcaptrack.") if core else ():
+    if not module.name.startswith(("mcaptrack.extensions", "mcaptrack.__main__")):
+        try:
+            importlib.import_module(module.name)
+        except ImportError as error:
+            broken.append(str(error))
+commands = {name: call(name, "x") for name in names if name.islower()}
+loaded = [name for name in sys.modules if name.startswith("mcaptrack.extensions.")] if core else []
+print(json.dumps({
+    "help": call("--help"), "names": said, "all": mcaptrack.__all__, "commands": commands, "broken": broken,
+    "where": mcaptrack.__file__, "loaded": loaded,
+}))
+"""
+
+
+def room_of(value: str) -> str:
+    return value.split(".")[2]
+
+
+def house_without(extensions: list[str], folder: Path) -> None:
+    """Put a house without some extensions into a folder: links to all else, and what pip leaves of it."""
+    info = folder / "mcaptrack-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mcaptrack\nVersion: 1\n")
+    lines = []
+    for group, points in POINTS.items():
+        lines += [f"[{group}]", *(f"{k} = {v}" for k, v in points.items() if room_of(v) not in extensions)]
+    (info / "entry_points.txt").write_text("\n".join(lines))
+    (folder / "mcaptrack" / "extensions").mkdir(parents=True)
+    for path in (ROOT / "mcaptrack").iterdir():
+        if path.name != "extensions":
+            (folder / "mcaptrack" / path.name).symlink_to(path)
+    for path in (ROOT / "mcaptrack" / "extensions").iterdir():
+        if path.name not in extensions:
+            (folder / "mcaptrack" / "extensions" / path.name).symlink_to(path)
+
+
+def ask(folder: Path, *, core: bool) -> dict[str, Any]:
+    names = sorted({name for group in ("commands", "names") for name in POINTS[f"mcaptrack.{group}"]})
+    done = subprocess.run(
+        [sys.executable, "-c", ASK, json.dumps([names, core])], cwd=folder, env={"PYTHONPATH": str(folder), "COLUMNS": "200"},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert not done.returncode, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("gone", [*EXTENSIONS, "all"])
+def test_without_an_extension_the_rest_works_and_what_is_missing_is_named(gone, tmp_path):
+    missing = EXTENSIONS if gone == "all" else [gone]
+    house_without(missing, tmp_path)
+    said = ask(tmp_path, core=gone == "all")
+    assert said["where"].startswith(str(tmp_path))
+    assert (said["broken"], said["loaded"]) == ([], [])
+    for group in ("commands", "names"):
+        for name, value in POINTS[f"mcaptrack.{group}"].items():
+            text = f"{name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/"
+            is_there = room_of(value) not in missing
+            assert (name in said["all"]) is is_there
+            assert (f"{text}{room_of(value)}" in said["names"][name]) is not is_there
+            if group == "commands":
+                assert (f"\n  {name} " in said["help"]) is is_there
+                assert (f"mcaptrack: {text}{room_of(value)}\n" == said["commands"][name]) is not is_there
+    assert "\n  ingest " in said["help"]
+
+
+def test_entry_points_of_a_folder_that_is_gone_do_not_count(tmp_path):
+    (gone, *_) = EXTENSIONS
+    house_without([gone], tmp_path)
+    info = tmp_path / "mcaptrack-1.dist-info" / "entry_points.txt"
+    info.write_text(
+        "\n".join(line for g, own in POINTS.items() for line in (f"[{g}]", *(f"{k}={v}" for k, v in own.items())))
+    )
+    (tmp_path / "mcaptrack" / "extensions" / gone / "__pycache__").mkdir(parents=True)  # which git leaves
+    said = ask(tmp_path, core=False)
+    for name, value in POINTS["mcaptrack.commands"].items():
+        assert (name in said["all"]) is (room_of(value) != gone)
+        assert ("isn't installed" in said["commands"][name]) is (room_of(value) == gone)
+
+
+def test_every_extension_has_a_folder_of_tests_and_every_entry_point_a_folder():
+    tested = {path.name for path in (ROOT / "tests" / "extensions").iterdir() if list(path.glob("test_*.py"))}
+    assert set(EXTENSIONS) == tested == {room_of(value) for points in POINTS.values() for value in points.values()}
+
+
+def test_the_installed_entry_points_are_those_of_the_project():
+    points = {(point.group, point.name, point.value) for point in declared().points if point.is_own}
+    wanted = {(group, name, value) for group, own in POINTS.items() for name, value in own.items()}
+    assert points == wanted, "install again: .venv/bin/python -m pip install --editable ."
+
+
+def test_the_core_names_no_extension():
+    for path in (ROOT / "mcaptrack").rglob("*.py"):
+        if "extensions" not in path.relative_to(ROOT / "mcaptrack").parts:
+            assert not [name for name in EXTENSIONS if f"extensions.{name}" in path.read_text()], path
