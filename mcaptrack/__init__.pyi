@@ -60,6 +60,9 @@ from mcaptrack.api.viewing import view as view
 from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.extensions.review.api import Review as Review
+from mcaptrack.extensions.review.api import ReviewResult as ReviewResult
+from mcaptrack.extensions.review.api import review as review
 from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
@@ -97,6 +100,8 @@ __all__ = [
     "Recording",
     "RenderResult",
     "ReportResult",
+    "Review",
+    "ReviewResult",
     "RunResult",
     "Scores",
     "TableInfo",
@@ -129,6 +134,7 @@ __all__ = [
     "render",
     "report",
     "retrack",
+    "review",
     "run",
     "sample",
     "schema_of",

@@ -49,6 +49,7 @@ Kind = Literal[
     "label_format",
     "message_reader",
     "exporter",
+    "judge",
     "command",
     "name",
 ]
@@ -155,6 +156,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "boxes-csv": "mcaptrack.tables.exchange.text:boxes_csv",
             "rerun": "mcaptrack.tables.exchange.rerun_file:write_recording",
         },
+        "judge": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.

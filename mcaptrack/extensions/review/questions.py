@@ -61,6 +61,14 @@ class Question:
         after = self.after or Tracklet(-1, -1, -1)
         return self.before.source_id, self.before.end_ns, after.source_id, after.begin_ns
 
+    def name(self, start_ns: int) -> str:
+        """Its name, with seconds since the start of the log."""
+        edge = self.before.end_ns if self.after else self.before.begin_ns
+        name = f"{self.before.source_id}@{(edge - start_ns) / NS_PER_S:.3f}"
+        return name + (
+            f"-{self.after.source_id}@{(self.after.begin_ns - start_ns) / NS_PER_S:.3f}" if self.after else ""
+        )
+
     @property
     def value(self) -> float:
         """The rows that its answer is expected to change."""
@@ -98,8 +106,8 @@ def solve(opened: log.Log, prefix: str, answers: Sequence[Frame] | None = None) 
     return Solved(frames, outputs[""], outputs["decisions"], outputs["worlds"])
 
 
-def questions(solved: Solved, answered: Sequence[Frame], count: int) -> list[Question]:
-    """The most valuable questions, the best first, without those that were answered; the same for the same log."""
+def questions(solved: Solved, answered: Sequence[tuple[int, Rows]], count: int) -> list[Question]:
+    """The most valuable questions, the best first, without those that a person answered; the same for the same log."""
     worlds = join_frames(WORLDS, solved.worlds)
     if not len(worlds.rows):
         return []
@@ -115,7 +123,7 @@ def questions(solved: Solved, answered: Sequence[Frame], count: int) -> list[Que
     tracklets, begins = tracklets[by_time], begins[by_time]
     decided = _decided(solved.tracks, tracklets, begins)
     asked = [*_of_pairs(track, decided, tracklets, begins), *_of_people(track, decided, tracklets, begins)]
-    done = {key for frame in answered for key in _keys(frame)}
+    done = {key for answer in answered if answer[1]["probability"][0] in (0, 1) for key in keys_of(*answer)}
     asked = [question for question in asked if question.key not in done and question.value >= _LEAST]
     asked.sort(key=lambda question: (-question.value, question.key))
     out: list[Question] = []
@@ -184,13 +192,13 @@ def _of_people(track: Ints, decided: Ints, tracklets: Rows, begins: Ints) -> lis
     ]
 
 
-def _keys(frame: Frame) -> list[tuple[int, int, int, int]]:
-    rows = frame.rows
+def keys_of(t_ns: int, rows: Rows) -> list[tuple[int, int, int, int]]:
+    """What each answer of rows at a time is about, as ``Question.key``."""
     gap_ns = np.round(rows["duration_s"] * NS_PER_S).astype(np.int64)
     return [
-        (int(row["previous_id"]), frame.t_ns - int(gap), int(row["source_id"]), frame.t_ns)
+        (int(row["previous_id"]), t_ns - int(gap), int(row["source_id"]), t_ns)
         if row["kind"] == DecisionKind.JOINED
-        else (int(row["source_id"]), frame.t_ns + int(gap), -1, -1)
+        else (int(row["source_id"]), t_ns + int(gap), -1, -1)
         for row, gap in zip(rows, gap_ns, strict=True)
     ]
 
@@ -215,7 +223,16 @@ def answer_row(question: Question, yes: float, samples: Sequence[Frame]) -> tupl
     return t_ns, DECISIONS.check(rows)
 
 
-def read_answers(opened: log.Log, prefix: str) -> list[Frame]:
-    """The answers in a log."""
+def in_frames(answers: Sequence[tuple[int, Rows]]) -> list[Frame]:
+    """Rows of answers at their times, as frames in order."""
+    by_time: dict[int, list[Rows]] = {}
+    for t_ns, rows in sorted(answers, key=lambda answer: answer[0]):
+        by_time.setdefault(t_ns, []).append(rows)
+    return [Frame(t_ns, number, DECISIONS.joined(rows)) for number, (t_ns, rows) in enumerate(by_time.items())]
+
+
+def read_answers(opened: log.Log, prefix: str) -> list[tuple[int, Rows]]:
+    """The answers in a log: the time and the row of each."""
     topic = f"{prefix}/{ANSWERS}"
-    return list(opened.frame_columns(topic, DECISIONS)) if topic in opened.channels else []
+    frames = opened.frame_columns(topic, DECISIONS) if topic in opened.channels else ()
+    return [(frame.t_ns, frame.rows[number : number + 1]) for frame in frames for number in range(len(frame.rows))]
