@@ -111,18 +111,14 @@ def questions(solved: Solved, answered: Sequence[tuple[int, Rows]], count: int) 
     worlds = join_frames(WORLDS, solved.worlds)
     if not len(worlds.rows):
         return []
-    of = worlds.rows["world"]
-    many = int(of.max())
-    one = of == 1
-    begins = worlds.row_ns[one]
-    tracklets = worlds.rows[one]
-    track = worlds.rows["track_id"].reshape(-1)
-    order = np.lexsort((worlds.rows["source_id"], worlds.row_ns, of))
-    track = track[order].reshape(many, -1)
-    by_time = np.lexsort((tracklets["source_id"], begins))
-    tracklets, begins = tracklets[by_time], begins[by_time]
-    decided = _decided(solved.tracks, tracklets, begins)
-    asked = [*_of_pairs(track, decided, tracklets, begins), *_of_people(track, decided, tracklets, begins)]
+    order = np.lexsort((worlds.rows["source_id"], worlds.row_ns, worlds.rows["world"]))
+    track = worlds.rows["track_id"][order].reshape(int(worlds.rows["world"].max()), -1)
+    first = order[: track.shape[1]]
+    rows, begins = worlds.rows[first], worlds.row_ns[first]
+    tracklets = _placed(solved.samples, rows, begins)
+    decided = _decided(solved.tracks, rows, begins)
+    frames = rows["frames"].astype(np.int64)
+    asked = [*_of_pairs(track, decided, tracklets, frames), *_of_people(track, decided, tracklets, frames)]
     done = {key for answer in answered if answer[1]["probability"][0] in (0, 1) for key in keys_of(*answer)}
     asked = [question for question in asked if question.key not in done and question.value >= _LEAST]
     asked.sort(key=lambda question: (-question.value, question.key))
@@ -143,20 +139,32 @@ def _decided(tracks: Sequence[Frame], tracklets: Rows, begins: Ints) -> Ints:
     return np.where(at >= 0, joined.rows["track_id"][at], -1 - np.arange(len(at)))
 
 
-def _of_pairs(track: Ints, decided: Ints, tracklets: Rows, begins: Ints) -> list[Question]:
+def _placed(samples: Sequence[Frame], rows: Rows, begins: Ints) -> list[Tracklet]:
+    """The tracklets of worlds, with the times of their last samples: durations are in steps, which may jitter."""
+    joined = join_frames(TRACKS, samples)
+    seen = joined.rows["observed"]
+    order = np.lexsort((joined.row_ns[seen], joined.rows["track_id"][seen]))
+    ids, t_ns = joined.rows["track_id"][seen][order], joined.row_ns[seen][order]
+    out = []
+    for row, begin in zip(rows, begins.tolist(), strict=True):
+        low, high = (int(np.searchsorted(ids, row["source_id"], side)) for side in ("left", "right"))
+        first = low + int(np.searchsorted(t_ns[low:high], begin))
+        end = int(t_ns[min(first + int(row["frames"]), high) - 1])
+        out.append(Tracklet(int(row["source_id"]), begin, end))
+    return out
+
+
+def _of_pairs(track: Ints, decided: Ints, tracklets: Sequence[Tracklet], frames: Ints) -> list[Question]:
     """A question for each two tracklets that follow each other in a world (W, K), or as was decided."""
-    ends = begins + np.round(tracklets["duration_s"] * NS_PER_S).astype(np.int64)
+    begins = np.array([tracklet.begin_ns for tracklet in tracklets])
     pairs = np.unique(np.concatenate([_following(of, begins) for of in (decided, *track)], axis=1), axis=1)
     a, b = pairs
-    together = (track[:, a] == track[:, b]) & (track[:, a] >= 0)
-    is_one = decided[a] == decided[b]
-    heads, tails = _sides(decided, tracklets["frames"].astype(np.int64))
-    rows = np.minimum(heads[a], tails[b])
+    together = ((track[:, a] == track[:, b]) & (track[:, a] >= 0)).mean(axis=0)
+    heads, tails = _sides(decided, frames)
+    columns = pairs.T, together, decided[a] == decided[b], np.minimum(heads[a], tails[b])
     return [
-        Question(*(Tracklet(int(tracklets["source_id"][k]), int(begins[k]), int(ends[k])) for k in (i, j)), p, one, n)
-        for i, j, p, one, n in zip(
-            a.tolist(), b.tolist(), together.mean(axis=0).tolist(), is_one.tolist(), rows.tolist(), strict=True
-        )
+        Question(tracklets[i], tracklets[j], p, is_one, count)
+        for (i, j), p, is_one, count in zip(*(column.tolist() for column in columns), strict=True)
     ]
 
 
@@ -180,15 +188,12 @@ def _sides(track: Ints, frames: Ints) -> tuple[Ints, Ints]:
     return heads, tails
 
 
-def _of_people(track: Ints, decided: Ints, tracklets: Rows, begins: Ints) -> list[Question]:
+def _of_people(track: Ints, decided: Ints, tracklets: Sequence[Tracklet], frames: Ints) -> list[Question]:
     """A question for each tracklet: whether it is a person."""
-    ends = begins + np.round(tracklets["duration_s"] * NS_PER_S).astype(np.int64)
-    share = (track >= 0).mean(axis=0)
+    columns = (track >= 0).mean(axis=0), decided >= 0, frames
     return [
-        Question(
-            Tracklet(int(row["source_id"]), int(begin), int(end)), None, float(p), bool(one >= 0), int(row["frames"])
-        )
-        for row, begin, end, p, one in zip(tracklets, begins, ends, share, decided, strict=True)
+        Question(tracklet, None, p, is_kept, count)
+        for tracklet, p, is_kept, count in zip(tracklets, *(column.tolist() for column in columns), strict=True)
     ]
 
 
