@@ -36,7 +36,9 @@ def crops(
     wanted: dict[int, list[tuple[list[Image], Rows]]] = {}
     for question, sides in zip(asked, out, strict=True):
         for tracklet, side in zip((question.before, question.after), sides, strict=True):
-            for number in _chosen(times, tracklet, question) if tracklet else ():
+            if tracklet is None:
+                continue
+            for number in _chosen(times, tracklet, question):
                 rows = samples[number].rows
                 shown = int(max(np.searchsorted(pictures.t_ns, times[number], "right") - 1, 0))
                 wanted.setdefault(shown, []).append((side, rows[rows["track_id"] == tracklet.source_id]))

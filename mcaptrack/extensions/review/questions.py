@@ -102,7 +102,7 @@ def solve(opened: log.Log, prefix: str, answers: Sequence[Frame] | None = None) 
     transform = replace(transform, **context | given, worlds=_WORLDS)
     if transform.leaves_unchanged:
         raise McaptrackError(f"{opened.path}: without a measured ground plane {prefix} has no decisions to review")
-    outputs = dict(zip(transform.writes, zip(*transform(frames), strict=True), strict=True))  # type: ignore[operator]
+    outputs = dict(zip(transform.writes, zip(*transform(frames), strict=True), strict=True))
     return Solved(frames, outputs[""], outputs["decisions"], outputs["worlds"])
 
 
