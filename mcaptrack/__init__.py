@@ -19,8 +19,6 @@ _PARTS = {
     "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
     "messages": ["DecodedMessage"],
-    "notebook": ["Player"],
-    "outputs": ["ReportResult", "report"],
     "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
     "recording": ["Recording", "open"],
     "rendering": ["RenderResult", "render"],

@@ -23,9 +23,6 @@ from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.messages import DecodedMessage as DecodedMessage
-from mcaptrack.api.notebook import Player as Player
-from mcaptrack.api.outputs import ReportResult as ReportResult
-from mcaptrack.api.outputs import report as report
 from mcaptrack.api.querying import ColumnInfo as ColumnInfo
 from mcaptrack.api.querying import TableInfo as TableInfo
 from mcaptrack.api.querying import TableList as TableList
@@ -60,6 +57,9 @@ from mcaptrack.api.viewing import view as view
 from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.extensions.notebook.api import Player as Player
+from mcaptrack.extensions.report.api import ReportResult as ReportResult
+from mcaptrack.extensions.report.api import report as report
 from mcaptrack.extensions.review.api import Review as Review
 from mcaptrack.extensions.review.api import ReviewResult as ReviewResult
 from mcaptrack.extensions.review.api import review as review

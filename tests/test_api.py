@@ -14,7 +14,6 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log, tables
-from mcaptrack.api.outputs import ReportResult
 from mcaptrack.api.scoring import Scores
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources import ingest
@@ -226,8 +225,6 @@ def test_topics_and_names_are_text(tmp_path):
 def test_results_are_shown_in_a_line(tmp_path):
     info = mcaptrack.info(some_log(tmp_path / "a.mcap"))
     assert repr(info) == f"LogInfo({str(info.log)!r}, {len(info.channels)} channels, {info.messages} messages)"
-    page = ReportResult(Path("page.html"), 12, {"many": [0] * 1000}, ())
-    assert repr(page) == f"ReportResult({str(page.page)!r}, 12 bytes)"
     row = {
         "sequence": "<a>", "tracks": "/camera/tracks", "similarity": "iou", "gate": 0.5, "HOTA": 0.5, "MOTA": -0.25,
         "IDF1": 1,

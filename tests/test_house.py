@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from mcaptrack.installed import declared
 
@@ -127,6 +128,11 @@ def test_the_installed_entry_points_are_those_of_the_project():
     points = {(point.group, point.name, point.value) for point in declared().points if point.is_own}
     wanted = {(group, name, value) for group, own in POINTS.items() for name, value in own.items()}
     assert points == wanted, "install again: .venv/bin/python -m pip install --editable ."
+
+
+def test_the_workflow_takes_each_extension_away():
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    assert sorted(jobs["without"]["strategy"]["matrix"]["extension"]) == EXTENSIONS
 
 
 def test_the_core_names_no_extension():

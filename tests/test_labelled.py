@@ -12,12 +12,10 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.api import ingesting, labels, scoring
+from mcaptrack.api import labels
 from mcaptrack.api.declared import hints_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.forecasts import score_forecasts
-from mcaptrack.extensions.training import api as training
-from mcaptrack.extensions.tuning import api as tuning
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.provenance import Provenance
@@ -331,7 +329,8 @@ def test_times_of_a_part_and_of_every_third_picture(tmp_path, clip):
 
 
 def test_options_of_label_files_are_the_same_in_every_command():
-    commands = (ingesting.ingest, scoring.evaluate, tuning.tune, training.train)
+    names = ("ingest", "evaluate", "tune", "train")
+    commands = [getattr(mcaptrack, name) for name in names if name in mcaptrack.__all__]
     of_all, of_two = ("label_format", "classes"), ("columns", "class_map", "first_frame", "frames", "size")
     for name, some in (*((name, commands) for name in of_all), *((name, commands[:2]) for name in of_two)):
         assert len({repr(hints_of(command)[name]) for command in some}) == 1, name

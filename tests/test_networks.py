@@ -12,10 +12,7 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.metrics.displacement import forecast_scores
-from mcaptrack.extensions.training.walks import walks
-from mcaptrack.extensions.training.windows import Windows, ar1
-from mcaptrack.predictors import OnClock, PeopleSeen, make, weights_sha256
+from mcaptrack.predictors import OnClock, make, weights_sha256
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.onnx import are_covariances
@@ -59,28 +56,6 @@ class TestAgainstTorch:
         factor = np.array([1.0, 2.0, 4.0])[:, None, None]
         np.testing.assert_allclose(Lstm.of(wider).predict(PAST, known).cov, kalman * factor)
 
-    def test_networks_for_training_give_the_same_forecasts(self):
-        torch = pytest.importorskip("torch", reason="training needs torch")
-        from mcaptrack.extensions.training.network import LstmNetwork, RedNetwork
-
-        torch.manual_seed(1)
-        path = walks(32, 20, 0.4, seed=3)[0]
-        windows = Windows.of(path, 8)
-        for network, kind, card in (
-            (RedNetwork(12, 0.4), Red, {"network": "red", "steps": "12", "step_s": "0.4"}),
-            (LstmNetwork(12), Lstm, {"network": "lstm", "steps": "12", "step_s": "0.4"}),
-        ):
-            with torch.no_grad():
-                for parameter in network.parameters():
-                    parameter.normal_(0, 0.2)
-                part = windows if kind is Red else windows.last(4)
-                given = network.prepare(part)
-                there = network(given)[0] if kind is Red else network(given["past"]).cumsum(1)
-            tensors = {name: np.asarray(value, float) for name, value in network.tensors().items()}
-            here = kind.of(Weights(Path("w"), tensors, card, "")).predict(part.past, part.known).mean
-            here = here if kind is Red else here - part.past[:, -1:]
-            np.testing.assert_allclose(here, there.numpy(), atol=2e-4)
-
 
 def test_a_blend_is_the_mean_of_the_network_and_of_constant_velocity():
     blend, red, cv = (make(name, 12, 0.4).predict(PAST, KNOWN) for name in ("blend", "red", "cv"))
@@ -99,25 +74,6 @@ class TestShippedWeights:
         assert "synthetic walks" in shipped.card["data"]
         assert "ADE_m" in shipped.card["scores_noisy"]
         assert make(name, 12, 0.4).weights_sha256 == shipped.sha256
-
-    def test_red_has_less_error_than_linear_predictors_and_is_calibrated_and_social_has_less(self):
-        """On walks that it was not trained on, as they are and with the noise of a tracker."""
-        paths, scene = walks(3000, 20, 0.4, seed=12345)
-        windows = Windows.of(paths, 8)
-        moment = 5 * scene + np.arange(len(scene)) % 5  # the walks of a person follow one another
-        noise = 0.2 * ar1(np.random.default_rng(0), 3000, 8)
-        for seen in (windows.past, windows.past + noise):
-            scores = {
-                name: forecast_scores(*make(name, 12, 0.4).predict(seen, windows.known), windows.future)
-                for name in ("red", "cv", "kalman")
-            }
-            people = PeopleSeen(seen, windows.known, moment, np.arange(len(seen)))
-            among = forecast_scores(*make("social", 12, 0.4).predict(seen, windows.known, people), windows.future)
-            assert among["ADE_m"] < 0.97 * scores["red"]["ADE_m"]
-            assert among["NLL"] < scores["red"]["NLL"]
-            assert scores["red"]["ADE_m"] < 0.95 * min(scores["cv"]["ADE_m"], scores["kalman"]["ADE_m"])
-            assert scores["red"]["NLL"] < min(scores["cv"]["NLL"], scores["kalman"]["NLL"]) - 0.3
-            assert 0.93 < scores["red"]["coverage_95"] < 0.97
 
     def test_predictions_name_the_weights_that_made_them(self, tmp_path):
         lines = [f"{12 * n} 1 {0.4 * n} 0" for n in range(20)]

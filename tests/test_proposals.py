@@ -19,7 +19,6 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.errors import McaptrackError, command
-from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import serving
@@ -160,6 +159,8 @@ class Scene:
         return self.says("detect", "LOG", "--detector", "yolox-nano")
 
     def to_train_on(self) -> str:
+        from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
+
         with pytest.raises(McaptrackError) as refused:
             read_scenes([self.path], SourceOptions(), 0.4)
         return with_flags(str(refused.value))
@@ -195,12 +196,12 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:products:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
-    "cli/train.py:show:predict": lambda s: s.says(
+    "extensions/training/command.py:show:predict": lambda s: s.says(
         "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
     ),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
-    "viewing/report/figures.py:identity_events:view": Scene.page,
+    "extensions/report/figures.py:identity_events:view": Scene.page,
     "api/viewing.py:_note_trouble:ingest": lambda s: s.says("view", "LOG", "--links"),
     "api/viewing.py:view:run": lambda s: s.ingested("clip.mp4", "--truth", "truth.txt").says("view", "LOG", "--links"),
     "pipeline/views.py:with_views:run": Scene.without_temporary_folder,
@@ -246,10 +247,10 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "viewing/zones_page.py:zones_page:run": lambda s: s.ingested("truth.txt", "--as", "detections", "--fps", "10").says(
         "zones", "draw", "LOG"
     ),
-    "viewing/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
-    "viewing/report/__init__.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
-    "viewing/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
-    "viewing/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
+    "extensions/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
+    "extensions/report/page.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
+    "extensions/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
+    "extensions/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(
         "evaluate", "tracks.csv", "--truth", "truth.txt"
     ),
@@ -258,8 +259,11 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "sources/ingest/job.py:read:ingest": lambda s: (
         s.without("/camera/truth*").cubes().says("ingest", "clip.mp4", "--truth", "cubes.csv")
     ),
-    "training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
+    "extensions/training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
 }
+
+
+SCENES = {where: scene for where, scene in SCENES.items() if (PACKAGE / where.partition(":")[0]).exists()}
 
 
 def functions(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:

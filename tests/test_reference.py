@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
-import numpy as np
 import pytest
 from mcap.records import Channel, Header, Schema
 
 from mcaptrack import log
-from mcaptrack.evaluation.metrics.displacement import forecast_scores
-from mcaptrack.extensions.training.recipe import RECIPES
-from mcaptrack.extensions.training.sources import SourceOptions, read_scenes, windows_of
-from mcaptrack.extensions.training.windows import ar1
 from mcaptrack.log import records
-from mcaptrack.predictors import make
 from tests.commands import printed
 
 
@@ -114,17 +107,3 @@ def test_what_others_recorded_is_checked_without_a_complaint_and_recovered_whole
             assert ours.index.channels == theirs.index.channels
             for topic in theirs.channels:
                 assert list(theirs.messages(topic)) == list(ours.messages(topic)), path
-
-
-@pytest.mark.parametrize(("past", "noise_m", "most_m"), [(4, 0.0, 0.61), (8, 0.2, 0.90)])
-def test_weights_that_never_saw_a_recording_foretell_one(data, past, noise_m, most_m):
-    """Scenes of Stanford Drone: errors in metres, what the ellipses hold, and constant velocity beside it."""
-    recipe = replace(RECIPES["red"], past=past, least=past)
-    windows = windows_of(read_scenes([data / "sdd" / "val"], SourceOptions(), recipe.step_s), recipe)
-    seen = windows.past + noise_m * ar1(np.random.default_rng(3), *windows.known.shape)
-    red, cv = (
-        forecast_scores(*make(name, 12, 0.4).predict(seen, windows.known), windows.future) for name in ("red", "cv")
-    )
-    assert red["ADE_m"] < most_m
-    assert red["ADE_m"] < cv["ADE_m"]
-    assert 0.90 < red["coverage_95"] < 0.97

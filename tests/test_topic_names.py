@@ -15,7 +15,6 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
 from mcaptrack.log import find_topic
 
 
@@ -71,8 +70,16 @@ FUNCTIONS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
         "detections",
         lambda p, t, f: mcaptrack.tune(p, stage="track", topic=t, trials=1, study=f / "a.jsonl").scores,
     ),
-    "train": ("tracks", lambda p, t, _: [s.xy_m.tobytes() for s in read_scenes([p], SourceOptions(topic=t), 0.4)]),
+    "train": ("tracks", lambda p, t, _: _scenes(p, t)),
 }
+
+
+def _scenes(path: Path, topic: str) -> list[bytes]:
+    from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
+
+    return [scene.xy_m.tobytes() for scene in read_scenes([path], SourceOptions(topic=topic), 0.4)]
+
+
 METHODS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     "table": ("tracks", _reads(lambda r, t: r.table("tracks", t).num_rows)),
     "array": ("tracks", _reads(lambda r, t: len(r.array("tracks", t)))),

@@ -39,7 +39,13 @@ mcaptrack.run("log.mcap").sumary
 number: int = mcaptrack.open("log.mcap").fetch({}).payload
 """
 #: What is only imported by type checkers, or by those who have it.
-ONLY_TYPES = {"pa": pa, "CheckResult": CheckResult, "Finding": Finding, "Detections": type("Detections", (), {})}
+ONLY_TYPES = {
+    "pa": pa,
+    "Player": mcaptrack.Player,
+    "CheckResult": CheckResult,
+    "Finding": Finding,
+    "Detections": type("Detections", (), {}),
+}
 
 
 def mypy(folder: Path) -> list[str]:

@@ -18,9 +18,13 @@ import mcaptrack
 from mcaptrack.errors import McaptrackError
 from tests.browser import browser, needs_browser
 from tests.commands import done
-from tests.test_report import Reader
+from tests.reader import Reader
 from tests.test_serving import ask
 from tests.worlds import ns, write_eventful
+
+pytestmark = pytest.mark.skipif(
+    not {"report", "Player"} <= {*mcaptrack.__all__}, reason="the pages that it shows are of extensions"
+)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +56,7 @@ def test_the_first_page_leads_to_all_others_and_no_other_origin_may_read_them(ev
     with mcaptrack.view(eventful, port=0) as server:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", server.address)
         data = index_of(server)
-        pages = [data["report"], data["tables"], *(view["address"] for view in data["views"])]
+        pages = [*data["pages"].values(), *(view["address"] for view in data["views"])]
         for address in ("/", *pages):
             status, headers, body = ask(server.address.rstrip("/") + address)
             assert (status, headers["Content-Type"]) == (200, "text/html; charset=utf-8")
@@ -69,7 +73,7 @@ def test_the_first_page_leads_to_all_others_and_no_other_origin_may_read_them(ev
 
 def test_the_report_is_about_the_log_as_it_is_now(pictures):
     def digest() -> str:
-        reader = inside(server, data["report"])
+        reader = inside(server, data["pages"]["report"])
         return json.loads(reader.scripts[0])["logs"][0]["digest"]
 
     with mcaptrack.view(pictures, port=0) as server:
@@ -93,7 +97,7 @@ def test_a_player_has_all_tracks_and_those_that_are_not_shown_at_first_are_off(p
 
 def test_tables_are_those_of_the_log_and_their_csv_has_all_rows(pictures):
     with mcaptrack.view(pictures, port=0) as server, mcaptrack.open(pictures) as log:
-        folder = index_of(server)["tables"].rpartition("/")[0]
+        folder = index_of(server)["pages"]["tables"].rpartition("/")[0]
         page = inside(server, f"{folder}/tables.html")
         links = [one["href"] for one in page.of("a")]
         filled = {name for name in log.tables if log.table(name).num_rows}
@@ -109,8 +113,8 @@ def test_a_log_with_nothing_to_see_says_so(tmp_path):
     with mcaptrack.view(path, port=0) as server:
         data = index_of(server)
         assert (data["views"], data["events"]) == ([], [])
-        assert [one["href"] for one in inside(server, data["tables"]).of("a")] == ["./recordings.csv"]
-        assert "no messages at all" in "".join(inside(server, data["report"]).text)
+        assert [one["href"] for one in inside(server, data["pages"]["tables"]).of("a")] == ["./recordings.csv"]
+        assert "no messages at all" in "".join(inside(server, data["pages"]["report"]).text)
 
 
 def test_names_in_the_first_page_are_text(eventful, tmp_path):
@@ -121,7 +125,7 @@ def test_names_in_the_first_page_are_text(eventful, tmp_path):
         assert not [one for element, one in reader.elements if element == "img" or "onerror" in one]
         assert len(reader.of("script")) == 2
         assert "<img src=x onerror=alert(1)>" in "".join(reader.text)
-        assert inside(server, index_of(server)["report"]).of("h1")
+        assert inside(server, index_of(server)["pages"]["report"]).of("h1")
 
 
 def test_other_addresses_are_served_with_a_warning_and_never_to_names_of_others(eventful):

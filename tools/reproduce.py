@@ -37,7 +37,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import PROFILES, TRANSFORMS, Predict, Sample
 from mcaptrack.transforms.retrack import Retracking
-from mcaptrack.viewing.report.formatting import curves_svg
+from mcaptrack.viewing.formatting import curves_svg
 
 RATE_HZ = 2.5
 

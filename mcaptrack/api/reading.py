@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from mcaptrack import log as logs
 from mcaptrack import tables
+from mcaptrack.api.arrow_tables import show_tables
 from mcaptrack.api.common import names_of, split_names
 from mcaptrack.api.declared import Option, checked
 from mcaptrack.api.messages import DecodedMessage, checked_factories, decoded_messages
-from mcaptrack.api.notebook import Choice, Player, show_log, show_tables
 from mcaptrack.api.options import Progress, no_progress
 from mcaptrack.api.rows import supervision_of
 from mcaptrack.errors import McaptrackError, call, offer
@@ -37,10 +37,13 @@ from mcaptrack.sources.pictures import Pictures, find_pictures, only_pictures
 from mcaptrack.sources.video import decode_bgr, decode_gray
 from mcaptrack.tables import export
 from mcaptrack.tables.export.contents import WHOLE, MessagesPart
+from mcaptrack.viewing.serving import Choice, log_player
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from supervision import Detections
+
+    from mcaptrack import Player
 
 T = TypeVar("T")
 Colour = Literal["bgr", "rgb", "grey"]
@@ -404,7 +407,7 @@ class LogReader:
 
         """
         with self._now() as opened:
-            return show_log(
+            player: Player = log_player().show(
                 opened,
                 at_s,
                 topics=names_of(topic),
@@ -413,6 +416,7 @@ class LogReader:
                 max_mb=max_mb,
                 progress=progress,
             )
+            return player
 
     def fetch(self, row: Mapping[str, Any]) -> FetchedMessage:
         """Read one message by its place in the file, without a scan.

@@ -258,7 +258,7 @@ class Scores:
         'curves.svg'
 
         """
-        from mcaptrack.viewing.report.formatting import curves_svg
+        from mcaptrack.viewing.formatting import curves_svg
 
         whole = [result for result in self.results if result.of_class is None and result.displacement is not None]
         whole = [result for result in whole if result.sequence == COMBINED] or whole

@@ -7,7 +7,7 @@ import re
 import threading
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -17,29 +17,29 @@ from typing import Annotated, Final, Self
 
 from mcaptrack import log as logs
 from mcaptrack import pipeline, tables
+from mcaptrack.api.arrow_tables import arrow_html
 from mcaptrack.api.common import as_path, log_file
 from mcaptrack.api.declared import Argument, Option, declared
-from mcaptrack.api.notebook import Choice, arrow_html, show_log
 from mcaptrack.api.options import PathLike, no_progress
 from mcaptrack.errors import McaptrackError, call, offer
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.installed import missing_extension
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
+from mcaptrack.registry import BUILT_IN, Entry, blamed, find, names, others
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.tables import exchange, export
-from mcaptrack.viewing import links, report
+from mcaptrack.viewing import links
+from mcaptrack.viewing.formatting import policy, render
 from mcaptrack.viewing.links import LICHTBLICK, LinkedEvent, rerun_link, viewer_links
-from mcaptrack.viewing.report.formatting import policy, render
-from mcaptrack.viewing.serving import LOOPBACK, Page, Server
+from mcaptrack.viewing.serving import LOOPBACK, LogPage, Page, Server, log_player
 
 #: Headings in the help.
 _OPENED: Final = "What is opened"
 _VIEWER: Final = "Server and viewer"
 #: The port where a log is served, unless another is given or this one is taken.
 PORT: Final = 8765
-#: The largest size of a player in megabytes: it is opened from this machine.
-_PLAYER_MB: Final = 16.0
 #: Our pages and scripts, below the secret word; files of the log have no folder.
 _FOLDER: Final = "page"
 #: The time in the text of an event.
@@ -89,18 +89,27 @@ class _FromLog:
                 return render("nothing.html", text=str(error)).encode()
 
 
-def _player(camera: str, is_above: bool, opened: logs.Log) -> bytes:
-    with with_views(opened) as (complete, _):
-        topics = pipeline.views_from_above(complete, camera) if is_above else ()
-    shown = show_log(
-        opened, None, topics=topics, camera=camera, choice=Choice(), max_mb=_PLAYER_MB, progress=no_progress,
-        all_tracks=True,
-    )  # fmt: skip
-    return shown.page.encode()
+def _page_names() -> list[str]:
+    """The names of the pages beside the player: those of entry points, and our own."""
+    return [name for name in (*others("page"), *BUILT_IN["page"]) if re.fullmatch(r"\w[\w-]*", name)]
 
 
-def _report(opened: logs.Log) -> bytes:
-    return report.page([report.gather(opened, None)]).encode()
+def _log_page(name: str) -> LogPage:
+    """A page by its name. Raises McaptrackError if that of another package can't be made."""
+    entry = find("page", name)
+    with blamed(entry, "could not be made") if not entry.is_built_in else nullcontext():
+        page: LogPage = entry.cls()
+    return page if entry.is_built_in else page._replace(make=partial(_made_by, entry, page.make))
+
+
+def _made_by(entry: Entry, make: Callable[[logs.Log], bytes], opened: logs.Log) -> bytes:
+    with blamed(entry, "failed"):
+        return make(opened)
+
+
+def tables_page() -> LogPage:
+    """The page with the tables of a log."""
+    return LogPage(partial(_tables, "{}.csv".format), policy())
 
 
 def _tables(address: Callable[[str], str], opened: logs.Log) -> bytes:
@@ -193,12 +202,13 @@ class LogServer:
     def _pages(self, contents: _Contents) -> dict[str, Page]:
         """Return our pages on a log, by name."""
         made = partial(_FromLog, contents.path)
-        pages = {
-            f"{_FOLDER}/player-{number}.html": Page(made(partial(_player, camera, is_above)), policy("player.js"))
-            for number, (_, camera, is_above) in enumerate(contents.views)
-        }
-        pages[f"{_FOLDER}/report.html"] = Page(made(_report), policy("report.js"))
-        pages[f"{_FOLDER}/tables.html"] = Page(made(partial(_tables, "{}.csv".format)), policy())
+        pages = {}
+        for number, (_, camera, is_above) in enumerate(contents.views):
+            player = log_player().page(camera, is_above)
+            pages[f"{_FOLDER}/player-{number}.html"] = Page(made(player.make), player.policy)
+        for name in _page_names():
+            page = _log_page(name)
+            pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
         for name in tables.TABLES:
             pages[f"{_FOLDER}/{name}.csv"] = Page(made(partial(_csv, name)), kind="text/csv; charset=utf-8")
         if not contents.rerun:
@@ -225,8 +235,7 @@ class LogServer:
                 {"name": name, "address": f"{place}player-{number}.html"}
                 for number, (name, *_) in enumerate(contents.views)
             ],
-            "report": f"{place}report.html",
-            "tables": f"{place}tables.html",
+            "pages": {name: f"{place}{name}.html" for name in _page_names()},
             "best": links.best_tracks(contents.events),
             "events": [
                 {
@@ -373,6 +382,8 @@ def view(
         if opened.start_ns or opened.end_ns:
             notes.append(f"viewers open at {links.seconds_of(opened, at_ns):.1f} s, {why}")
         _note_trouble(opened, notes)
+        if not names("player"):
+            notes.append(missing_extension("Player"))
         if host != LOOPBACK:
             warn(
                 f"{path}: whoever reaches this machine at {host} can read the log and all that is made of it", "shared"
@@ -389,13 +400,13 @@ def view(
 
 def _views(opened: logs.Log) -> list[tuple[str, str, bool]]:
     """Return what players show, the best first: a name, the camera, and whether it is seen from above."""
-    of_cameras = cameras(opened)
+    of_cameras = cameras(opened) if names("player") else []
     pictures = [(camera.prefix, False) for camera in of_cameras if camera.pictures]
     above = [(camera.prefix, True) for camera in of_cameras if pipeline.views_from_above(opened, camera.prefix)]
     what_there_is = [*pictures, *above] or [(camera.prefix, False) for camera in of_cameras[:1]]
-    names = {False: "pictures", True: "from above"}
+    sights = {False: "pictures", True: "from above"}
     return [
-        (names[is_above] if len(of_cameras) == 1 else f"{prefix.lstrip('/')}, {names[is_above]}", prefix, is_above)
+        (sights[is_above] if len(of_cameras) == 1 else f"{prefix.lstrip('/')}, {sights[is_above]}", prefix, is_above)
         for prefix, is_above in what_there_is
     ]
 

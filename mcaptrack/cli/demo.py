@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Once
+from mcaptrack.cli.group import entries
 from mcaptrack.cli.text import show
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Demo(Once["DemoResult"]):
 def _next_commands(target: Path) -> list[str]:
     """Return commands to try next, as they can be typed in the working folder."""
     command, log = _program(), quote(str(target))
-    lines = [f"{command} {name} {log}" for name in ("view", "info", "evaluate", "report")]
+    lines = [f"{command} {name} {log}" for name in ("view", "info", "evaluate", "report") if name in entries()]
     if find_spec("duckdb") is None:
         lines.append(f"{_from_here(Path(sys.executable))} -m pip install duckdb")
     return [*lines, f'{command} query {log} "from tracks limit 5"']

@@ -97,7 +97,6 @@ _LISTED: Final = (
     ("run", _FIRST, "running:Run"),
     ("view", _FIRST, "view:ViewCommand"),
     ("info", _FIRST, "show:Info"),
-    ("report", _FIRST, "report:ReportCommand"),
     ("detect", _STEP, _STAGE),
     ("motion", _STEP, _STAGE),
     ("track", _STEP, _STAGE),

@@ -51,6 +51,8 @@ Kind = Literal[
     "exporter",
     "judge",
     "command",
+    "page",
+    "player",
     "name",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -63,11 +65,11 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares.
 _COMMANDS: Final = (
-    "ingest demo run detect motion track sample predict retrack fuse models info view render report query export "
+    "ingest demo run detect motion track sample predict retrack fuse models info view render query export "
     "evaluate events zones calibrate check recover cut drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "name")
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "name")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -159,6 +161,8 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "judge": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
+        "page": {"tables": "mcaptrack.api.viewing:tables_page"},
+        "player": {},
         # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
         "name": {},
     }

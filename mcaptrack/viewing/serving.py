@@ -28,10 +28,13 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from socketserver import TCPServer
 from time import monotonic
-from typing import Any, BinaryIO, Final
+from typing import Any, BinaryIO, Final, NamedTuple
 from urllib.parse import quote, unquote_to_bytes
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.installed import missing_extension
+from mcaptrack.log import Log
+from mcaptrack.registry import find, names
 
 LOOPBACK: Final = "127.0.0.1"
 _LOCAL: Final = (LOOPBACK, "localhost")
@@ -87,6 +90,35 @@ class Page:
     policy: str = "default-src 'none'"
     kind: str = "text/html; charset=utf-8"
     is_shared: bool = False
+
+
+class LogPage(NamedTuple):
+    """A page about a log that `mcaptrack view` shows: what makes it of an open log, and its ``policy`` as of a page."""
+
+    make: Callable[[Log], bytes]
+    policy: str
+
+
+class Choice(NamedTuple):
+    """Which pictures: from ``start_s`` to ``end_s`` (None: the end) every ``every``-th (None: as many as fit).
+
+    ``width_px`` is their width in pixels; None stands for a usual one.
+    """
+
+    start_s: float = 0.0
+    end_s: float | None = None
+    every: int | None = None
+    width_px: int | None = None
+
+
+AS_MANY_AS_FIT: Final = Choice()
+
+
+def log_player() -> Any:
+    """The maker of players of logs: that of the first entry point. Raises McaptrackError if there is none."""
+    if not names("player"):
+        raise McaptrackError(missing_extension("Player"))
+    return find("player", names("player")[0]).made("show", "page")
 
 
 #: What is served: a file, the content of one, or a page.

@@ -21,8 +21,8 @@ from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import FULL
-from mcaptrack.viewing.report.formatting import render
-from mcaptrack.viewing.report.scene_map import background_picture
+from mcaptrack.viewing.background import background_picture
+from mcaptrack.viewing.formatting import render
 
 #: The channels of tracks with the places that are shown without pictures.
 _PLACES: Final = (f"retracks{FULL}", "retracks", "tracks", "truth")

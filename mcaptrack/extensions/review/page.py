@@ -6,22 +6,19 @@ import threading
 from base64 import b64encode
 from collections.abc import Sequence
 from functools import partial
-from hashlib import sha256
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.sources.video import encode_image
-from mcaptrack.viewing.report.formatting import environment, policy
+from mcaptrack.viewing.formatting import policy, render
 from mcaptrack.viewing.serving import Page, Server
 
 if TYPE_CHECKING:
     from mcaptrack.extensions.review.api import Review
 
 Answer = Literal["yes", "no", "skip"]
-_PAGE: Final = Path(__file__).with_name("page.html")
-_SCRIPT: Final = Path(__file__).with_name("page.js")
+_POLICY: Final = policy("review.js", "connect-src 'self'", __package__ or "")
 
 
 class ReviewServer:
@@ -33,15 +30,13 @@ class ReviewServer:
     def __init__(self, review: Review, shown: Sequence[Sequence[Sequence[Image]]]) -> None:
         self._review, self._shown, self._lock = review, shown, threading.Lock()
         self._open = set(review.questions)
-        script = b64encode(sha256(_SCRIPT.read_bytes()).digest()).decode()
-        self._policy = policy("", f"script-src 'sha256-{script}'; connect-src 'self'")
         names = [*review.questions]
         answers = {
             f"{answer}-{number}": Page(partial(self._answered, name, answer), kind="text/plain; charset=utf-8")
             for number, name in enumerate(names)
             for answer in get_args(Answer)
         }
-        self._server = Server(answers, review.port, host=review.host, index=Page(self._index, self._policy))
+        self._server = Server(answers, review.port, host=review.host, index=Page(self._index, _POLICY))
         self.address = self._server.root
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
         self._thread.start()
@@ -73,6 +68,4 @@ class ReviewServer:
                 }
             )
         data = {"root": self._server.path("").decode(), "questions": asked}
-        template = environment().from_string(_PAGE.read_text(encoding="utf-8"))
-        script = _SCRIPT.read_text(encoding="utf-8")
-        return template.render(title=review.log.name, data=data, script=script, policy=self._policy).encode()
+        return render("review.html", __package__ or "", title=review.log.name, data=data, policy=_POLICY).encode()

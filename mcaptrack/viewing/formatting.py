@@ -1,21 +1,21 @@
-"""Numbers and counts as a report prints them."""
+"""Numbers and counts as our pages print them, and the templates of pages."""
 
 from __future__ import annotations
 
 import base64
 import math
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from typing import Any, Final
 from urllib.parse import quote
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
-from mcaptrack.viewing.report.charts import WIDTH, Axis, Line, line_chart, round_most, thinned, time_ticks
+from mcaptrack.viewing.charts import WIDTH, Axis, Line, line_chart, round_most, thinned, time_ticks
 
 #: Printed in place of a number that is missing.
 NONE: Final = "\N{EN DASH}"
@@ -90,10 +90,13 @@ _BLANKS: Final = "\n\N{NO-BREAK SPACE}\N{NARROW NO-BREAK SPACE}"
 
 
 @cache
-def environment() -> Environment:
-    """The environment of the templates in ``templates/``: escaping is on, and a missing value is an error."""
+def environment(package: str = "") -> Environment:
+    """The environment of the templates in ``templates/`` of a package, and of those here for all.
+
+    Escaping is on, and a missing value is an error.
+    """
     out = Environment(
-        loader=PackageLoader(__package__ or ""),
+        loader=ChoiceLoader([PackageLoader(name) for name in (package, __package__) if name]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -101,18 +104,18 @@ def environment() -> Environment:
         finalize=_printable,
     )
     out.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
-    out.globals["policy"] = policy
+    out.globals["policy"] = partial(policy, package=package)
     out.filters |= {"number": number, "percent": percent, "counted": counted, "base64": _base64, "address": quote}
     return out
 
 
-def render(template: str, **values: Any) -> Markup:
-    """A template filled with values."""
-    return Markup(environment().get_template(template).render(values))  # noqa: S704 - templates escape
+def render(template: str, package: str = "", /, **values: Any) -> Markup:
+    """A template, of a package or of those here, filled with values."""
+    return Markup(environment(package).get_template(template).render(values))  # noqa: S704 - templates escape
 
 
 @cache
-def policy(script: str = "", more: str = "") -> str:
+def policy(script: str = "", more: str = "", package: str = "") -> str:
     """The Content-Security-Policy of a page: it loads nothing, and of all scripts only this template's text runs."""
     parts = [
         "default-src 'none'",
@@ -122,7 +125,7 @@ def policy(script: str = "", more: str = "") -> str:
         "form-action 'none'",
     ]
     if script:
-        parts.append(f"script-src 'sha256-{_base64(sha256(render(script).encode()).digest())}'")
+        parts.append(f"script-src 'sha256-{_base64(sha256(render(script, package).encode()).digest())}'")
     return "; ".join([*parts, *([more] if more else [])])
 
 

@@ -10,25 +10,20 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.extensions.report.statistics import rows_by_track
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.foxglove.views.people import ellipse_points, ellipses
-from mcaptrack.geometry.arrays import Floats, Image, Ints
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.schema import Frame, Rows
-from mcaptrack.sources.pictures import Pictures
-from mcaptrack.sources.video import encode_image
+from mcaptrack.viewing.background import SceneBackground
+from mcaptrack.viewing.charts import round_step
+from mcaptrack.viewing.formatting import number
 from mcaptrack.viewing.heat_map import occupancy
-from mcaptrack.viewing.report.charts import round_step
-from mcaptrack.viewing.report.formatting import number
-from mcaptrack.viewing.report.statistics import rows_by_track
 
-#: The background is the median of this many pictures, spread over the log: people who move vanish from it.
-_PICTURES: Final = 9
-_WIDTH_PX: Final = 800
-_QUALITY: Final = 72
 #: The largest number of points of a map, so that the page stays small.
 _MAX_POINTS: Final = 6000
 _MARGIN: Final = 14
@@ -45,15 +40,6 @@ _HALF: Final = 2 * np.log(2)
 _HEAT: Final = (224, 84, 0)
 
 
-class SceneBackground(NamedTuple):
-    """A picture in JPEG to draw tracks on; ``scale`` converts pixels of the camera to pixels of this picture."""
-
-    jpeg: bytes
-    width: int
-    height: int
-    scale: float
-
-
 class TrackPath(NamedTuple):
     """The path of a track: points (P, 2) in pixels or metres, and the log times in s of the first and the last."""
 
@@ -61,47 +47,6 @@ class TrackPath(NamedTuple):
     points: Floats
     first_s: float
     last_s: float
-
-
-def background_picture(pictures: Pictures, is_still: bool = True) -> SceneBackground | None:
-    """The scene without moving people, or the first picture if the camera isn't still; None without pictures.
-
-    Raises McaptrackError for damaged pictures.
-    """
-    import cv2
-
-    count = len(pictures.t_ns) if is_still else min(len(pictures.t_ns), 1)
-    numbers = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int)).tolist() if count else []
-    seen: list[Image] = []
-    scale = 1.0
-    for frame in pictures.readable(numbers):
-        high, wide = frame.rows.shape[:2]
-        scale = min(1.0, _WIDTH_PX / wide) if not seen else scale
-        size = (max(1, round(wide * scale)), max(1, round(high * scale)))
-        small = np.asarray(cv2.resize(frame.rows, size, interpolation=cv2.INTER_AREA), np.uint8)
-        if not seen or small.shape == seen[0].shape:
-            seen.append(small)
-    if not seen:
-        return None
-    still = np.median(np.stack(seen), axis=0)
-    # Grey and with less contrast, so that only tracks have colours.
-    grey = 0.55 * (still @ [0.114, 0.587, 0.299]) + 70
-    image = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
-    return SceneBackground(encode_image(image, "jpeg", _QUALITY), image.shape[1], image.shape[0], scale)
-
-
-def moment_picture(pictures: Pictures, t_ns: int) -> SceneBackground | None:
-    """The picture that is shown at a time; None if it can't be decoded."""
-    import cv2
-
-    at = max(int(np.searchsorted(pictures.t_ns, t_ns, "right")) - 1, 0)
-    for frame in pictures.readable([at]):
-        high, wide = frame.rows.shape[:2]
-        scale = min(1.0, _WIDTH_PX / wide)
-        size = (max(1, round(wide * scale)), max(1, round(high * scale)))
-        small = np.asarray(cv2.resize(frame.rows, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return SceneBackground(encode_image(small, "jpeg", _QUALITY), *size, scale)
-    return None
 
 
 def forecast_map(

@@ -18,6 +18,20 @@ from mcaptrack.evaluation.event_text import PEOPLE, nouns_of
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.evaluation.people import PersonScores, person_scores
 from mcaptrack.evaluation.zones import ZoneInWorlds, ZoneTotals
+from mcaptrack.extensions.report import statistics
+from mcaptrack.extensions.report.headline import AFTER, BEFORE, BeforeAfter, compared
+from mcaptrack.extensions.report.identity_events import (
+    ChannelEvents,
+    Doubt,
+    DoubtfulTrack,
+    IdentityEvent,
+    add_thumbnails,
+    find_doubtful_tracks,
+    find_doubts,
+    most_important,
+    summarize_events,
+)
+from mcaptrack.extensions.report.scene_map import forecast_map
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
 from mcaptrack.geometry.zones import Zone
@@ -30,23 +44,10 @@ from mcaptrack.sources.cameras import provenance_of, repaired_tracks
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import FULL
+from mcaptrack.viewing.background import SceneBackground, background_picture, moment_picture
+from mcaptrack.viewing.charts import POINTS, Axis, Floats, Line, figure, line_chart, round_most
 from mcaptrack.viewing.comparing import tracker_name
-from mcaptrack.viewing.report import statistics
-from mcaptrack.viewing.report.charts import POINTS, Axis, Floats, Line, figure, line_chart, round_most
-from mcaptrack.viewing.report.formatting import NONE, clock, number, plain, short
-from mcaptrack.viewing.report.headline import AFTER, BEFORE, BeforeAfter, compared
-from mcaptrack.viewing.report.identity_events import (
-    ChannelEvents,
-    Doubt,
-    DoubtfulTrack,
-    IdentityEvent,
-    add_thumbnails,
-    find_doubtful_tracks,
-    find_doubts,
-    most_important,
-    summarize_events,
-)
-from mcaptrack.viewing.report.scene_map import SceneBackground, background_picture, forecast_map, moment_picture
+from mcaptrack.viewing.formatting import NONE, clock, number, plain, short
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {

@@ -20,7 +20,7 @@ from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import frame_times, join_frames
 from mcaptrack.transforms import Predict
-from mcaptrack.viewing.report.charts import round_step, thinned
+from mcaptrack.viewing.charts import round_step, thinned
 
 #: Steps longer than this many frame intervals are gaps, over which the speed is not known.
 _HOLE: Final = 1.5

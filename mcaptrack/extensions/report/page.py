@@ -23,17 +23,18 @@ from mcaptrack import SCHEMA_VERSION, __version__, foxglove
 from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow, combined, metrics, set_means
 from mcaptrack.evaluation.people import Intervals, intervals
+from mcaptrack.extensions.report import figures, sections
+from mcaptrack.extensions.report.contents import LogReport, gather
+from mcaptrack.extensions.report.figures import identity_timeline, people_over_time
+from mcaptrack.extensions.report.fleet import fleet_data, fleet_page
+from mcaptrack.extensions.report.headline import BEFORE, BeforeAfter, rule_text
 from mcaptrack.foxglove.palette import COUNT as COLOURS
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.viewing.report import figures, sections
-from mcaptrack.viewing.report.charts import Axis, figure, pairs_chart, ranges_chart, round_most
-from mcaptrack.viewing.report.contents import LogReport, gather
-from mcaptrack.viewing.report.figures import identity_timeline, people_over_time
-from mcaptrack.viewing.report.fleet import fleet_data, fleet_page
-from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, render, short, times
-from mcaptrack.viewing.report.headline import BEFORE, BeforeAfter, rule_text
+from mcaptrack.viewing.charts import Axis, figure, pairs_chart, ranges_chart, round_most
+from mcaptrack.viewing.formatting import NONE, counted, number, percent, policy, render, short, times
+from mcaptrack.viewing.serving import LogPage
 
-__all__ = ["ELEMENT", "LogReport", "data", "draw", "fleet_data", "fleet_page", "gather", "page"]
+__all__ = ["ELEMENT", "LogReport", "data", "draw", "fleet_data", "fleet_page", "gather", "page", "view_page"]
 
 #: The id of the element that holds the numbers.
 ELEMENT: Final = "mcaptrack-report"
@@ -236,6 +237,7 @@ def draw(report: LogReport, at: int, total: int) -> None:
     """Render the part of the page on one log, number ``at`` of ``total``, and release its tracks and pictures."""
     report.html = render(
         "log.html",
+        __package__ or "",
         number=at,
         level=2 if total == 1 else 3,
         identities=identity_timeline(report),
@@ -266,6 +268,7 @@ def page(reports: Sequence[LogReport]) -> str:
             draw(report, k, len(reports))
     return render(
         "page.html",
+        __package__ or "",
         version=__version__,
         element=ELEMENT,
         title=reports[0].name if len(reports) == 1 else counted(len(reports), "log"),
@@ -339,3 +342,8 @@ def _comparison_row(file: str, scores: BeforeAfter | None, sure: Intervals | Non
             for key, is_share in _COMPARED.items()
         ],
     }
+
+
+def view_page() -> LogPage:
+    """The page as `mcaptrack view` shows it."""
+    return LogPage(lambda opened: page([gather(opened, None)]).encode(), policy("report.js", package=__package__ or ""))

@@ -6,57 +6,34 @@ widget needs both, and is blank there.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from mcaptrack import log as logs
-from mcaptrack import pipeline, tables
+from mcaptrack import pipeline
 from mcaptrack.api.common import as_path, warn_unused, warnings_about
 from mcaptrack.api.declared import checked
-from mcaptrack.api.options import PathLike, Progress
+from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.notebook.page import Still, player_html, player_page, still_html
+from mcaptrack.extensions.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
 from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.foxglove.views import SCENE_SUFFIX
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
+from mcaptrack.viewing.formatting import policy
 from mcaptrack.viewing.links import find_moments, opening_moment
-from mcaptrack.viewing.notebook.page import (
-    FIRST,
-    LAST,
-    ShownColumn,
-    Still,
-    player_html,
-    player_page,
-    still_html,
-    table_html,
-)
-from mcaptrack.viewing.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
+from mcaptrack.viewing.serving import AS_MANY_AS_FIT, Choice, LogPage
 
-if TYPE_CHECKING:
-    import pyarrow as pa
-
-#: The module and name of the class of Arrow tables.
-_ARROW: Final = ("pyarrow.lib", "Table")
 _MB: Final = 1e6
+#: The largest size of a player of `mcaptrack view` in megabytes: it is opened from this machine.
+_PAGE_MB: Final = 16.0
 #: The part of the largest size that is planned for, because sizes are estimated.
 _PLANNED: Final = 0.92
-
-
-class Choice(NamedTuple):
-    """Which pictures: from ``start_s`` to ``end_s`` (None: the end) every ``every``-th (None: as many as fit).
-
-    ``width_px`` is their width in pixels; None stands for a usual one.
-    """
-
-    start_s: float = 0.0
-    end_s: float | None = None
-    every: int | None = None
-    width_px: int | None = None
 
 
 @dataclass(frozen=True)
@@ -161,76 +138,44 @@ class Player:
         return {"text/html": self.html, "image/jpeg": self.still, "text/plain": repr(self)}
 
 
-def show_tables() -> None:
-    """Let the running notebook show tables of logs with their units, unless it has its own way to show Arrow tables."""
-    jupyter = sys.modules.get("IPython")
-    shell = jupyter.get_ipython() if jupyter is not None else None
-    if shell is None:
-        return
-    html = shell.display_formatter.formatters["text/html"]
-    if _ARROW not in html.deferred_printers and not any(_name_of(printer) == _ARROW for printer in html.type_printers):
-        html.for_type_by_name(*_ARROW, arrow_html)
+class LogPlayer:
+    """Makes players: for ``Recording.show``, and for `mcaptrack view`."""
 
+    def show(
+        self,
+        opened: logs.Log,
+        at_s: float | None = None,
+        *,
+        topics: Sequence[str] = (),
+        camera: str | None = None,
+        choice: Choice = AS_MANY_AS_FIT,
+        max_mb: float,
+        progress: Progress = no_progress,
+        all_tracks: bool = False,
+    ) -> Player:
+        """Return a player, or a still of a time, of an open log. See ``Recording.show``.
 
-def _name_of(cls: type) -> tuple[str, str]:
-    return cls.__module__, cls.__qualname__
+        With ``all_tracks``, those that aren't shown at first are in the player, too.
+        """
+        with warnings_about(opened.path) as warnings, pipeline.with_views(opened) as (complete, _):
+            source = PictureSource(complete, pipeline.find_camera(opened, camera), topics, all_tracks)
+            if at_s is None:
+                shown = _player(complete, source, choice, max_mb, progress)
+            else:
+                unused = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
+                warn_unused("a still is one picture", **unused)
+                shown = _still(complete, source, source.number_at(at_s), choice.width_px)
+        return replace(shown, warnings=tuple(dict.fromkeys(warnings)))
 
+    def page(self, camera: str, is_above: bool) -> LogPage:
+        """Return the page of `mcaptrack view` with a player of a camera, or of its ground seen from above."""
 
-def arrow_html(table: pa.Table) -> str | None:
-    """Return a table of a log as HTML; None for tables of others, which are shown as always.
+        def make(opened: logs.Log) -> bytes:
+            with pipeline.with_views(opened) as (complete, _):
+                topics = pipeline.views_from_above(complete, camera) if is_above else ()
+            return self.show(opened, topics=topics, camera=camera, max_mb=_PAGE_MB, all_tracks=True).page.encode()
 
-    Examples
-    --------
-    >>> import pyarrow
-    >>> arrow_html(pyarrow.table({"a": [1]})) is None
-    True
-    """
-    import pyarrow as pa
-
-    about = [{key.decode(): text.decode() for key, text in (field.metadata or {}).items()} for field in table.schema]
-    if not any("unit" in metadata and "description" in metadata for metadata in about):
-        return None
-    rows = table.num_rows
-    is_whole = rows <= FIRST + LAST
-    numbers, texts = tables.cells(table, rows if is_whole else FIRST)
-    texts += [] if is_whole else tables.cells(table.slice(rows - LAST), LAST)[1]
-    units = [  # dates and seconds have theirs in the text
-        "" if pa.types.is_timestamp(kind) else metadata.get("unit", "")
-        for kind, metadata in zip(table.schema.types, about, strict=True)
-    ]
-    columns = [
-        ShownColumn(name, unit, metadata.get("description", ""), is_number, [line[place] for line in texts])
-        for place, (name, unit, metadata, is_number) in enumerate(
-            zip(table.column_names, units, about, numbers, strict=True)
-        )
-    ]
-    return table_html(columns, rows)
-
-
-def show_log(
-    opened: logs.Log,
-    at_s: float | None,
-    *,
-    topics: Sequence[str],
-    camera: str | None,
-    choice: Choice,
-    max_mb: float,
-    progress: Progress,
-    all_tracks: bool = False,
-) -> Player:
-    """Return a player, or a still of a time, of an open log. See ``Recording.show``.
-
-    With ``all_tracks``, those that aren't shown at first are in the player, too.
-    """
-    with warnings_about(opened.path) as warnings, pipeline.with_views(opened) as (complete, _):
-        source = PictureSource(complete, pipeline.find_camera(opened, camera), topics, all_tracks)
-        if at_s is None:
-            shown = _player(complete, source, choice, max_mb, progress)
-        else:
-            unused = {"start_s": choice.start_s > 0, "end_s": choice.end_s is not None, "every": bool(choice.every)}
-            warn_unused("a still is one picture", **unused)
-            shown = _still(complete, source, source.number_at(at_s), choice.width_px)
-    return replace(shown, warnings=tuple(dict.fromkeys(warnings)))
+        return LogPage(make, policy("player.js", package=__package__ or ""))
 
 
 def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int | None) -> Player:

@@ -12,13 +12,11 @@ from base64 import b64encode
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
-from markupsafe import Markup
-
+from mcaptrack.extensions.notebook.pictures import Clip
 from mcaptrack.foxglove.views import SUFFIXES
 from mcaptrack.transforms import FULL
+from mcaptrack.viewing.formatting import render
 from mcaptrack.viewing.legend import BACKGROUND
-from mcaptrack.viewing.notebook.pictures import Clip
-from mcaptrack.viewing.report.formatting import render
 
 #: The least width of a player in pixels: there is room for what it is controlled with.
 _LEAST_PX: Final = 420
@@ -33,13 +31,13 @@ class Still(NamedTuple):
 
 def still_html(jpeg: bytes, width_px: int, caption: str) -> str:
     """Return a picture with a caption."""
-    return str(render("in_notebook.html", width=width_px, jpeg=jpeg, caption=caption, page=""))
+    return str(render("in_notebook.html", __package__ or "", width=width_px, jpeg=jpeg, caption=caption, page=""))
 
 
 def player_html(page: str, still: Still, caption: str) -> str:
     """Return a player in a frame, for a notebook, with the still below it."""
     width = max(still.width_px, _LEAST_PX)
-    return str(render("in_notebook.html", width=width, jpeg=still.jpeg, caption=caption, page=page))
+    return str(render("in_notebook.html", __package__ or "", width=width, jpeg=still.jpeg, caption=caption, page=page))
 
 
 def player_page(
@@ -64,7 +62,9 @@ def player_page(
         "ground": "#" + bytes(BACKGROUND[::-1]).hex(),
     }
     pictures = " ".join(_base64(jpeg) for jpeg in taken.jpegs)
-    return str(render("player.html", caption=caption, pictures=pictures, data=_base64(_packed(data))))
+    return str(
+        render("player.html", __package__ or "", caption=caption, pictures=pictures, data=_base64(_packed(data)))
+    )
 
 
 def _tracks_of(layer: str) -> str:
@@ -87,45 +87,3 @@ def _packed(data: Any) -> bytes:
 
 def _base64(data: bytes) -> str:
     return b64encode(data).decode()
-
-
-def framed_html(page: str | None, caption: str) -> str:
-    """Return a page in a frame, without an origin, with a caption; the caption alone without a page."""
-    return str(render("framed.html", page=page or "", caption=caption))
-
-
-# Tables for notebooks: the first and the last rows, with units and the number of rows.
-
-
-#: The number of rows that are shown at the beginning and at the end.
-FIRST: Final = 8
-LAST: Final = 2
-#: The longest text in a cell.
-_LONGEST: Final = 60
-
-
-class ShownColumn(NamedTuple):
-    """A column of a table: its name, unit ("" if it has none) and meaning; whether it holds numbers; and its texts in
-    the rows that are shown, None where a value is missing.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    is_number: bool
-    texts: Sequence[str | None]
-
-
-def table_html(columns: Sequence[ShownColumn], rows: int) -> Markup:
-    """Return a table of some rows as HTML. ``columns`` hold all rows, or the first and the last ones of more."""
-    shown = len(columns[0].texts) if columns else 0
-    lines = [[_short(column.texts[row]) for column in columns] for row in range(shown)]
-    gap = FIRST if shown < rows else -1
-    caption = f"{rows:,} rows, {len(columns)} columns"
-    if shown < rows:
-        caption += f"; the first {FIRST} and the last {LAST} rows are shown"
-    return render("table.html", columns=columns, lines=lines, gap=gap, caption=caption)
-
-
-def _short(text: str | None) -> str | None:
-    return text if text is None or len(text) <= _LONGEST else text[: _LONGEST - 1] + "\N{HORIZONTAL ELLIPSIS}"

@@ -13,11 +13,13 @@ import pytest
 import mcaptrack
 from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.report import fleet
+from mcaptrack.extensions.report.page import ELEMENT, fleet_data, fleet_page
 from mcaptrack.tables import catalogue
-from mcaptrack.viewing.report import ELEMENT, fleet, fleet_data, fleet_page
 from tests.commands import call, done
+from tests.extensions.report.test_report import _ELEMENTS, _NASTY
 from tests.logs import some_log
-from tests.test_report import _ELEMENTS, _NASTY, Reader
+from tests.reader import Reader
 
 #: 2026-11-01, midnight.
 FIRST_S = 1_793_491_200

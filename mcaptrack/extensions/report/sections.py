@@ -12,10 +12,10 @@ from mcaptrack.errors import command
 from mcaptrack.evaluation import EvaluationRow
 from mcaptrack.evaluation.metrics import summary
 from mcaptrack.evaluation.metrics.displacement import LEVELS
-from mcaptrack.viewing.report.charts import Axis, Bars, Line, figure, histogram_chart, line_chart, round_most
-from mcaptrack.viewing.report.contents import LogReport
-from mcaptrack.viewing.report.formatting import counted, number, percent, short
-from mcaptrack.viewing.report.headline import result_of, rule_text, rules_text
+from mcaptrack.extensions.report.contents import LogReport
+from mcaptrack.extensions.report.headline import result_of, rule_text, rules_text
+from mcaptrack.viewing.charts import Axis, Bars, Line, figure, histogram_chart, line_chart, round_most
+from mcaptrack.viewing.formatting import counted, number, percent, short
 
 #: The columns of the table of scores: whether a column is a share, and whether its lowest value is the best.
 _SCORES: Final = {"IDF1": True, "MOTA": True, "HOTA": True, "IDSW": False, "Frag": False, "FP": False, "FN": False}

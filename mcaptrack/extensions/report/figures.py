@@ -11,18 +11,10 @@ import numpy as np
 
 from mcaptrack.errors import command
 from mcaptrack.evaluation.people import PersonScores
-from mcaptrack.foxglove.palette import COUNT as COLOURS
-from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ragged import run_starts
-from mcaptrack.schema import EventKind, Frame
-from mcaptrack.schema.framing import frame_times, row_ends
-from mcaptrack.viewing.report.charts import POINTS, Axis, Line, figure, round_most, timeline_chart
-from mcaptrack.viewing.report.contents import LogReport, TrackSet, plane_of
-from mcaptrack.viewing.report.formatting import clock, counted, number, short, tick_marks
-from mcaptrack.viewing.report.headline import rule_text
-from mcaptrack.viewing.report.identity_events import BARS, SIDE_PX, ChannelEvents, IdentityEvent, Thumbnail
-from mcaptrack.viewing.report.scene_map import (
+from mcaptrack.extensions.report.contents import LogReport, TrackSet, plane_of
+from mcaptrack.extensions.report.headline import rule_text
+from mcaptrack.extensions.report.identity_events import BARS, SIDE_PX, ChannelEvents, IdentityEvent, Thumbnail
+from mcaptrack.extensions.report.scene_map import (
     TrackPath,
     ground_map,
     ground_paths,
@@ -31,7 +23,15 @@ from mcaptrack.viewing.report.scene_map import (
     picture_map,
     pixel_paths,
 )
-from mcaptrack.viewing.report.statistics import rows_by_track
+from mcaptrack.extensions.report.statistics import rows_by_track
+from mcaptrack.foxglove.palette import COUNT as COLOURS
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.ragged import run_starts
+from mcaptrack.schema import EventKind, Frame
+from mcaptrack.schema.framing import frame_times, row_ends
+from mcaptrack.viewing.charts import POINTS, Axis, Line, figure, round_most, timeline_chart
+from mcaptrack.viewing.formatting import clock, counted, number, short, tick_marks
 
 #: The time in the text of an event.
 _WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")

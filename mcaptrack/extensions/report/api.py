@@ -16,6 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, place_of, publish_bytes, refuse_overwrite
 from mcaptrack.location import Location, distinct_names, local_name, parse
 from mcaptrack.notices import Notice, collected
+from mcaptrack.viewing.formatting import render
 
 #: The largest page in bytes that notebooks show and keep.
 _MOST_INLINE: Final = 8_000_000
@@ -48,18 +49,21 @@ class ReportResult:
 
     def _repr_html_(self) -> str:
         """The page in a frame, for notebooks, as long as the file is there and not too large to be kept in one."""
-        from mcaptrack.viewing.notebook.page import framed_html
-
         caption = f"{self.page} ({self.size / 1e6:.1f} MB)"
         try:
             size = self.page.stat().st_size
             page = self.page.read_text(encoding="utf-8") if size <= _MOST_INLINE else None
         except OSError as error:
-            return framed_html(None, f"{caption} can't be read: {error.strerror}")
-        return framed_html(page, caption if page is not None else f"{caption} is too large to show here; open the file")
+            return _framed(None, f"{caption} can't be read: {error.strerror}")
+        return _framed(page, caption if page is not None else f"{caption} is too large to show here; open the file")
 
 
-@declared()
+def _framed(page: str | None, caption: str) -> str:
+    """Return a page in a frame, without an origin, with a caption; the caption alone without a page."""
+    return str(render("framed.html", __package__ or "", page=page or "", caption=caption))
+
+
+@declared(heading="Start here", printed_by="mcaptrack.extensions.report.command:ReportCommand")
 def report(
     log: Annotated[PathLike | Sequence[PathLike], Argument("logs", "LOG", LOGS)],
     output: Annotated[PathLike | None, output()] = None,
@@ -147,7 +151,7 @@ def _page_of(logs_: Sequence[Location], output: Path | None) -> Path:
 def _about_logs(paths: Sequence[Location], camera: str | None, progress: Progress) -> tuple[str, dict[str, Any]]:
     """Return the page about logs, and its numbers."""
     from mcaptrack import log as logs
-    from mcaptrack.viewing import report as pages
+    from mcaptrack.extensions.report import page as pages
 
     real = [place_of(path) for path in paths]
     files, names = (distinct_names(some, real) for some in ([p.name for p in paths], [p.stem for p in paths]))
@@ -163,8 +167,8 @@ def _about_logs(paths: Sequence[Location], camera: str | None, progress: Progres
 
 def _about_tables(where: Path, folder: Path) -> tuple[str, dict[str, Any]]:
     """Return the page about all logs in a folder of tables, and its numbers; it links to pages from ``folder``."""
+    from mcaptrack.extensions.report import page as pages
     from mcaptrack.tables.catalogue import read_catalogue
-    from mcaptrack.viewing import report as pages
 
     rows = read_catalogue(where)
     data = pages.fleet_data(rows)

@@ -1,5 +1,6 @@
 "use strict";
 const by = id => document.getElementById(id), data = JSON.parse(by("data").textContent);
+const pages = new Map(Object.entries(data.pages).map(([name, address]) => ["page-" + name, address])); // by section
 const frames = []; // the player of each view, once it was opened
 let view = -1, at_s = data.at_s, wanted = {at_s};
 
@@ -11,8 +12,8 @@ function frame(address, title) {
 }
 function open(tab) {
   for (const button of document.querySelectorAll("[role=tab]")) button.setAttribute("aria-selected", button.getAttribute("aria-controls") === tab);
-  for (const name of ["player", "report", "tables"]) by(name).hidden = name !== tab;
-  if (tab !== "player" && !by(tab).firstChild) by(tab).append(frame(data[tab], tab));
+  for (const name of ["player", ...pages.keys()]) by(name).hidden = name !== tab;
+  if (tab !== "player" && !by(tab).firstChild) by(tab).append(frame(pages.get(tab), tab.slice(5)));
 }
 function look(number) { // show a view; it begins at the time that the one before showed
   const before = frames[view];
@@ -35,11 +36,11 @@ function go(second, tracks) {
   open("player");
   ask(view);
 }
-addEventListener("message", event => { // a player says which time it shows, a report which time was clicked
+addEventListener("message", event => { // a player says which time it shows, a page which time was clicked
   if (frames[view] && event.source === frames[view].contentWindow && typeof event.data?.player?.at_s === "number") {
     at_s = event.data.player.at_s;
     highlight(); link();
-  } else if (event.source === by("report").firstChild?.contentWindow && typeof event.data?.at_ns === "string" && /^-?\d{1,19}$/.test(event.data.at_ns))
+  } else if ([...pages.keys()].some(name => event.source === by(name).firstChild?.contentWindow) && typeof event.data?.at_ns === "string" && /^-?\d{1,19}$/.test(event.data.at_ns))
     go(Number(BigInt(event.data.at_ns) - BigInt(data.start_ns)) / 1e9);
 });
 function link() { // other viewers open the log at the time that is shown, from the address of this page

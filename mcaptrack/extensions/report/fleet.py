@@ -12,8 +12,8 @@ import numpy as np
 from mcaptrack import SCHEMA_VERSION, __version__
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.viewing.report.charts import Axis, Line, figure, line_chart, round_most
-from mcaptrack.viewing.report.formatting import NONE, counted, number, percent, plain, render
+from mcaptrack.viewing.charts import Axis, Line, figure, line_chart, round_most
+from mcaptrack.viewing.formatting import NONE, counted, number, percent, plain, render
 
 #: The columns of a log in the data of the page.
 _KEPT: Final = (
@@ -261,6 +261,7 @@ def fleet_page(rows: Sequence[Row], title: str, element: str, data: Mapping[str,
     ]
     return render(
         "fleet.html",
+        __package__ or "",
         version=__version__,
         element=element,
         title=title,

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from mcaptrack.evaluation.event_text import describe, nouns_of
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.evaluation.people import PersonScores
+from mcaptrack.extensions.report.statistics import frame_interval_s, rows_by_track
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.schema import EVENT_KINDS, DecisionKind, EventKind, Frame, Rows
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
-from mcaptrack.viewing.report.formatting import number, percent
-from mcaptrack.viewing.report.statistics import frame_interval_s, rows_by_track
+from mcaptrack.viewing.formatting import number, percent
 
 #: The side of thumbnails, which are squares, and the part of the picture they show, in heights of a person.
 SIDE_PX: Final = 168

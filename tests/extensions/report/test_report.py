@@ -7,7 +7,6 @@ import hashlib
 import itertools
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
@@ -17,55 +16,35 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jinja2 import UndefinedError
 
+import mcaptrack
 from mcaptrack import foxglove, log
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.events import MatchRule, find_events
 from mcaptrack.evaluation.people import Interval, Intervals
+from mcaptrack.extensions.report import statistics
+from mcaptrack.extensions.report.headline import rules_text
+from mcaptrack.extensions.report.identity_events import SIDE_PX, add_thumbnails, most_important, summarize_events
+from mcaptrack.extensions.report.page import ELEMENT, change_text, data, gather, page, verdict
+from mcaptrack.extensions.report.scene_map import (
+    SceneBackground,
+    TrackPath,
+    ground_map,
+    heat_map,
+    picture_map,
+    simplified,
+)
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
-from mcaptrack.viewing.report import ELEMENT, change_text, charts, data, gather, page, statistics, verdict
-from mcaptrack.viewing.report.charts import Axis, Bars, Line
-from mcaptrack.viewing.report.formatting import environment, plain
-from mcaptrack.viewing.report.headline import rules_text
-from mcaptrack.viewing.report.identity_events import SIDE_PX, add_thumbnails, most_important, summarize_events
-from mcaptrack.viewing.report.scene_map import SceneBackground, TrackPath, ground_map, heat_map, picture_map, simplified
+from mcaptrack.viewing import charts
+from mcaptrack.viewing.charts import Axis, Bars, Line
+from mcaptrack.viewing.formatting import environment, plain
 from tests.commands import call, done, printed
 from tests.logs import add_rows, write_channels
+from tests.reader import Reader
 from tests.worlds import ns, tracks_at, walk
 
-
-class Reader(HTMLParser):
-    """What a browser would make of a page: elements with attributes, text, and what stands in scripts."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.elements: list[tuple[str, dict[str, str | None]]] = []
-        self.text: list[str] = []
-        self.open: list[str] = []
-        self.scripts: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append((tag, dict(attrs)))
-        if tag not in ("meta", "link", "br", "img", "input", "wbr"):
-            self.open.append(tag)
-        if tag == "script":
-            self.scripts.append("")
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        inside = self.open[-1] if self.open else ""
-        if inside == "script":
-            self.scripts[-1] += data
-        elif inside != "style":
-            self.text.append(data)
-
-    def of(self, name):
-        return [attributes for element, attributes in self.elements if element == name]
+PACKAGE = "mcaptrack.extensions.report"
 
 
 def report_on(*paths: Path) -> tuple[str, dict, Reader]:
@@ -431,7 +410,7 @@ def test_a_page_on_a_whole_log_loads_and_runs_nothing(fresh):
 
 
 def rendered(source: str, **values) -> str:
-    return environment().from_string(source).render(values)
+    return environment(PACKAGE).from_string(source).render(values)
 
 
 @given(st.text() | st.text(alphabet="<>&\"'/!-=script javasonloadx\u202e\0\n"))
@@ -461,10 +440,12 @@ def test_missing_values_are_errors_not_text():
             rendered(source, values={"none": None})
 
 
-@pytest.mark.parametrize("name", sorted(name for name in environment().list_templates() if name.endswith(".html")))
+@pytest.mark.parametrize(
+    "name", sorted(name for name in environment(PACKAGE).list_templates() if name.endswith(".html"))
+)
 def test_templates_print_in_text_and_quoted_attributes_only(name):
     """Whatever a log holds: no value stands in a link, a style or a handler, or gets past the escaping."""
-    source = environment().loader.get_source(environment(), name)[0]
+    source = environment(PACKAGE).loader.get_source(environment(PACKAGE), name)[0]
     assert not re.search(r"\|\s*safe|autoescape|Markup|xmlattr", source)
     assert not re.search(r"=\s*\{\{|\son\w+=", source), "a value outside of quotes, or a handler"
     # A notebook has no sheet of styles: what stands there has its own, with no value but a number or a side.
@@ -654,3 +635,8 @@ def test_rules_that_differ_in_their_limit_are_said_together():
     rules = [("iou", 0.5), ("metres", 0.5), ("metres", 1.0), ("metres", 2.0)]
     assert rules_text(rules) == "by overlap of boxes of at least 0.5; within 0.5, 1 or 2 m on the ground"
     assert rules_text([]) == ""
+
+
+def test_a_result_is_shown_in_a_line():
+    page = mcaptrack.ReportResult(Path("page.html"), 12, {"many": [0] * 1000}, ())
+    assert repr(page) == f"ReportResult({str(page.page)!r}, 12 bytes)"

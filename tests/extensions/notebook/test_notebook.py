@@ -22,7 +22,7 @@ import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.viewing.links import LinkedEvent
 from tests.commands import done
-from tests.test_report import Reader
+from tests.reader import Reader
 
 CLOSED, PAIRS = 0, 2
 
@@ -122,15 +122,17 @@ class TestPlayer:
             LinkedEvent(k, start_ns + round(s * 1e9), f"/camera/{name}", "joined", f"{name} {s}")
             for k, (name, s) in enumerate(at)
         ]
-        monkeypatch.setattr("mcaptrack.api.notebook.find_moments", lambda _: moments)
-        monkeypatch.setattr("mcaptrack.api.notebook.opening_moment", lambda *_: (start_ns + 2_960_000_000, ""))
+        monkeypatch.setattr("mcaptrack.extensions.notebook.api.find_moments", lambda _: moments)
+        monkeypatch.setattr(
+            "mcaptrack.extensions.notebook.api.opening_moment", lambda *_: (start_ns + 2_960_000_000, "")
+        )
         with mcaptrack.open(finished) as log:
             data = shown(log.show(start_s=2.0, end_s=4.0, width=64)).data
         assert data["events"] == [[3.0, "retracks 3.0", data["layers"].index("/camera/retracks/full/view/image")]]
         assert data["seconds"][data["open"]] == 2.9
 
     def test_pictures_are_left_out_evenly_where_their_size_was_estimated_too_small(self, finished, monkeypatch):
-        monkeypatch.setattr("mcaptrack.viewing.notebook.pictures.PictureSource.step", lambda *_: 1)
+        monkeypatch.setattr("mcaptrack.extensions.notebook.pictures.PictureSource.step", lambda *_: 1)
         with mcaptrack.open(finished) as log:
             small = log.show(max_mb=0.2)
         data = shown(small).data
@@ -363,7 +365,7 @@ def test_the_result_of_a_run_is_a_line_in_a_notebook(finished, tmp_path):
 def test_the_strokes_of_any_annotations_can_be_written_as_json():
     from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 
-    from mcaptrack.viewing.notebook.pictures import Strokes
+    from mcaptrack.extensions.notebook.pictures import Strokes
 
     black, clear = {"a": 1.0}, {"a": 0.0}
     message = json_format.ParseDict(

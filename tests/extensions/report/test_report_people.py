@@ -15,11 +15,11 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.evaluation.people import LEAST_PEOPLE, PersonScores, intervals, person_scores
+from mcaptrack.extensions.report.figures import counts_over_time, identity_timeline, mean_numbers, pieces
+from mcaptrack.extensions.report.identity_events import find_doubts, summarize_events
+from mcaptrack.extensions.report.page import LogReport, gather, page
 from mcaptrack.schema import Frame
-from mcaptrack.viewing.report import LogReport, gather, page
-from mcaptrack.viewing.report.charts import Line
-from mcaptrack.viewing.report.figures import counts_over_time, identity_timeline, mean_numbers, pieces
-from mcaptrack.viewing.report.identity_events import find_doubts, summarize_events
+from mcaptrack.viewing.charts import Line
 from tests.worlds import crossing_tracks, ns, tracks_at, write_eventful
 
 

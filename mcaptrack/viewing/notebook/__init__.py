@@ -1,1 +1,0 @@
-"""Players, stills, tables and pages for notebooks, as HTML that needs no other file."""
