@@ -61,7 +61,8 @@ def takes_corrections(stage: str) -> bool:
 def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     """Whether what people corrected, or answered about tracks, is new, or was changed or is gone, since then."""
     answers = f"{camera_at(opened, prefix).prefix}/{ANSWERS}"
-    if provenance.transform == "retrack" and "transform" not in provenance.plugins:
+    is_retracked = provenance.transform in STAGES and STAGES[provenance.transform].kind == "retracker"
+    if is_retracked and "transform" not in provenance.plugins:
         return (answers in opened.channels) != (answers in provenance.references)
     if not takes_corrections(provenance.transform):
         return False

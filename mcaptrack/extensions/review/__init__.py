@@ -1,1 +1,1 @@
-"""A second look: the questions about identities whose answers would change most, to a person or to a judge."""
+"""Ask a person or a judge about the identities that re-tracking is least sure of, and obey the answers."""

@@ -42,7 +42,7 @@ _MOST_LOG_ODDS: Final = 10.0
 
 @dataclass(frozen=True)
 class ReviewResult:
-    """What answers changed.
+    """The changes that answers made.
 
     Attributes
     ----------

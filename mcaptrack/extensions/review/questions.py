@@ -1,4 +1,4 @@
-"""The questions about identities whose answers would change most, and what becomes of their answers.
+"""The questions about identities with the largest expected change, and the rows of their answers.
 
 What is not sure is what differs between worlds: re-tracking decided again with noise (``retrack --worlds``). A question
 is worth the probability that its answer is another one than was decided, times the rows that would change.
@@ -57,7 +57,7 @@ class Question:
 
     @property
     def key(self) -> tuple[int, int, int, int]:
-        """What it is about: the same question has the same key, also after other answers."""
+        """The samples that it is about: the same question has the same key, also after other answers."""
         after = self.after or Tracklet(-1, -1, -1)
         return self.before.source_id, self.before.end_ns, after.source_id, after.begin_ns
 
@@ -77,7 +77,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Solved:
-    """What re-tracking makes of samples: tracks, decisions and worlds of a camera."""
+    """The samples of a camera, and the tracks, decisions and worlds that re-tracking makes of them."""
 
     samples: Sequence[Frame]
     tracks: Sequence[Frame]
@@ -198,7 +198,7 @@ def _of_people(track: Ints, decided: Ints, tracklets: Sequence[Tracklet], frames
 
 
 def keys_of(t_ns: int, rows: Rows) -> list[tuple[int, int, int, int]]:
-    """What each answer of rows at a time is about, as ``Question.key``."""
+    """The keys of the questions that rows of answers at a time are about (``Question.key``)."""
     gap_ns = np.round(rows["duration_s"] * NS_PER_S).astype(np.int64)
     return [
         (int(row["previous_id"]), t_ns - int(gap), int(row["source_id"]), t_ns)

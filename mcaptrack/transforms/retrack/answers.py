@@ -72,12 +72,12 @@ class Answers(NamedTuple):
 
     def weighed(self, hypotheses: Hypotheses, tracks: Tracks, evidence: Floats, is_final: bool) -> Floats:
         """``evidence`` (E,) of links, or what was answered in its place; certain answers only if tracks are final."""
-        link, nobody = self._links(hypotheses, tracks)
+        link, clutter = self._links(hypotheses, tracks)
         evidence = evidence.copy()
         those = (link >= 0) & (is_final | ~self.is_certain)
         evidence[link[those]] = self.log_odds[those]
         if is_final:
-            evidence[nobody] = -CERTAIN
+            evidence[clutter] = -CERTAIN
         return evidence
 
     def _links(self, hypotheses: Hypotheses, tracks: Tracks) -> tuple[Ints, Bools]:
@@ -86,8 +86,8 @@ class Answers(NamedTuple):
         rows = self.find(tracks)
         of, here = tracklets.of[rows], rows[:, 0] >= 0
         link = find_rows((before, after), (of[:, 0], of[:, 1]))
-        nobody = of[here & ~self.is_join & (self.log_odds <= -CERTAIN), 0]
-        is_with = np.isin(before, nobody) | np.isin(after, nobody)
+        clutter = of[here & ~self.is_join & (self.log_odds <= -CERTAIN), 0]
+        is_with = np.isin(before, clutter) | np.isin(after, clutter)
         return np.where(here & self.is_join, link, -1), is_with
 
     def persons(self, tracks: Tracks, yes: bool) -> Ints:
@@ -107,10 +107,10 @@ class Answers(NamedTuple):
         tracklets, before, after, *_ = hypotheses
         follows = following(tracks.track[tracklets.first], tracklets.begins)
         gain = favouring(np.flatnonzero(follows[before] == after), hypotheses, hypotheses.scored().gain(min_confidence))
-        link, nobody = self._links(hypotheses, tracks)
+        link, clutter = self._links(hypotheses, tracks)
         bound = (link >= 0) & self.is_certain
         gain[link[bound]] += 3 * self.log_odds[bound]
-        gain[nobody] = -CERTAIN
+        gain[clutter] = -CERTAIN
         root = chains(best_next(before, after, gain, len(tracklets.first)), tracklets.begins)
         return self._separated(
             tracks._replace(track=named(root, tracks.track[tracklets.first])[tracklets.of]), hypotheses, gain
@@ -141,9 +141,9 @@ class Answers(NamedTuple):
         lost += sum(len(pair) == 1 for pair in pieces.apart)
         if lost:
             warn(f"{lost} of {len(rows)} answers contradict others, and are left out", "left-out")
-        nobody = np.isin(tracklet[first], hypotheses.tracklets.of[rows[~is_join & ~yes, 1]])
+        clutter = np.isin(tracklet[first], hypotheses.tracklets.of[rows[~is_join & ~yes, 1]])
         track = tracks.track[order[first]]
-        beside = np.flatnonzero((track[1:] == track[:-1]) & ~(nobody[1:] | nobody[:-1]))
+        beside = np.flatnonzero((track[1:] == track[:-1]) & ~(clutter[1:] | clutter[:-1]))
         same = tracklet[first[beside]] == tracklet[first[beside + 1]]
         link = find_rows((hypotheses.before, hypotheses.after), (tracklet[first[beside]], tracklet[first[beside + 1]]))
         strength = np.where(same, np.inf, np.append(gain, 0.0)[link])

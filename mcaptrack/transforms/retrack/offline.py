@@ -502,7 +502,7 @@ def offline_tracks(
     ids, of = np.unique(tracks.track, return_inverse=True)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
     is_fixed |= np.isin(ids, answers.persons(tracks, yes=True))
-    is_nobody = np.isin(ids, answers.persons(tracks, yes=False)) & ~is_fixed
+    is_clutter = np.isin(ids, answers.persons(tracks, yes=False)) & ~is_fixed
     odds = np.full(len(ids), np.inf)
     if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
         _, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
@@ -516,8 +516,8 @@ def offline_tracks(
     least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
     is_short = _are_short(of_row, rows.is_sample, len(ids), round(least_s * options.rate_hz) + 1)
     odds = np.where(is_short, np.minimum(odds, _SHORT), odds)
-    odds = np.where(is_nobody, -CERTAIN, odds)
-    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short & ~is_nobody)
+    odds = np.where(is_clutter, -CERTAIN, odds)
+    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short & ~is_clutter)
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
     left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
