@@ -60,6 +60,9 @@ from mcaptrack.extensions.render.api import RenderResult as RenderResult
 from mcaptrack.extensions.render.api import render as render
 from mcaptrack.extensions.report.api import ReportResult as ReportResult
 from mcaptrack.extensions.report.api import report as report
+from mcaptrack.extensions.review.api import Review as Review
+from mcaptrack.extensions.review.api import ReviewResult as ReviewResult
+from mcaptrack.extensions.review.api import review as review
 from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
@@ -97,6 +100,8 @@ __all__ = [
     "Recording",
     "RenderResult",
     "ReportResult",
+    "Review",
+    "ReviewResult",
     "RunResult",
     "Scores",
     "TableInfo",
@@ -129,6 +134,7 @@ __all__ = [
     "render",
     "report",
     "retrack",
+    "review",
     "run",
     "sample",
     "schema_of",

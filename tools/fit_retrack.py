@@ -232,7 +232,7 @@ class Judged(NamedTuple):
 
 def choices_of(run: Run) -> Chosen:
     """What the ends and beginnings of tracklets should choose in a scene."""
-    model, tracks, max_gap_s, _ = reached("hypotheses_of", *run.args)
+    model, tracks, max_gap_s, *_ = reached("hypotheses_of", *run.args)
     tracklets, before, after, _, gap, terms, leaves, comes, _ = Hypotheses.of(model, tracks, max_gap_s)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
     same = np.flatnonzero((ends[before] >= 0) & (ends[before] == begins[after]))

@@ -15,7 +15,7 @@ from mcaptrack.notices import warn
 from mcaptrack.schema.provenance import FUSE, Provenance, digest
 from mcaptrack.sources.camera_motion import motion_topic, planes_in
 from mcaptrack.sources.cameras import camera_at, chain_of, is_plane, name_above, provenance_of
-from mcaptrack.sources.corrections import CORRECTED, corrections_of
+from mcaptrack.sources.corrections import ANSWERS, CORRECTED, corrections_of
 from mcaptrack.transforms import STAGES
 
 if TYPE_CHECKING:
@@ -59,7 +59,11 @@ def takes_corrections(stage: str) -> bool:
 
 
 def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
-    """Whether samples are out of date because corrections of their tracks are new, changed or gone."""
+    """Whether what people corrected, or answered about tracks, is new, or was changed or is gone, since then."""
+    answers = f"{camera_at(opened, prefix).prefix}/{ANSWERS}"
+    is_retracked = provenance.transform in STAGES and STAGES[provenance.transform].kind == "retracker"
+    if is_retracked and "transform" not in provenance.plugins:
+        return (answers in opened.channels) != (answers in provenance.references)
     if not takes_corrections(provenance.transform):
         return False
     ending = f"/{CORRECTED}"

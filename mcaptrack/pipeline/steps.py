@@ -19,6 +19,7 @@ from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
+from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.notices import Code, Notice, warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
@@ -28,13 +29,13 @@ from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_fo
 from mcaptrack.pipeline.scores import DOUBTFUL, score_map, score_range, without_doubtful
 from mcaptrack.pipeline.staleness import digest_of, takes_corrections
 from mcaptrack.pipeline.write import RunState
-from mcaptrack.schema import TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema import DECISIONS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.schema.framing import frame_times, row_ends
+from mcaptrack.schema.framing import frame_times, join_frames, row_ends
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.cameras import camera_at
-from mcaptrack.sources.corrections import corrections_of, fixed_ids, with_corrections, without_filled
+from mcaptrack.sources.corrections import ANSWERS, corrections_of, fixed_ids, with_corrections, without_filled
 from mcaptrack.sources.pictures import picture_size
 from mcaptrack.transforms import FULL, STAGES, Sample, Stage
 from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits
@@ -336,6 +337,29 @@ def _fixed_ids(work: Work) -> SideInput | None:
     return SideInput(fixed_ids(state.frames(how.input), state.opened.frame_columns(topic, TRACKS)))
 
 
+def _answers(work: Work) -> SideInput | None:
+    """Take answers about identities, without those about samples that aren't there."""
+    topic = f"{work.state.prefix}/{ANSWERS}"
+    answers = work._channel(topic, DECISIONS)
+    if answers is None:
+        return None
+    samples, asked = join_frames(TRACKS, work.seen), join_frames(DECISIONS, answers.value)
+    at = find_rows((samples.row_ns, samples.rows["track_id"]), (asked.row_ns, asked.rows["source_id"]))
+    is_there = at >= 0
+    rows = samples.rows[at[is_there]]
+    for place, side in (("x_px", "w_px"), ("y_px", "h_px")):  # ids of a tracker that was run again are others
+        off = np.abs(rows[place] + rows[side] / 2 - asked.rows[place][is_there])
+        is_there[is_there] &= ~(off > rows[side])
+        rows = samples.rows[at[is_there]]
+    if not is_there.all():
+        lost = np.count_nonzero(~is_there)
+        text = f"{lost} of {len(at)} answers in {topic} are about tracks that {work.job.source} doesn't have any more"
+        work.say(f"{text}, and are left out", "left-out")
+    kept = iter(is_there.tolist())
+    frames = [frame._replace(rows=frame.rows[[next(kept) for _ in frame.rows]]) for frame in answers.value]
+    return answers._replace(value=[frame for frame in frames if len(frame.rows)])
+
+
 def _sampled_tracks(work: Work) -> tuple[Sequence[Frame], Sequence[Frame] | None]:
     """The tracks of which the input has samples, in the reference picture, and corrections of them, if any."""
     state = work.state
@@ -367,6 +391,7 @@ CONTEXT: Final[Mapping[str, Callable[[Work], SideInput | None]]] = MappingProxyT
         "rate_hz": _rate_hz,
         "poor_scale": lambda work: SideInput(is_poor(work.source.frames)) if is_assumed(work.planes) else None,
         "fixed_ids": _fixed_ids,
+        "answers": _answers,
         "boxes": _boxes,
     }
 )

@@ -49,6 +49,7 @@ Kind = Literal[
     "label_format",
     "message_reader",
     "exporter",
+    "judge",
     "command",
     "page",
     "player",
@@ -153,6 +154,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             **dict.fromkeys(("rosbag2", "rosbag2-sqlite3"), "mcaptrack.tables.rosbag2:write_bag"),
             "mot": "mcaptrack.tables.box_files:MotFile",
         },
+        "judge": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         "page": {"tables": "mcaptrack.api.viewing:tables_page"},

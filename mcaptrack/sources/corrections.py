@@ -23,6 +23,8 @@ from mcaptrack.sources.cameras import camera_at
 
 #: The topic of corrections, below the name of their camera.
 CORRECTED: Final = "corrected"
+#: The topic of answers to questions about identities (rows of Decisions), below the name of their camera.
+ANSWERS: Final = "answers"
 #: The channels that people may have corrected, below the name of their camera, the likeliest first.
 CORRECTED_FROM: Final = ("retracks/full", "tracks")
 #: The topic of the tracks that they correct.

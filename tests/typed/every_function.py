@@ -49,9 +49,11 @@ def compute(log: str) -> mcaptrack.RunResult:
         mcaptrack.zones(log, zones={"type": "FeatureCollection", "features": []}, max_gap_s=1.0),
     ]
     best: mcaptrack.TuneResult = mcaptrack.tune([log], search={"min_iou": (0.1, 0.4)}, trials=2)
+    review: mcaptrack.Review = mcaptrack.review(log, questions=3)
+    changes: mcaptrack.ReviewResult = review.finish()
     weights: mcaptrack.TrainResult = mcaptrack.train(["tracks.parquet"], "weights.safetensors", epochs=1)
     steps.append(mcaptrack.track(log, output="tuned.mcap", **best.settings))
-    print(mcaptrack.draw_zones(log).name, weights)
+    print(mcaptrack.draw_zones(log).name, weights, changes.rows)
     whole: mcaptrack.RunResult = mcaptrack.run(log, tracker=ByteTrack(), class_limits=None, tables=True, progress=say)
     people = 0 if whole.summary is None else whole.summary.tracks
     said: tuple[mcaptrack.Notice, ...] = tuple(notice for step in (*steps, whole) for notice in step.warnings)

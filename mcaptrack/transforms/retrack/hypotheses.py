@@ -154,8 +154,13 @@ class Hypotheses(NamedTuple):
     evidence: Floats
 
     @classmethod
-    def of(cls, model: MotionModel, tracks: Tracks, max_gap_s: float) -> Hypotheses:
-        """The hypotheses about tracks as they are now, with the ``evidence`` of those that go on alone."""
+    def of(
+        cls, model: MotionModel, tracks: Tracks, max_gap_s: float, asked: tuple[Ints, Ints] | None = None
+    ) -> Hypotheses:
+        """The hypotheses about tracks as they are now, with the ``evidence`` of those that go on alone.
+
+        ``asked`` are assignments before and after that are of one person, however far apart.
+        """
         tracklets = Tracklets.in_tracks(tracks)
         tracked, beside = _tracked(model, tracks, tracklets)
         _, row, paths = to_trajectories(tracks.step, tracklets.of, tracks.xy_m)
@@ -172,6 +177,10 @@ class Hypotheses(NamedTuple):
         )
         follows = following(tracks.track[tracklets.first], tracklets.begins)
         before, after = _candidates(ends, follows, max_gap_s)
+        if asked is not None and len(asked[0]):
+            more = tracklets.of[np.stack(asked)]
+            more = more[:, tracklets.ends[more[0]] < tracklets.begins[more[1]]]
+            before, after = np.unique(np.concatenate([[before, after], more], axis=1), axis=1)
         gaps = ends.gaps(before, after)
         gap_s = gaps.seconds
         terms = np.column_stack(

@@ -5,7 +5,7 @@ Letters: C assignments (a track has a sample at a step), R rows, K tracks, N row
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from itertools import pairwise, repeat
 from typing import Any, Final, NamedTuple
 
@@ -24,6 +24,7 @@ from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, BodyPart, De
 from mcaptrack.schema.classes import first_classes, majority
 from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows, spans_of
 from mcaptrack.schema.resampling import ANGLES, LINEAR
+from mcaptrack.transforms.retrack.answers import CERTAIN, Answers
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers, Tracks
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
@@ -478,10 +479,17 @@ def offline_tracks(
         tracks = taken(tracks, np.unique(sample, return_index=True)[1])
     seen = Appearance.of(options.looks, tracks, model.step_s)
     appearance = seen if seen and seen.calibration.tells_apart else None
+    answers = Answers.of(options.answers, steps, times_ns)
+
+    def hypotheses_in(tracks: Tracks, is_final: bool = False) -> Hypotheses:
+        return hypotheses_of(model, tracks, options.link_s / movers.unit_m, appearance, answers, is_final)
+
     if options.link_s > 0 and len(tracks.step):
-        tracks = _linked(model, tracks, options.link_s / movers.unit_m, options.link_confidence, appearance)
+        tracks = _linked(hypotheses_in, tracks, options.link_confidence)
     if options.resolve_swaps and len(tracks.step) and not movers.on_ground:
         tracks = _without_swaps(model, tracks, appearance)
+    if len(tracks.step) and answers.is_certain.any():
+        tracks = answers.obeyed(tracks, hypotheses_in(tracks), options.link_confidence)
     tracks = fix_tracks(tracks, options.fixed_ids)
     tracks = taken(tracks, tracks.order)
     rows = TrackRows.of(tracks.step, tracks.track, tracks.sample)
@@ -489,6 +497,8 @@ def offline_tracks(
     moved_m: Floats | None = None
     ids, of = np.unique(tracks.track, return_inverse=True)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
+    is_fixed |= np.isin(ids, answers.persons(tracks, yes=True))
+    is_clutter = np.isin(ids, answers.persons(tracks, yes=False)) & ~is_fixed
     of_row = np.searchsorted(ids, rows.track)
     least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
     least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
@@ -502,13 +512,14 @@ def offline_tracks(
         log = steps[0], steps[-1]
         odds = _log_odds(model, trajectories, smoothed, rows, samples, movers, log, is_short)
     odds = np.where(is_short, np.minimum(odds, _SHORT), odds)
-    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short)
+    odds = np.where(is_clutter, -CERTAIN, odds)
+    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short & ~is_clutter)
     has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
     left = np.flatnonzero(keeps[of_row] & has_frame)
     decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
     worlds: Iterator[Rows] = repeat(WORLDS.empty(), len(steps))
     if is_decided and len(ids):
-        hypotheses = hypotheses_of(model, tracks, options.link_s / movers.unit_m, appearance)
+        hypotheses = hypotheses_in(tracks, is_final=True)
         decided = Decided(tracks, np.where(is_fixed, np.inf, odds), keeps, hypotheses)
         if options.drawn_worlds:
             drawn = _worlds(options, decided, round(least_s * options.rate_hz), samples)
@@ -603,21 +614,26 @@ def _without_swaps(model: MotionModel, tracks: Tracks, appearance: Appearance | 
     return tracks
 
 
-def _linked(
-    model: MotionModel, tracks: Tracks, max_gap_s: float, min_confidence: float, appearance: Appearance | None
-) -> Tracks:
+def _linked(hypotheses_in: Callable[[Tracks], Hypotheses], tracks: Tracks, min_confidence: float) -> Tracks:
     """Decide about identities."""
     for _ in range(_SWEEPS):
-        hypotheses = hypotheses_of(model, tracks, max_gap_s, appearance)
-        tracks = tracks._replace(track=hypotheses.scored().best(min_confidence))
+        tracks = tracks._replace(track=hypotheses_in(tracks).scored().best(min_confidence))
     return tracks
 
 
-def hypotheses_of(model: MotionModel, tracks: Tracks, max_gap_s: float, appearance: Appearance | None) -> Hypotheses:
-    """The hypotheses about identities in tracks, with what the log shows of their looks."""
-    hypotheses = Hypotheses.of(model, tracks, max_gap_s)
-    if appearance is None:
-        return hypotheses
-    sides = appearance.between(tracks._replace(track=hypotheses.tracklets.of))
-    looks = sides.of_tracks(hypotheses.before, hypotheses.after)
+def hypotheses_of(
+    model: MotionModel,
+    tracks: Tracks,
+    max_gap_s: float,
+    appearance: Appearance | None,
+    answers: Answers,
+    is_final: bool = False,
+) -> Hypotheses:
+    """The hypotheses about identities in tracks, with what the log shows of their looks, and what was answered."""
+    hypotheses = Hypotheses.of(model, tracks, max_gap_s, answers.joined(tracks))
+    looks = np.zeros(len(hypotheses.before))
+    if appearance is not None:
+        sides = appearance.between(tracks._replace(track=hypotheses.tracklets.of))
+        looks = sides.of_tracks(hypotheses.before, hypotheses.after)
+    looks = answers.weighed(hypotheses, tracks, looks, is_final)
     return hypotheses._replace(evidence=hypotheses.evidence + looks)

@@ -129,6 +129,7 @@ class RetrackOptions:
     poor_scale: bool = context(lambda: False)
     fixed_ids: tuple[int, ...] = context(tuple, is_recorded=False)
     boxes: FrameColumns | None = context(lambda: None, is_recorded=False)
+    answers: Sequence[Frame] = context(tuple, is_recorded=False)
 
     reads: ClassVar[Schema] = TRACKS
     writes: ClassVar[Mapping[str, Schema]] = MappingProxyType(

@@ -77,7 +77,7 @@ def draw_worlds(
     tracklets, before, after, *_ = hypotheses
     size = len(tracklets.first)
     decided = np.flatnonzero(following(track, tracklets.begins)[before] == after)
-    gain = _favouring(decided, hypotheses, hypotheses.scored().gain(min_confidence))
+    gain = favouring(decided, hypotheses, hypotheses.scored().gain(min_confidence))
     of = np.unique(track, return_inverse=True)[1]
     is_person = np.where(kept, np.maximum(log_odds, _LEAST), np.minimum(log_odds, -_LEAST))
     is_certain = is_person > _CERTAIN
@@ -128,7 +128,7 @@ def world_rows(worlds: Worlds, hypotheses: Hypotheses, step_s: float, steps: Seq
         yield WORLDS.check(rows)
 
 
-def _favouring(decided: Ints, hypotheses: Hypotheses, gain: Floats) -> Floats:
+def favouring(decided: Ints, hypotheses: Hypotheses, gain: Floats) -> Floats:
     """Gains (E,) with which the links ``decided`` are the best set.
 
     They are raised by as little as possible in all: a linear programme over the prices of ends and of beginnings, the
