@@ -181,7 +181,7 @@ def test_the_offline_steps_equal_the_reference(seed, chosen):
 
 #: Options that decide whether anything is re-tracked at all, together, and in which unit of length.
 WHETHER = {"side_view", "poor_scale", "across_classes", "class_names", "class_limits", "fixed_ids"}
-WHETHER |= {"appearance", "store_appearance", "descriptors", "boxes", "worlds"}
+WHETHER |= {"appearance", "store_appearance", "descriptors", "boxes", "worlds", "answers"}
 
 
 def test_every_option_is_varied():

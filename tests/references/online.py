@@ -161,6 +161,7 @@ class Left:
 
     first: int
     last: int
+    begun: State
     state: State
     hits: int = 1
     written: int | None = None
@@ -172,6 +173,7 @@ class Returns:
 
     def __init__(self, motion: Motion, options, confirm: int) -> None:
         self.motion, self.options, self.confirm = motion, options, confirm
+        self.lasting = 3 * (confirm - 1) + 1
         self.tracks: dict[int, Left] = {}
         self.used: set[int] = set()
         self.made: list[tuple[float, bool, float]] = []
@@ -181,7 +183,7 @@ class Returns:
     def learn(self, people: list[Person], has: dict[int, Row], step: int) -> None:
         for person in people:
             if person.name not in self.tracks:
-                self.tracks[person.name] = Left(step, step, State(person.mean, person.cov))
+                self.tracks[person.name] = Left(step, step, *[State(person.mean, person.cov)] * 2)
             if person.name in has:
                 known = self.tracks[person.name]
                 known.last, known.hits, known.state = step, person.hits, State(person.mean, person.cov)
@@ -189,32 +191,39 @@ class Returns:
             known.over = name not in {person.name for person in people}
 
     def name(self, written: list[Person], step: int, has: dict[int, Row], people: list[Person]) -> list[Person]:
-        """Decide on those without a name; returns those that are written, too, because they continue others."""
+        """Decide on those without a name, or with their own; returns those that are written, too: they continue others."""
         from scipy.optimize import linear_sum_assignment
 
         more = [one for one in people if one.name in has and one not in written]
-        new = [one for one in people if one in written or one in more]
-        new = [person for person in new if self.tracks[person.name].written is None]
-        for person in new:
-            if person in written:
-                self.tracks[person.name].written = person.name
+        first = [one for one in written if self.tracks[one.name].written is None]
+        new = [one for one in people if one in first or one in more or (one in written and one.name in has)]
+        new = [
+            one
+            for one in new
+            if self.tracks[one.name].written is None
+            or (self.tracks[one.name].written == one.name and one.hits <= self.lasting)
+        ]
+        for person in first:
+            self.tracks[person.name].written = person.name
         if self.options.link_s <= 0:
             return []
         lost = [one for one, known in self.tracks.items() if known.over and known.written and one not in self.used]
         found, gains = {}, np.zeros((len(lost), len(new)))
         for i, one in enumerate(lost):
             for j, person in enumerate(new):
-                known, gap_s = self.tracks[one], (step - self.tracks[one].last) * self.motion.step_s
-                apart = hypot(*(known.state.mean[:, 0] - person.here))
+                known, begun = self.tracks[one], self.tracks[person.name].begun
+                gap_s = (self.tracks[person.name].first - known.last) * self.motion.step_s
+                apart = hypot(*(known.state.mean[:, 0] - begun.mean[:, 0]))
                 if (
-                    gap_s > self.options.link_s
+                    (step - known.last) * self.motion.step_s > self.options.link_s
                     or apart > 1 + 2.5 * gap_s
                     or known.last >= self.tracks[person.name].first
                 ):
                     continue
-                if person not in written and known.hits < self.confirm:
+                if person not in first and known.hits < self.confirm:
                     continue
-                mean, cov = person.mean.copy(), person.cov.copy()
+                mean = np.stack([begun.mean[:, 0], person.mean[:, 1]], axis=1)
+                cov = np.diag([begun.cov[0, 0], person.cov[1, 1]])
                 if person.hits == 1:
                     mean[:, 1], cov[1, 1] = known.state.mean[:, 1], known.state.cov[1, 1]
                 features = link_features(self.motion, known.state, State(mean, cov), gap_s)
@@ -225,11 +234,11 @@ class Returns:
             if gains[i, j] <= 0:
                 continue
             shifted = found[i, j][0] + self.shifts[gap_class(found[i, j][2])]
-            is_right = shifted > (least - log(3) if new[j] in written else least)
+            is_right = shifted > (least - log(3) if new[j] in first else least)
             if is_right:
                 self.tracks[new[j].name].written = self.tracks[lost[i]].written
                 self.used.add(lost[i])
-            if is_right or new[j] in written:
+            if is_right or new[j].hits >= self.lasting:
                 self.made.append(found[i, j])
         if len(self.made) > self.estimated + min(self.estimated / 10, 50):
             self.estimated = len(self.made)

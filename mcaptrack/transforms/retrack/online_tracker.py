@@ -37,13 +37,15 @@ _CIRCLE: Final = -2 * np.log(_OUTSIDE)
 IDS, SOURCE, HITS, MISSED, MERGED = range(5)
 
 
-# Online links: which new track continues a lost one, decided when the new one is first written, or before.
+# Online links: which new track continues a lost one, decided from when the new one begins until it has lasted.
 #
 # A track that is lost for longer than its filter can bridge terminates, and the same person comes back as a new
 # track. Where that is likely, the new one is written under the id of the lost one, and if it is likelier than not,
-# it is written at once: a person who was confirmed needs no more proof. Links are judged by motion as they are
-# offline, but from the past alone: by the state of the lost track when it was last observed, that of the new one
-# now, and by how many earlier links of this log seem right. Offline re-tracking doesn't depend on these links.
+# it is written at once: a person who was confirmed needs no more proof. While it goes on its motion is known better,
+# so that one that was begun under an id of its own may get that of the lost one later; what was written before stays.
+# Links are judged by motion as they are offline, but from the past alone: by the state of the lost track when it was
+# last observed, that of the new one where it began, at its velocity now, and by how many earlier links of this log
+# seem right. Offline re-tracking doesn't depend on these links.
 #
 # Letters: R tracks alive at the steps of some frames, end to end; F frames; K tracks; L lost and N new ones; E
 # links.
@@ -59,8 +61,8 @@ _BATCH: Final = 200_000
 
 
 class _Known(NamedTuple):
-    """Tracks (K,): ids, the steps at which they began, were last observed and are over, the number of observations, and
-    the state at the last one.
+    """Tracks (K,): ids, the steps at which they began, were last observed and are over, the number of observations, the
+    state at the first one, and at the last one.
     """
 
     ids: Ints
@@ -68,11 +70,13 @@ class _Known(NamedTuple):
     last: Ints
     over: Ints
     hits: Ints
+    begun: State
     state: State
 
 
 _NONE: Final = np.empty(0, np.int64)
-_NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, State(np.empty((0, 4)), np.empty((0, 3))))
+_NO_STATE: Final = State(np.empty((0, 4)), np.empty((0, 3)))
+_NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, _NO_STATE, _NO_STATE)
 
 
 class _Links(NamedTuple):
@@ -104,8 +108,8 @@ class OnlineLinks:
     """
 
     def __init__(self, model: MotionModel, max_gap_s: float, min_confidence: float, confirm_hits: int) -> None:
-        self._model, self._step_s, self._max_gap_s = model, model.step_s, max_gap_s
-        self._confirm_hits = confirm_hits
+        self._model, self._step_s, self._max_gap_steps = model, model.step_s, max_gap_s / model.step_s
+        self._confirm_hits, self._settled_hits = confirm_hits, _lasting(confirm_hits)
         self._sure = float(np.log(min_confidence / (1 - min_confidence)))
         self._least = self._sure + float(np.log(linking.ENOUGH))
         self._names: dict[int, int] = {}  # the ids under which tracks are written, of those that were
@@ -126,16 +130,18 @@ class OnlineLinks:
         ``tracks`` (5, R) and ``state`` (R,) are as in ``Step``. ``is_written`` (R,) says which are written in any case.
         Nothing is known at a step that was not known then.
         """
-        if self._max_gap_s <= 0:
+        if self._max_gap_steps <= 0:
             return np.asarray(tracks[IDS]), is_written
         alive, which = self._known(steps, tick, tracks, state, is_observed)
         count = len(tick)
-        first = np.full(len(alive.ids), count)  # the row from which on a track is written in any case
-        written = np.flatnonzero(is_written)
+        is_named = self._are_named(alive.ids)
+        first = np.full(len(alive.ids), count)  # the row from which on a track is written that was not written before
+        written = np.flatnonzero(is_written & ~is_named[which])
         np.minimum.at(first, which[written], written)
-        rows = np.flatnonzero(
-            (is_written | is_observed) & (np.arange(count) <= first[which]) & ~self._are_named(alive.ids)[which]
-        )
+        is_early = (np.arange(count) <= first[which]) & ~is_named[which]
+        is_judged = is_early | (tracks[HITS] <= self._settled_hits)
+        is_own = np.array([self._names.get(track, track) == track for track in alive.ids.tolist()], bool)
+        rows = np.flatnonzero(((is_written & is_early) | is_observed) & is_judged & is_own[which])
         of = which[rows]
         new = taken(alive, of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=taken(state, rows))
         over = np.flatnonzero(alive.over < _NEVER)
@@ -145,27 +151,29 @@ class OnlineLinks:
         order = np.argsort(lost.ids)  # however many steps are read at once, links of equal odds are chosen by ids
         lost, was_written = taken(lost, order), was_written[order]
         is_first = rows == first[of]
+        is_settled = new.hits >= self._settled_hits
         links = self._candidates(lost, new, is_first)
         since = np.full(len(alive.ids), count)  # those that continue another one are written whenever they are observed
-        since[[self._names.get(track, track) != track for track in alive.ids.tolist()]] = 0
+        since[~is_own] = 0
         used = np.zeros(len(lost.ids), bool)
         for at_once in np.split(np.arange(len(links.new)), np.flatnonzero(np.diff(tick[rows[links.new]])) + 1):
             may_be = ~used[links.lost[at_once]] & (since[of[links.new[at_once]]] == count)
             may_be &= was_written[links.lost[at_once]] | self._are_named(lost.ids[links.lost[at_once]])
             edges = taken(links, at_once[may_be])
-            chosen = self._decide(edges, is_first[edges.new])
+            chosen = self._decide(edges, is_first[edges.new], is_settled[edges.new])
             for ended, other in zip(edges.lost[chosen].tolist(), edges.new[chosen].tolist(), strict=True):
                 self._names[int(new.ids[other])] = self._names.get(int(lost.ids[ended]), int(lost.ids[ended]))
                 used[ended], since[of[other]] = True, rows[other]
         for track in alive.ids[first < count].tolist():
             self._names.setdefault(track, track)
-        reached = lost.last >= steps[-1] - self._max_gap_s / self._step_s
+        reached = lost.last >= steps[-1] - self._max_gap_steps
         self._lost = taken(lost, reached & ~used & self._are_named(lost.ids))
         self._alive = taken(alive, alive.over == _NEVER)
         names = np.array([self._names.get(track, track) for track in alive.ids.tolist()], np.int64)
         kept = {*self._alive.ids.tolist(), *self._lost.ids.tolist()}
         self._names = {track: name for track, name in self._names.items() if track in kept}
-        return np.asarray(names[which]), is_written | (is_observed & (np.arange(count) >= since[which]))
+        continues = np.arange(count) >= since[which]
+        return np.where(continues, names[which], tracks[IDS]), is_written | (is_observed & continues)
 
     def _are_named(self, ids: Ints) -> Bools:
         return np.array([track in self._names for track in ids.tolist()], bool)
@@ -179,12 +187,17 @@ class OnlineLinks:
         each = max(1, _BATCH // max(len(lost.ids), 1))
         for low in range(0, len(new.ids), each):
             part = slice(low, low + each)
-            gaps_s = (new.last[part, None] - lost.last) * self._step_s
-            fits = (lost.over <= new.last[part, None]) & (gaps_s <= self._max_gap_s)
+            fits = (lost.over <= new.last[part, None]) & (new.last[part, None] - lost.last <= self._max_gap_steps)
             fits &= (lost.last < new.began[part, None]) & (is_written[part, None] | (lost.hits >= self._confirm_hits))
             row, candidate = np.nonzero(fits)
-            row, gap_s = row + low, np.asarray(gaps_s[row, candidate], np.float64)
-            gaps = linking.Gaps(taken(lost.state, candidate), taken(new.state, row), gap_s)
+            row += low
+            gap_s = np.asarray((new.began[row] - lost.last[candidate]) * self._step_s, np.float64)
+            begun, now = taken(new.begun, row), taken(new.state, row)
+            after = State(
+                np.concatenate([begun.mean[:, :2], now.mean[:, 2:]], axis=1),
+                np.stack([begun.cov[:, 0], 0 * begun.cov[:, 0], now.cov[:, 2]], axis=1),
+            )
+            gaps = linking.Gaps(taken(lost.state, candidate), after, gap_s)
             is_near = linking.are_in_reach(gaps)
             candidate, row, gaps = candidate[is_near], row[is_near], taken(gaps, is_near)
             before, after, gap_s = gaps
@@ -195,17 +208,19 @@ class OnlineLinks:
             parts.append(taken(_Links(candidate, row, gap_s, log_odds), linking.has_chance(log_odds)))
         return joined(parts)
 
-    def _decide(self, links: _Links, is_written: Bools) -> Bools:
-        """Which of the links (E,) at one step are made, to tracks that are written in any case or not."""
+    def _decide(self, links: _Links, is_first: Bools, is_settled: Bools) -> Bools:
+        """Which of the links (E,) at one step are made, to tracks that are written in any case from now on or not.
+
+        How likely links are right is learned from those that are made, and from those to tracks that have settled.
+        """
         is_made = np.zeros(len(links.new), bool)
         if not len(is_made):
             return is_made
         ends, begins = (np.unique(side, return_inverse=True)[1] for side in (links.lost, links.new))
         best = linking.best_links(ends, begins, links.log_odds, len(is_made))
         shifted = links.log_odds[best] + self._shifts[linking.gap_classes(links.gap_s[best])]
-        is_right = shifted > np.where(is_written[best], self._least, self._sure)
-        # one that is not written yet is judged again at the next step: it counts once it is
-        counts = best[is_written[best] | is_right]
+        is_right = shifted > np.where(is_first[best], self._least, self._sure)
+        counts = best[is_settled[best] | is_right]
         self._learn(links.log_odds[counts], links.gap_s[counts])
         is_made[best[is_right]] = True
         return is_made
@@ -228,12 +243,20 @@ class OnlineLinks:
             np.zeros((len(names), 4)),
             np.zeros((len(names), 3)),
         )
+        begun = State(np.zeros((len(names), 4)), np.zeros((len(names), 3)))
+        is_new = np.ones(len(names), bool)
+        is_new[had] = False
+        first_row = np.full(len(names), len(tick))
+        np.minimum.at(first_row, which, np.arange(len(tick)))
+        for column, at_birth, now_at in zip(begun, before.begun, state, strict=True):
+            column[had] = at_birth
+            column[is_new] = now_at[first_row[is_new]]
         earlier, now = (before.last, before.hits, *before.state), (steps[tick], tracks[HITS], *state)
         is_seen = last_row >= 0
         for values, was, is_now in zip((last, hits, mean, cov), earlier, now, strict=True):
             values[had] = was
             values[is_seen] = is_now[last_row[is_seen]]
-        return _Known(names, began, last, np.append(steps, _NEVER)[ends + 1], hits, State(mean, cov)), which
+        return _Known(names, began, last, np.append(steps, _NEVER)[ends + 1], hits, begun, State(mean, cov)), which
 
     def _learn(self, log_odds: Floats, gap_s: Floats) -> None:
         """Learn from the best links so far how many are right after gaps of what length."""
@@ -494,6 +517,13 @@ def _squared(off: Floats) -> Floats:
 
 #: A track has lasted once it was observed for so many times as long as its confirmation takes.
 _LASTING: Final = 3
+
+
+def _lasting(confirm_hits: int) -> int:
+    """The number of observations after which tracks that so many confirm have lasted."""
+    return _LASTING * (confirm_hits - 1) + 1
+
+
 #: Before anything is known: the probability that a track lasts, and that a lost one comes back; and for how many tracks
 #: this counts at each number of observations and steps.
 _LASTS, _RETURNS, _WEIGHT = 0.6, 0.8, 2.0
@@ -684,7 +714,7 @@ class ShownTracks:
     def __init__(self, confirm_hits: int, coast: int, max_age: int, adapts: bool) -> None:
         self._adapts = adapts
         self._confirm_hits, self._coast, self._max_age = confirm_hits, coast, max_age
-        self._lasting = _LASTING * (confirm_hits - 1) + 1
+        self._lasting = _lasting(confirm_hits)
         self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
         self._seen = GrowingHull()
         self._places = PlacesOfLosses()
