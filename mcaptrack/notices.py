@@ -104,8 +104,12 @@ _LOG: Final[ContextVar[str | None]] = ContextVar("log", default=None)
 
 
 def warn(message: str, code: Code = "other") -> None:
-    """Warn of something that changes results or casts doubt on them: what, where, and what to do."""
-    _pass_on(Notice(" ".join(message.splitlines()), code, _LOG.get()), _LISTENER.get())
+    """Warn of something that changes results or casts doubt on them: what, where, and what to do.
+
+    A log that keeps the warning names no file, so the name of the log that it is about goes.
+    """
+    line, log = " ".join(message.splitlines()), _LOG.get()
+    _pass_on(Notice(line.removeprefix(f"{log}: "), code, log), _LISTENER.get())
 
 
 def _pass_on(notice: Notice, listener: Listener | None) -> None:

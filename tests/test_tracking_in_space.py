@@ -169,8 +169,8 @@ class Renamed:
     def __getattr__(self, name: str):
         return getattr(self._writer, name)
 
-    def register_channel(self, topic, *others):
-        return self._writer.register_channel("/radar/boxes", *others)
+    def add_channel(self, topic, *others):
+        return self._writer.add_channel("/radar/boxes", *others)
 
 
 def boxes_in(frame_id: str, own: str = ""):
@@ -195,6 +195,9 @@ def test_what_transforms_and_boxes_lack_is_one_line(boxes, keep, count, words, t
     assert result.frames == {"/lidar/tracks": count}
     assert sum(words in line for line in said(result)) == 1, said(result)
     assert not any("\n" in line for line in said(result))
+    kept = mcaptrack.query(path, "select message from warnings where topic = '/lidar/tracks'").column("message").to_pylist()
+    assert sum(words in line for line in kept) == 1
+    assert not any(path.name in line for line in kept)
 
 
 def test_boxes_without_any_known_pose_are_an_error_and_without_transforms_stay_in_their_frame(tmp_path):

@@ -246,9 +246,9 @@ def run(
             warn_clock_jumps(opened)
         planes = read_planes(opened, prefix)
         for job in jobs:
-            with part("read"):
+            with part("read"), collected() as of_input:
                 source = _input(state, job, stamps, progress, boxes, report.watch)
-            planes = _add_results(Work(state, job, source, planes, plane, before, progress), report)
+            planes = _add_results(Work(state, job, source, planes, plane, before, progress, notices=of_input), report)
             del source
             release_memory()
         own_planes = planes or ()

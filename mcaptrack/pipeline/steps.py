@@ -106,7 +106,7 @@ class Work:
     ``seen`` are the frames of its input with boxes in the pictures that they were seen in, also where the camera moves
     by ``path``. ``references`` are the digests of channels beside the main input, by topic. ``outputs`` are schema and
     frames by topic; ``continued`` says how their ids go on from the log before. ``scores`` say what scores of its input
-    were taken for, by class, and ``notices`` are warnings of that, which its channels keep.
+    were taken for, by class, and ``notices`` are warnings of that and of its input, which its channels keep.
     """
 
     state: RunState
