@@ -171,6 +171,7 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "recover": lambda log, out: [log, "-o", out / "recovered.mcap"],
     "render": lambda log, out: [log, "-o", out / "rendered.gif", "--width", "64", "--end-s", "0.2"],
     "report": lambda log, out: [log, "-o", out / "report.html"],
+    "review": lambda log, out: [log, "--print"],
     "tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"],
     "zones": lambda log, out: [log, "--zones", zones_file(out), "-o", out / "other.mcap"],
     "view": lambda log, out: [log, "--layout", "no such layout"],

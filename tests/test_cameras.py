@@ -33,7 +33,7 @@ PLACES = [*zip([*STAGES, *STAGES], TARGETS, strict=False)]
 READING = {
     "evaluate": (), "report": ("-o", "page.html", "--force"), "events": (), "zones": ("--zones", "zones.geojson"),
     "render": ("-o", "walk.gif", "--force", "--width", "64"), "run": ("--no-tables",),
-    "tune": ("--trials", "1", "-o", "tuned.toml"),
+    "tune": ("--trials", "1", "-o", "tuned.toml"), "review": ("--print",),
 } | dict.fromkeys(TRANSFORMS, ())  # fmt: skip
 
 

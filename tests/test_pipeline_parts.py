@@ -274,7 +274,7 @@ def test_the_rate_of_other_inputs_is_known_and_a_high_one_is_said(tmp_path, rate
         for source in ("/camera/tracks", None):
             with notices.collected() as said:
                 frames, known = pipeline.input_of(opened, "/camera", "retrack", Retrack(), source)
-            people = {"class_names": ((1, "person"),), "fixed_ids": ()}
+            people = {"class_names": ((1, "person"),), "fixed_ids": (), "answers": ()}
             assert known == {
                 "rate_hz": rate_hz,
                 "ground_planes": (),
