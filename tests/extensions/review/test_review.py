@@ -37,8 +37,7 @@ def scene(seed: int) -> list[Frame]:
 
 
 def solved_with(frames: list[Frame], answers: Sequence[tuple[asking.Question, float]] = ()) -> Solved:
-    given = asking.in_frames([asking.answer_row(question, yes, frames) for question, yes in answers])
-    made = Retrack(worlds=20, answers=given)
+    made = Retrack(worlds=20, answers=asking.with_answers((), answers, frames))
     out = dict(zip(made.writes, map(list, zip(*made(frames), strict=True)), strict=True))
     return Solved(frames, out[""], out["decisions"], out["worlds"])
 
@@ -51,10 +50,10 @@ def track_at(solved: Solved, t_ns: int, source: int) -> int | None:
 
 
 def obeys(solved: Solved, question: asking.Question, yes: bool) -> bool:
-    before = track_at(solved, question.before.end_ns, question.before.source_id)
-    if question.after is None:
-        return (track_at(solved, question.before.begin_ns, question.before.source_id) is not None) is yes
     after = track_at(solved, question.after.begin_ns, question.after.source_id)
+    if question.before is None:
+        return (after is not None) is yes
+    before = track_at(solved, question.before.end_ns, question.before.source_id)
     return (before == after) if yes else (before != after or before is None)
 
 
@@ -81,7 +80,7 @@ def test_the_same_log_has_the_same_questions_fewer_are_the_first_and_answered_on
     assert asking.questions(solved_with(frames), [], 8) == asked
     assert asking.questions(solved, [], 3) == asked[:3]
     assert [question.value for question in asked] == sorted((q.value for q in asked), reverse=True)
-    answered = [asking.answer_row(question, 1.0, frames) for question in asked[:2]]
+    answered = asking.with_answers((), [(question, 1.0) for question in asked[:2]], frames)
     again = asking.questions(solved, answered, 100)
     assert not {question.key for question in again} & {question.key for question in asked[:2]}
 
@@ -202,9 +201,11 @@ def test_an_answer_that_is_interrupted_leaves_the_log_before_it(own, monkeypatch
 def test_bad_answers_are_refused_in_a_line(own, tmp_path):
     name, file = described(own)[0]["name"], tmp_path / "answers.json"
     for content, text in (
-        (f'{{"{name}": "yes", "{name}": "no"}}', "has two answers to"),
         (f'{{"{name}": "perhaps"}}', "has no answers; it holds them by question"),
-        ("[", "is not JSON"),
+        (f'{{"{name}": "yes", "{name}": "no"}}', "stands there twice"),
+        ("[", "is not valid JSON"),
+        (f'{{"{name}": ["yes"]}}', "has no answers; it holds them by question"),
+        (f'{{"{name}": "yes", "1@2": "no"}}', "has no question 1@2"),
         ('{"1@2": "yes"}', "has no question 1@2"),
     ):
         file.write_text(content)
@@ -240,7 +241,7 @@ def test_a_judge_weighs_where_there_are_pictures_and_is_never_certain(seen, tmp_
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(asking, "_LEAST", 0.0)
     review = mcaptrack.review(own, judge="alike:Alike", questions=50)
-    asked = [name for name, question in review.questions.items() if question.after]
+    asked = [name for name, question in review.questions.items() if question.before]
     assert asked
     assert {*review.answers} == {*asked}
     assert all(0.9 < yes < 1 for yes in review.answers.values())
@@ -268,6 +269,9 @@ def test_the_page_keeps_each_answer_at_once_and_takes_it_back(seen, tmp_path, mo
         tab.run(key % "n")
         tab.wait(number % 2)
         tab.run(key % "s")
+        tab.wait("document.getElementById('text').textContent.startsWith('That was the last')")
+        assert not review.is_done.is_set()
+        tab.run(key % "f")
         tab.wait("document.getElementById('text').textContent.startsWith('Thank')")
         assert review.is_done.is_set()
         assert review.answers == {first: 0.0}
