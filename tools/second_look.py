@@ -65,10 +65,10 @@ def curve(path: Path, most: int, at_once: int) -> list[tuple[int, float, int, in
         solved, given, asked = asking.solve(opened, "/camera", ()), [], []
         person, out, count = Truth(truth, solved.samples), [scored(0, solved)], 0
         while count < most and (some := asking.questions(solved, asked, min(at_once, most - count))):
-            answers = [(question, person.answer(question)) for question in some]
-            said = [(question, float(yes)) for question, yes in answers if yes is not None]
+            answers = [(question.key, person.answer(question)) for question in some]
+            said = [(key, float(yes)) for key, yes in answers if yes is not None]
             given = asking.with_answers(given, said, solved.samples)
-            asked = asking.with_answers(asked, [(question, 0.0) for question in some], solved.samples)
+            asked = asking.with_answers(asked, [(key, 0.0) for key, _ in answers], solved.samples)
             count += len(some)
             solved = asking.solve(opened, "/camera", given)
             out.append(scored(count, solved))

@@ -20,7 +20,7 @@ from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.extensions.review import questions as asking
 from mcaptrack.extensions.review.crops import crops
 from mcaptrack.extensions.review.page import Answer, ReviewServer
-from mcaptrack.extensions.review.questions import Question
+from mcaptrack.extensions.review.questions import Key, Question
 from mcaptrack.files import read_json
 from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.pipeline.write import Made, RunState, write
@@ -108,11 +108,13 @@ class Review:
     port: int = field(default=0, repr=False)
     #: Set when the page says that no more answers follow.
     is_done: threading.Event = field(default_factory=threading.Event, repr=False)
+    #: What each question is about: also those that were answered before, and can be answered again.
+    _keys: Mapping[str, Key] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _server: ReviewServer | None = field(default=None, repr=False)
 
     def answer(self, name: str, yes: Answer | float) -> None:
-        """Keep an answer in the log at once; "skip" takes an earlier one back.
+        """Keep an answer in the log at once, in place of an earlier one; "skip" takes that back.
 
         Parameters
         ----------
@@ -144,20 +146,18 @@ class Review:
 
     def _keep(self, answers: Mapping[str, Answer | float]) -> None:
         """Write answers into the log, in place of earlier ones to the same questions."""
-        kept = dict.fromkeys(answers)
+        kept: dict[str, float | None] = {}
         for name, yes in answers.items():
-            if name not in self.questions:
+            if name not in self._keys:
                 raise McaptrackError(f"{self.log} has no question {name}; {offer(name, list(self.questions))}")
             if not (isinstance(yes, str) and yes in _SAID) and not (isinstance(yes, float) and 0 <= yes <= 1):
                 raise McaptrackError(f"the answer to {name} is yes, no, skip or a probability, not {yes!r:.40}")
             kept[name] = _SAID[yes] if isinstance(yes, str) else yes
         with self._lock:
-            if all(self.answers.get(name) == yes for name, yes in kept.items()):
-                return
             with logs.read(self.log, sidecar=SidecarChoice(None)) as opened:
                 opened.lock()
                 topic, earlier = f"{self.camera}/{ANSWERS}", asking.read_answers(opened, self.camera)
-                new = [(self.questions[name], yes) for name, yes in kept.items()]
+                new = [(self._keys[name], yes) for name, yes in kept.items()]
                 if frames := asking.with_answers(earlier, new, self.solved.samples):
                     made = Made.of(DECISIONS, frames, Provenance("review", {}))
                     write(RunState(opened, self.camera, {topic: made}), None)
@@ -278,15 +278,17 @@ def review(
     if answers is not None and judge is not None:
         raise McaptrackError("`answers=` and `judge=` both answer; leave one out")
     path, file = log_file(log), optional_path(answers)
-    given = {} if file is None else read_json(file, "answers", _MOST_BYTES, is_unique=True)
+    given = {} if file is None else read_json(file, "a file of answers", _MOST_BYTES, is_unique=True)
     if not isinstance(given, dict) or not all(isinstance(yes, str) and yes in _SAID for yes in given.values()):
         raise McaptrackError(f'{file} has no answers; it holds them by question, as in {{"31@50.8-32@51.6": "yes"}}')
     with logs.read(path) as opened:
         prefix = pipeline.find_camera(opened, camera)
         solved = asking.solve(opened, prefix)
-        asked = asking.questions(solved, asking.read_answers(opened, prefix), questions)
-        named = {question.name(opened.start_ns): question for question in asked}
-        out = Review(path, prefix, named, solved, opened.start_ns, host=host, port=port or 0)
+        answered = asking.read_answers(opened, prefix)
+        asked = {question.key: question for question in asking.questions(solved, answered, questions)}
+        keys = {asking.name_of(key, opened.start_ns): key for key in (*asked, *asking.keys_of(answered))}
+        named = {name: asked[key] for name, key in keys.items() if key in asked}
+        out = Review(path, prefix, named, solved, opened.start_ns, host=host, port=port or 0, _keys=keys)
         given |= {} if judge is None else _judged(judge, opened, out)
     if file is not None or judge is not None:
         out._keep(given)

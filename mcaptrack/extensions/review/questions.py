@@ -66,12 +66,6 @@ class Question:
         end = (self.before.source_id, self.before.end_ns) if self.before else (-1, self.after.begin_ns)
         return *end, self.after.source_id, self.after.begin_ns
 
-    def name(self, start_ns: int) -> str:
-        """Its name, with seconds since the start of the log."""
-        before, end_ns, after, begin_ns = self.key
-        ends = [(after, begin_ns)] if self.before is None else [(before, end_ns), (after, begin_ns)]
-        return "-".join(f"{track}@{(t_ns - start_ns) / NS_PER_S:.3f}" for track, t_ns in ends)
-
     @property
     def value(self) -> float:
         """The rows that its answer is expected to change."""
@@ -178,6 +172,12 @@ def read_answers(opened: log.Log, prefix: str) -> Sequence[Frame]:
     return opened.frame_columns(topic, DECISIONS) if topic in opened.channels else ()
 
 
+def name_of(key: Key, start_ns: int) -> str:
+    """The name of a question, with seconds since the start of the log."""
+    ends = [f"{track}@{(t_ns - start_ns) / NS_PER_S:.3f}" for track, t_ns in (key[:2], key[2:])]
+    return ends[1] if key[0] < 0 else "-".join(ends)
+
+
 def keys_of(answers: Sequence[Frame]) -> list[Key]:
     """The key of the question that each row of answers is about (``Question.key``)."""
     joined = join_frames(DECISIONS, answers)
@@ -187,13 +187,13 @@ def keys_of(answers: Sequence[Frame]) -> list[Key]:
 
 
 def with_answers(
-    answers: Sequence[Frame], new: Sequence[tuple[Question, float | None]], samples: Sequence[Frame]
+    answers: Sequence[Frame], new: Sequence[tuple[Key, float | None]], samples: Sequence[Frame]
 ) -> list[Frame]:
     """``answers`` with new ones in place of those to the same questions: the probability of yes, or None for none."""
-    again = {question.key for question, _ in new}
+    again = {key for key, _ in new}
     earlier, seen = join_frames(DECISIONS, answers), join_frames(TRACKS, samples)
     kept = np.array([key not in again for key in keys_of(answers)], bool)
-    keys = [question.key for question, yes in new if yes is not None]
+    keys = [key for key, yes in new if yes is not None]
     before, end_ns, after, t_ns = np.array(keys, np.int64).reshape(-1, 4).T
     at = seen.rows[find_rows((seen.row_ns, seen.rows["track_id"]), (t_ns, after))]
     rows = DECISIONS.rows(

@@ -37,7 +37,9 @@ def scene(seed: int) -> list[Frame]:
 
 
 def solved_with(frames: list[Frame], answers: Sequence[tuple[asking.Question, float]] = ()) -> Solved:
-    made = Retrack(worlds=20, answers=asking.with_answers((), answers, frames))
+    made = Retrack(
+        worlds=20, answers=asking.with_answers((), [(question.key, yes) for question, yes in answers], frames)
+    )
     out = dict(zip(made.writes, map(list, zip(*made(frames), strict=True)), strict=True))
     return Solved(frames, out[""], out["decisions"], out["worlds"])
 
@@ -80,7 +82,7 @@ def test_the_same_log_has_the_same_questions_fewer_are_the_first_and_answered_on
     assert asking.questions(solved_with(frames), [], 8) == asked
     assert asking.questions(solved, [], 3) == asked[:3]
     assert [question.value for question in asked] == sorted((q.value for q in asked), reverse=True)
-    answered = asking.with_answers((), [(question, 1.0) for question in asked[:2]], frames)
+    answered = asking.with_answers((), [(question.key, 1.0) for question in asked[:2]], frames)
     again = asking.questions(solved, answered, 100)
     assert not {question.key for question in again} & {question.key for question in asked[:2]}
 

@@ -22,8 +22,8 @@ function show() {
     figure.append(caption, pictures);
     return figure;
   }));
-  at("hint").hidden = !asked || asked.sides.length < 2;
-  at("help").hidden = isFinished;
+  at("which").hidden = !asked || asked.sides.length < 2;
+  at("how").hidden = isFinished;
   for (const id of ["yes", "no", "skip"]) at(id).hidden = !asked;
   at("undo").hidden = !number || isFinished;
   at("finish").hidden = isFinished;
