@@ -276,17 +276,6 @@ CASES: dict[str, dict[str, Case]] = {
     "report": common(
         "report a.mcap", camera="--camera other", output="-o b.html", force=("report a.mcap -o old.html", "--force")
     ),
-    "review": common(
-        "review a.mcap --print",
-        questions="--questions 1",
-        answers="--answers answers.json",
-        judge="--judge nobody:Judge",
-        camera="--camera other",
-        print=("review a.mcap --questions 1000 --port 1", "--print"),
-        open="--open",
-        port=("review a.mcap --questions 1000", "--port 1"),
-        host=("review a.mcap --questions 1000 --port 1", "--host 127.0.0.2"),
-    ),
     "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
     "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o fresh.mcap", "--force")),
     "cut": common(

@@ -29,9 +29,9 @@ class ReviewCommand(Once["Review"]):
         if done.result is None and done.questions and not self.values["print"]:
             with done:
                 show(f"Open {done.address}")
-                if self.values["open"]:
-                    webbrowser.open(done.address)
                 try:
+                    if self.values["open"]:
+                        webbrowser.open(done.address)
                     while not done.is_done.wait(0.2):
                         pass
                 except KeyboardInterrupt:

@@ -121,9 +121,11 @@ def questions(solved: Solved, answered: Sequence[Frame], count: int) -> list[Que
     out: list[Question] = []
     ends: set[tuple[int, ...]] = set()
     for question in sorted(asked, key=lambda question: (-question.value, question.key)):
-        sides = {question.key[:2], (*question.key[2:], 1)} if question.before else set()
+        before, end_ns, after, begin_ns = question.key
+        exchange = (*sorted([before, after]), begin_ns)
+        sides = {(before, end_ns), (after, begin_ns, 1), exchange} if question.before else set()
         if question.key in done or question.value < _LEAST or sides & ends:
-            continue  # one question for each end and each beginning: the others follow from its answer
+            continue  # one for each end, each beginning and each exchange: the others follow from its answer
         out.append(question)
         ends |= sides
     return out[:count]

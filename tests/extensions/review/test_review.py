@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import urllib.error
 import urllib.request
+import webbrowser
 from collections.abc import Sequence
 
 import numpy as np
@@ -159,6 +161,13 @@ def test_a_file_of_answers_is_kept_obeyed_and_taken_back_by_drop(own, tmp_path):
     assert question["name"] not in {one["name"] for one in described(own)}
     done("run", own, "-q", "--no-tables")  # nothing is due: the tracks know the answers that they were made with
     assert len(mcaptrack.run(own, tables=False).stages) == 0
+    changed = log_tracks(own)
+    file.write_text(json.dumps({question["name"]: "skip"}))  # an earlier answer can be given again, or taken back
+    assert printed("review", own, "--answers", file, "-q")[0].count("answered 0")
+    assert log_tracks(own) == before
+    file.write_text(json.dumps({question["name"]: "no" if question["decided"] == "yes" else "yes"}))
+    done("review", own, "--answers", file, "-q")
+    assert log_tracks(own) == changed
     done("drop", own, "/camera/answers", "-q")
     done("run", own, "-q", "--no-tables")
     assert log_tracks(own) == before
@@ -280,6 +289,52 @@ def test_the_page_keeps_each_answer_at_once_and_takes_it_back(seen, tmp_path, mo
         assert tab.said == []
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(review.address + "yes-0")
+
+
+def test_every_option_of_the_command_has_an_effect(seen, tmp_path, monkeypatch):
+    own, opened = shutil.copyfile(seen, tmp_path / "walk.mcap"), []
+    monkeypatch.setattr(asking, "_LEAST", 0.0)
+    assert len(json.loads(printed("review", own, "--print", "--json", "--questions", 1, "-q")[0])["questions"]) == 1
+    assert "has no camera other" in call("review", own, "--camera", "other").err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert f"port {port} of this machine can't be used" in call("review", own, "--port", port).err
+    assert "port 0 of this machine can't be used" in call("review", own, "--host", "192.0.2.1").err
+
+    def open_and_stop(address: str) -> None:
+        opened.append(address)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(webbrowser, "open", open_and_stop)
+    assert "answered 0" in done("review", own, "--open").out
+    assert opened[0].startswith("http://127.0.0.1:")
+
+
+def test_only_a_post_answers(seen, tmp_path, monkeypatch):
+    """Neither GET nor HEAD, as previews of links send them, and an answer that can't be kept says why."""
+    own = shutil.copyfile(seen, tmp_path / "walk.mcap")
+    monkeypatch.setattr(asking, "_LEAST", 0.0)
+    with mcaptrack.review(own, questions=1) as review:
+        page = urllib.request.urlopen(review.address).read().decode()
+        address = review.address.rstrip("/") + json.loads(page.partition('id="data">')[2].partition("<")[0])["root"]
+        for method, status in (("GET", 405), ("HEAD", 405), ("PUT", 501), ("POST", 200)):
+            assert review.answers == {}
+            assert asked_by(method, f"{address}yes-0")[0] == status
+        assert list(review.answers.values()) == [1.0]
+        assert asked_by("POST", review.address)[0] == 501
+        own.unlink()
+        status, text = asked_by("POST", f"{address}no-0")
+        assert status == 500
+        assert "does not exist" in text
+        assert list(review.answers.values()) == [1.0]
+
+
+def asked_by(method: str, address: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, method=method)) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
 
 
 def kept(path) -> list[float]:
