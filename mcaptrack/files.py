@@ -240,10 +240,27 @@ def read_beginning(path: Path, count: int) -> bytes:
         raise unreadable(path, error) from None
 
 
-def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], IO[bytes]] | None = None) -> Any:
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON. Raises ValueError if a name is there twice."""
+    out: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in out:
+            raise ValueError(f"{name!r:.60} stands there twice")
+        out[name] = value
+    return out
+
+
+def read_json(
+    path: Path,
+    what: str,
+    most_bytes: int,
+    opened: Callable[[Path], IO[bytes]] | None = None,
+    is_unique: bool = False,
+) -> Any:
     """Return the content of a JSON file, of the form ``what``; ``opened`` opens it, if it may be packed.
 
-    Raises McaptrackError if it can't be read, has more than ``most_bytes``, is nested too deep or is invalid.
+    Raises McaptrackError if it can't be read, has more than ``most_bytes``, is nested too deep or is invalid; and if
+    ``is_unique``, for a name that an object has twice.
     """
     refuse_special(path)
     try:
@@ -251,7 +268,8 @@ def read_json(path: Path, what: str, most_bytes: int, opened: Callable[[Path], I
         if size > most_bytes:
             raise McaptrackError(f"{path} has {size} bytes; at most {most_bytes} of {what} are read: give it in parts")
         with opened(path) if opened else path.open("rb") as stream:
-            return json.loads(stream.read().decode("utf-8-sig"))
+            text = stream.read().decode("utf-8-sig")
+            return json.loads(text, object_pairs_hook=_each_once if is_unique else None)
     except OSError as error:
         raise unreadable(path, error) from None
     except UnicodeDecodeError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import html
+import json
 import re
 import shutil
 import subprocess
@@ -74,6 +75,12 @@ class Scene:
         """Add a file of 3D labels."""
         Path("cubes.csv").write_text("t,id,x_m,y_m\n0,1,2,3\n1,1,2,3\n")
         return self
+
+    def reviewed(self) -> str:
+        """Answer the first question."""
+        (name, *_) = mcaptrack.review(self.path, questions=1).questions
+        Path("answers.json").write_text(json.dumps({name: "yes"}))
+        return self.says("review", "LOG", "--answers", "answers.json")
 
     def page(self) -> str:
         """Return the text of a report."""
@@ -259,6 +266,8 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "sources/ingest/job.py:read:ingest": lambda s: (
         s.without("/camera/truth*").cubes().says("ingest", "clip.mp4", "--truth", "cubes.csv")
     ),
+    "extensions/review/questions.py:solve:run": lambda s: s.untracked().says("review", "LOG"),
+    "extensions/review/command.py:show:review": Scene.reviewed,
     "extensions/training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
 }
 

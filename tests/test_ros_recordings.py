@@ -89,6 +89,7 @@ def on_recording(path: Path, elsewhere: Path) -> dict[str, list[object]]:
         "events": [path],
         "evaluate": [path],
         "export": [path, "-o", elsewhere / "tables"],
+        "review": [],  # needs a measured ground plane, and writes its answers as `retrack` writes
         "query": [path, "select count(*) from tracks"],
         "info": [path],
         "check": [path],

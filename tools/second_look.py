@@ -34,8 +34,8 @@ class Truth:
 
     def answer(self, question: Question) -> bool | None:
         """Yes or no; None if it can't be told."""
-        if question.after is None:
-            seen = self._seen(question.before)
+        if question.before is None:
+            seen = self._seen(question.after)
             share = sum(person is not None for person in seen) / max(len(seen), 1)
             return None if 0.3 < share < 0.7 else share > 0.5
         sides = self._one(self._seen(question.before)[-NEAR:]), self._one(self._seen(question.after)[:NEAR])
@@ -65,13 +65,12 @@ def curve(path: Path, most: int, at_once: int) -> list[tuple[int, float, int, in
         solved, given, asked = asking.solve(opened, "/camera", ()), [], []
         person, out, count = Truth(truth, solved.samples), [scored(0, solved)], 0
         while count < most and (some := asking.questions(solved, asked, min(at_once, most - count))):
-            for question in some:
-                yes = person.answer(question)
-                row = asking.answer_row(question, float(bool(yes)), solved.samples)
-                asked.append(row)
-                given += [] if yes is None else [row]
+            answers = [(question.key, person.answer(question)) for question in some]
+            said = [(key, float(yes)) for key, yes in answers if yes is not None]
+            given = asking.with_answers(given, said, solved.samples)
+            asked = asking.with_answers(asked, [(key, 0.0) for key, _ in answers], solved.samples)
             count += len(some)
-            solved = asking.solve(opened, "/camera", asking.in_frames(given))
+            solved = asking.solve(opened, "/camera", given)
             out.append(scored(count, solved))
         return out
 

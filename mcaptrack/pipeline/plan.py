@@ -453,7 +453,8 @@ class _Planner:
         if not is_due or self.force:
             return ""
         if is_of_corrections(self.opened, self.prefix, result.provenance):
-            return f"corrections of {source} have changed: {again}, as before"
+            changed = "answers about" if stage.kind == "retracker" else "corrections of"
+            return f"{changed} {source} have changed: {again}, as before"
         return f"{topic} was made from an earlier {source}: {again}, as before"
 
     def _kept(self, result: _Result, transform: Transform) -> tuple[str, ...] | None:

@@ -63,7 +63,8 @@ def is_of_corrections(opened: log.Log, prefix: str, provenance: Provenance) -> b
     answers = f"{camera_at(opened, prefix).prefix}/{ANSWERS}"
     is_retracked = provenance.transform in STAGES and STAGES[provenance.transform].kind == "retracker"
     if is_retracked and "transform" not in provenance.plugins:
-        return (answers in opened.channels) != (answers in provenance.references)
+        now = digest_of(opened, answers) if answers in opened.channels else None
+        return provenance.references.get(answers) != now
     if not takes_corrections(provenance.transform):
         return False
     ending = f"/{CORRECTED}"

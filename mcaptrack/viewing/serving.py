@@ -61,6 +61,7 @@ _SHARED: Final = {
     "Access-Control-Allow-Private-Network": "true",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
 }
+_TEXT: Final = "text/plain; charset=utf-8"
 #: More digits than the size of any file has.
 _MANY_DIGITS: Final = 20
 
@@ -84,12 +85,14 @@ class Limits:
 class Page:
     """A page of ours or a file to download: ``content`` makes it when it is asked for, ``policy`` says what it may load
     and run (a Content-Security-Policy). ``is_shared``: other origins may read it, as they may read files.
+    ``is_action``: it changes something, so only POST does it: no link does, and no preview of one.
     """
 
     content: Callable[[], bytes]
     policy: str = "default-src 'none'"
     kind: str = "text/html; charset=utf-8"
     is_shared: bool = False
+    is_action: bool = False
 
 
 class LogPage(NamedTuple):
@@ -359,6 +362,9 @@ class _Handler(BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
         self._answer(with_body=False)
 
+    def do_POST(self) -> None:
+        self._answer(with_body=True)
+
     def do_OPTIONS(self) -> None:
         self._head(HTTPStatus.NO_CONTENT, {})
 
@@ -373,13 +379,22 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, with_body: bool) -> None:
         name = self.path.partition("?")[0]
         content = self.server.served.get(unquote_to_bytes(name.encode("latin-1")))
-        if content is None:
+        is_action = isinstance(content, Page) and content.is_action
+        if self.command == "POST" and not is_action:
+            self.send_error(HTTPStatus.NOT_IMPLEMENTED)
+        elif is_action and self.command != "POST":
+            self._head(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": "POST", "Content-Length": "0"}, _OURS)
+        elif content is None:
             self._head(HTTPStatus.NOT_FOUND, {"Content-Length": "0"})
         elif isinstance(content, Page):
-            body = content.content()
+            status, kind = HTTPStatus.OK, content.kind
+            try:
+                body = content.content()
+            except McaptrackError as error:
+                status, kind, body = HTTPStatus.INTERNAL_SERVER_ERROR, _TEXT, str(error).encode()
             policy = f"{content.policy}; frame-ancestors 'self'"
-            about = {"Content-Type": content.kind, "Content-Security-Policy": policy, "Content-Length": str(len(body))}
-            self._head(HTTPStatus.OK, about, _SHARED if content.is_shared else _OURS)
+            about = {"Content-Type": kind, "Content-Security-Policy": policy, "Content-Length": str(len(body))}
+            self._head(status, about, _SHARED if content.is_shared else _OURS)
             self.wfile.write(body if with_body else b"")
         elif isinstance(content, bytes):
             self._head(HTTPStatus.OK, {"Content-Type": _kind_of(name), "Content-Length": str(len(content))})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,23 +20,28 @@ from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.extensions.review import questions as asking
 from mcaptrack.extensions.review.crops import crops
 from mcaptrack.extensions.review.page import Answer, ReviewServer
-from mcaptrack.extensions.review.questions import Question
-from mcaptrack.files import unreadable
+from mcaptrack.extensions.review.questions import Key, Question
+from mcaptrack.files import read_json
 from mcaptrack.geometry.ragged import find_rows
-from mcaptrack.pipeline.write import Made
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.registry import blamed, find
 from mcaptrack.schema import DECISIONS, TRACKS, Frame
 from mcaptrack.schema.framing import join_frames
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.corrections import ANSWERS
-from mcaptrack.sources.sidecar import SidecarChoice, encoding_for
+from mcaptrack.sources.sidecar import SidecarChoice
 from mcaptrack.viewing.serving import LOOPBACK
 
 _ASKED: Final = "What is asked"
 _SERVED: Final = "Page"
 #: A judge is never certain: its log odds count up to this.
 _MOST_LOG_ODDS: Final = 10.0
+#: The brightness of what is around the box in pictures that a person sees.
+_AROUND: Final = 0.55
+#: A file of answers is at most so large.
+_MOST_BYTES: Final = 2**20
+_SAID: Final[Mapping[str, float | None]] = {"yes": 1.0, "no": 0.0, "skip": None}
 
 
 @dataclass(frozen=True)
@@ -102,13 +106,15 @@ class Review:
     address: str = ""
     host: str = field(default=LOOPBACK, repr=False)
     port: int = field(default=0, repr=False)
-    #: Set when every question was answered or skipped.
+    #: Set when the page says that no more answers follow.
     is_done: threading.Event = field(default_factory=threading.Event, repr=False)
-    _touched: set[tuple[int, int, int, int]] = field(default_factory=set, repr=False)
+    #: What each question is about: also those that were answered before, and can be answered again.
+    _keys: Mapping[str, Key] = field(default_factory=dict, repr=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
     _server: ReviewServer | None = field(default=None, repr=False)
 
     def answer(self, name: str, yes: Answer | float) -> None:
-        """Keep an answer in the log at once; "skip" takes an earlier one back.
+        """Keep an answer in the log at once, in place of an earlier one; "skip" takes that back.
 
         Parameters
         ----------
@@ -123,19 +129,7 @@ class Review:
             If there is no such question or answer, or if the log can't be written.
 
         """
-        if name not in self.questions:
-            raise McaptrackError(f"{self.log} has no question {name}; {offer(name, list(self.questions))}")
-        words: Mapping[Any, float | None] = {"yes": 1.0, "no": 0.0, "skip": None}
-        if not isinstance(yes, float) and yes not in words:
-            raise McaptrackError(f"the answer to {name} is yes, no or skip, not {yes!r:.40}")
-        probability = yes if isinstance(yes, float) else words[yes]
-        before = dict(self.answers)
-        self._touched.add(self.questions[name].key)
-        self.answers.pop(name, None)
-        if probability is not None:
-            self.answers[name] = probability
-        if self.answers != before:
-            self._keep()
+        self._keep({name: yes})
 
     def described(self) -> list[dict[str, Any]]:
         """Return the questions as values of JSON: name, probability of yes, decision, rows, and the answer so far."""
@@ -150,36 +144,39 @@ class Review:
             for name, question in self.questions.items()
         ]
 
-    def _keep(self) -> None:
-        """Write the answers into the log: those of this review in place of earlier ones to the same questions."""
-        with logs.read(self.log, sidecar=SidecarChoice(None)) as opened:
-            earlier = asking.read_answers(opened, self.camera)
-            kept = [row for row in earlier if not {*asking.keys_of(*row)} & self._touched]
-            new = [
-                asking.answer_row(self.questions[name], yes, self.solved.samples) for name, yes in self.answers.items()
-            ]
-            topic = f"{self.camera}/{ANSWERS}"
-            frames = asking.in_frames([*kept, *new])
-            made = Made.of(DECISIONS, frames, Provenance("review", {}))
-            logs.refuse_to_replace_recorded(opened, [topic], "rename it")
-            encoding = encoding_for(opened)
-            with logs.extend(opened, drop=[topic]) as writer:
-                if frames:
-                    metadata = made.provenance.to_metadata()
-                    number = writer.add_channel(topic, made.record_in(encoding), encoding, metadata, group="review")
-                    for t_ns, sequence, payload in made.messages_in(encoding):
-                        writer.add_message(number, t_ns, sequence, payload)
+    def _keep(self, answers: Mapping[str, Answer | float]) -> None:
+        """Write answers into the log, in place of earlier ones to the same questions."""
+        kept: dict[str, float | None] = {}
+        for name, yes in answers.items():
+            if name not in self._keys:
+                raise McaptrackError(f"{self.log} has no question {name}; {offer(name, list(self.questions))}")
+            if not (isinstance(yes, str) and yes in _SAID) and not (isinstance(yes, float) and 0 <= yes <= 1):
+                raise McaptrackError(f"the answer to {name} is yes, no, skip or a probability, not {yes!r:.40}")
+            kept[name] = _SAID[yes] if isinstance(yes, str) else yes
+        with self._lock:
+            with logs.read(self.log, sidecar=SidecarChoice(None)) as opened:
+                opened.lock()
+                topic, earlier = f"{self.camera}/{ANSWERS}", asking.read_answers(opened, self.camera)
+                new = [(self._keys[name], yes) for name, yes in kept.items()]
+                if frames := asking.with_answers(earlier, new, self.solved.samples):
+                    made = Made.of(DECISIONS, frames, Provenance("review", {}))
+                    write(RunState(opened, self.camera, {topic: made}), None)
+                elif earlier:
+                    with logs.extend(opened, drop=[topic]):
+                        pass
+            self.answers = {name: yes for name, yes in {**self.answers, **kept}.items() if yes is not None}
 
     def finish(self, progress: Reports = no_progress) -> ReviewResult:
         """Solve the log again with the answers, and say what they changed."""
-        before, run = self.solved.tracks, None
-        with logs.read(self.log) as opened:
-            topic = f"{self.camera}/retracks"
-            if pipeline.is_stale(opened, topic):
+        run, topic = None, f"{self.camera}/retracks"
+        with self._lock:
+            with logs.read(self.log) as opened:
+                is_stale = pipeline.is_stale(opened, topic)
+            if is_stale:
                 run = mcaptrack.run(self.log, camera=self.camera, tables=False, progress=progress)
-        with logs.read(self.log) as opened:
-            after = opened.frame_columns(topic, TRACKS)
-            self.result = ReviewResult(dict(self.answers), *_changes(before, after), run)
+            with logs.read(self.log) as opened:
+                after = opened.frame_columns(topic, TRACKS)
+                self.result = ReviewResult(dict(self.answers), *_changes(self.solved.tracks, after), run)
         return self.result
 
     def __enter__(self) -> Self:
@@ -204,9 +201,9 @@ class Review:
                     f"{self.log} has no pictures of {self.camera} to show; `--print` lists the questions, and "
                     "`answers=` takes a file of answers"
                 )
-            shown = crops(opened, topic, self.solved.samples, [*self.questions.values()])
+            shown = crops(opened, topic, self.solved.samples, [*self.questions.values()], _AROUND)
         self._server = ReviewServer(self, shown)
-        self.address = self._server.address
+        self.address = self._server.root
         return self
 
     def close(self) -> None:
@@ -232,11 +229,11 @@ def review(
     host: Annotated[str, Option(_SERVED)] = LOOPBACK,
     progress: Reports = no_progress,
 ) -> Review:
-    """Answer what re-tracking is least sure of, and solve the log again.
+    """Answer what re-tracking is least sure of, and re-track again.
 
     A page shows two tracks and asks whether they are one person, or whether a track is a person, where the answer
-    would change most. Keys are y, n, s (skip) and u (undo). Each answer is kept in the log at once, in
-    /camera/answers; after the last one, or Ctrl-C, re-tracking is done again, and obeys. `mcaptrack drop` of this
+    would change most. Keys are y, n, s (skip), u (undo) and f (finish). Each answer is kept in the log at
+    once, in /camera/answers; after `finish`, or Ctrl-C, re-tracking is done again, and obeys. `mcaptrack drop` of this
     channel and `mcaptrack run` take all answers back.
 
     Parameters
@@ -281,39 +278,22 @@ def review(
     if answers is not None and judge is not None:
         raise McaptrackError("`answers=` and `judge=` both answer; leave one out")
     path, file = log_file(log), optional_path(answers)
-    given = None if file is None else _read(file)
+    given = {} if file is None else read_json(file, "a file of answers", _MOST_BYTES, is_unique=True)
+    if not isinstance(given, dict) or not all(isinstance(yes, str) and yes in _SAID for yes in given.values()):
+        raise McaptrackError(f'{file} has no answers; it holds them by question, as in {{"31@50.8-32@51.6": "yes"}}')
     with logs.read(path) as opened:
         prefix = pipeline.find_camera(opened, camera)
         solved = asking.solve(opened, prefix)
-        asked = asking.questions(solved, asking.read_answers(opened, prefix), questions)
-        named = {question.name(opened.start_ns): question for question in asked}
-        out = Review(path, prefix, named, solved, opened.start_ns, host=host, port=port or 0)
-        judged = {} if judge is None else _judged(judge, opened, out)
-    for name, yes in {**(given or {}), **judged}.items():
-        out.answer(name, yes)
-    if given is not None or judge is not None:
+        answered = asking.read_answers(opened, prefix)
+        asked = {question.key: question for question in asking.questions(solved, answered, questions)}
+        keys = {asking.name_of(key, opened.start_ns): key for key in (*asked, *asking.keys_of(answered))}
+        named = {name: asked[key] for name, key in keys.items() if key in asked}
+        out = Review(path, prefix, named, solved, opened.start_ns, host=host, port=port or 0, _keys=keys)
+        given |= {} if judge is None else _judged(judge, opened, out)
+    if file is not None or judge is not None:
+        out._keep(given)
         out.finish(progress)
     return out
-
-
-def _read(file: Path) -> dict[str, Any]:
-    """Return the answers in a file. Raises McaptrackError for another file, and for two answers to one question."""
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        names = [name for name, _ in pairs]
-        if again := [name for name in names if names.count(name) > 1]:
-            raise McaptrackError(f"{file} has two answers to {again[0]}; keep one")
-        return dict(pairs)
-
-    try:
-        content = json.loads(file.read_bytes(), object_pairs_hook=once)
-    except OSError as error:
-        raise unreadable(file, error) from None
-    except (ValueError, RecursionError):
-        raise McaptrackError(f"{file} has no answers: it is not JSON") from None
-    if not isinstance(content, dict) or not all(answer in ("yes", "no", "skip") for answer in content.values()):
-        raise McaptrackError(f'{file} has no answers; it holds them by question, as in {{"31@50.8-32@51.6": "yes"}}')
-    return content
 
 
 def _judged(name: str, opened: logs.Log, review: Review) -> dict[str, float]:
@@ -322,7 +302,7 @@ def _judged(name: str, opened: logs.Log, review: Review) -> dict[str, float]:
     judge, topic = entry.made("__call__"), camera_at(opened, review.camera).pictures
     if not topic:
         raise McaptrackError(f"{review.log} has no pictures of {review.camera} for {entry}")
-    about = {key: question for key, question in review.questions.items() if question.after}
+    about = {key: question for key, question in review.questions.items() if question.before}
     out = {}
     for key, (before, after) in zip(about, crops(opened, topic, review.solved.samples, [*about.values()]), strict=True):
         if before and after:
@@ -336,19 +316,18 @@ def _judged(name: str, opened: logs.Log, review: Review) -> dict[str, float]:
 
 def _changes(before: Sequence[Frame], after: Sequence[Frame]) -> tuple[tuple[int, int], int]:
     """Return the numbers of identities before and after, and of the samples with another one."""
-    old, new = (join_frames(TRACKS, frames) for frames in (before, after))
-    seen = [joined.rows["source_id"] >= 0 for joined in (old, new)]
-    at = find_rows(
-        (old.row_ns[seen[0]], old.rows["source_id"][seen[0]]), (new.row_ns[seen[1]], new.rows["source_id"][seen[1]])
-    )
-    was = np.where(at >= 0, old.rows["track_id"][seen[0]][at], -1)
-    pairs, count = np.unique(np.stack([new.rows["track_id"][seen[1]], was]), axis=1, return_counts=True)
-    kept = {(name, then): number for name, then, number in zip(*pairs.tolist(), count.tolist(), strict=True)}
-    same = 0
-    while kept:  # the largest shares first, each identity once
-        name, then = max(kept, key=lambda pair: kept[pair])
-        same += kept[name, then] if then >= 0 else 0
-        kept = {pair: number for pair, number in kept.items() if pair[0] != name and (pair[1] != then or then < 0)}
-    gone = int(seen[0].sum()) - int((at >= 0).sum())
-    identities = tuple(len(np.unique(joined.rows["track_id"])) for joined in (old, new))
-    return (identities[0], identities[1]), len(was) - same + gone
+    sides = []
+    for joined in (join_frames(TRACKS, frames) for frames in (before, after)):
+        is_sample = joined.rows["source_id"] >= 0
+        sides.append([joined.row_ns[is_sample], *(joined.rows[name][is_sample] for name in ("source_id", "track_id"))])
+    (*key, was), (*new_key, name) = sides
+    at = find_rows((key[0], key[1]), (new_key[0], new_key[1]))
+    is_both = at >= 0
+    pairs, count = np.unique(np.stack([name[is_both], was[at[is_both]]]), axis=1, return_counts=True)
+    same, taken = 0, set[tuple[int, int]]()
+    for number in np.argsort(-count, kind="stable").tolist():  # the largest shares first, each identity once
+        pair = {*enumerate(pairs[:, number].tolist())}
+        if not pair & taken:
+            same, taken = same + int(count[number]), taken | pair
+    rows = len(was) + len(name) - int(is_both.sum()) - same
+    return (len(np.unique(was)), len(np.unique(name))), rows

@@ -29,9 +29,9 @@ class ReviewCommand(Once["Review"]):
         if done.result is None and done.questions and not self.values["print"]:
             with done:
                 show(f"Open {done.address}")
-                if self.values["open"]:
-                    webbrowser.open(done.address)
                 try:
+                    if self.values["open"]:
+                        webbrowser.open(done.address)
                     while not done.is_done.wait(0.2):
                         pass
                 except KeyboardInterrupt:
@@ -51,7 +51,7 @@ class ReviewCommand(Once["Review"]):
 
     def show(self, done: Review, talk: common.Talk) -> None:
         """Print the questions, or what the answers changed."""
-        if not done.questions:
+        if done.result is None and not done.questions:
             show(f"{done.log}: no answer would change anything that re-tracking isn't sure of")
         elif done.result is None:
             for asked in done.described():
@@ -61,7 +61,7 @@ class ReviewCommand(Once["Review"]):
         else:
             before, after = done.result.identities
             count, rows = len(done.result.answers), done.result.rows
-            show(f"{done.log}: {count} of {len(done.questions)} questions answered: {before} identities, now {after}; "
-                 f"{rows} samples have another one")  # fmt: skip
+            show(f"{done.log}: answered {count}; {before} identities, now {after}; {rows} samples have "
+                 "another one")  # fmt: skip
             if count:
                 talk.say(f"more questions: {command('review', done.log)}")

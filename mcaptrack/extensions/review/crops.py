@@ -17,18 +17,18 @@ from mcaptrack.sources.pictures import Pictures
 
 #: Crops of each side at most, of samples at most so many seconds from the gap.
 _CROPS: Final = 4
-_WITHIN_S: Final = 4.0
+_WITHIN_NS: Final = 4 * NS_PER_S
 #: A crop shows so much around its box, as a share of the box on either side.
 _AROUND: Final = 0.25
 
 
 def crops(
-    opened: log.Log, topic: str, samples: Sequence[Frame], asked: Sequence[Question]
+    opened: log.Log, topic: str, samples: Sequence[Frame], asked: Sequence[Question], around: float = 1.0
 ) -> list[tuple[list[Image], list[Image]]]:
     """The crops of both sides of each question, in order of time: (height, width, 3), blue, green, red.
 
-    Pictures of ``topic`` are decoded once, in order. A question about one tracklet has crops of its whole length on
-    one side, and none on the other. Crops of pictures that can't be decoded are left out.
+    Pictures of ``topic`` are decoded once, in order. A question about one tracklet has crops of its whole length after
+    the gap. Crops of pictures that can't be decoded are left out. ``around`` is the brightness outside of the box.
     """
     out: list[tuple[list[Image], list[Image]]] = [([], []) for _ in asked]
     times = np.array([frame.t_ns for frame in samples])
@@ -45,23 +45,32 @@ def crops(
     for picture in pictures.readable(wanted):
         for side, rows in wanted[picture.index]:
             boxes = columns_to_boxes(rows)
-            if len(boxes) and np.isfinite(boxes).all() and (crop := _crop(picture.rows, boxes[0])).size:
+            if len(boxes) and np.isfinite(boxes).all() and (crop := _crop(picture.rows, boxes[0], around)).size:
                 side.append(crop)
     return out
 
 
 def _chosen(times: Ints, tracklet: Tracklet, question: Question) -> list[int]:
     """The numbers of the samples that are shown of a tracklet."""
-    inside = np.flatnonzero((times >= tracklet.begin_ns) & (times <= tracklet.end_ns))
-    if question.after is not None:
-        edge = tracklet.begin_ns if tracklet is question.after else tracklet.end_ns
-        inside = inside[np.abs(times[inside] - edge) <= _WITHIN_S * NS_PER_S]
-    places = np.unique(np.linspace(0, len(inside) - 1, min(_CROPS, len(inside))).round().astype(int))
+    low, high = tracklet.begin_ns, tracklet.end_ns
+    if tracklet is question.before:
+        low = max(low, high - _WITHIN_NS)
+    elif question.before:
+        high = min(high, low + _WITHIN_NS)
+    inside = np.flatnonzero((times >= low) & (times <= high))
+    places = np.linspace(0, len(inside) - 1, min(_CROPS, len(inside))).round().astype(int)
     return [int(number) for number in inside[places]]
 
 
-def _crop(picture: Image, box: Floats) -> Image:
+def _crop(picture: Image, box: Floats, around: float) -> Image:
     left, top, width, height = box
-    low = np.maximum([top - _AROUND * height, left - _AROUND * width], 0).astype(int)
-    high = np.maximum([top + (1 + _AROUND) * height, left + (1 + _AROUND) * width], 0).astype(int) + 1
-    return picture[low[0] : high[0], low[1] : high[1]].copy()
+
+    def cut(share: float) -> tuple[slice, slice]:
+        low = np.maximum([top - share * height, left - share * width], 0).astype(int)
+        high = np.maximum([top + (1 + share) * height, left + (1 + share) * width], 0).astype(int) + 1
+        return slice(low[0], high[0]), slice(low[1], high[1])
+
+    out = picture.copy()
+    out[cut(_AROUND)] = (picture[cut(_AROUND)] * around).astype(np.uint8)
+    out[cut(0)] = picture[cut(0)]
+    return out[cut(_AROUND)].copy()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from base64 import b64encode
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
@@ -21,51 +21,53 @@ Answer = Literal["yes", "no", "skip"]
 _POLICY: Final = policy("review.js", "connect-src 'self'", __package__ or "")
 
 
-class ReviewServer:
+class ReviewServer(Server):
     """Serves the page of a review to the browsers of this machine, and keeps what it answers.
 
-    An answer is a request of an address with a secret word, that other origins can't know.
+    An answer is posted to an address with a secret word, that other origins can't know.
     """
 
     def __init__(self, review: Review, shown: Sequence[Sequence[Sequence[Image]]]) -> None:
-        self._review, self._shown, self._lock = review, shown, threading.Lock()
-        self._open = set(review.questions)
-        names = [*review.questions]
-        answers = {
-            f"{answer}-{number}": Page(partial(self._answered, name, answer), kind="text/plain; charset=utf-8")
-            for number, name in enumerate(names)
+        self._review, self._shown = review, shown
+        actions = {
+            f"{answer}-{number}": partial(review.answer, name, answer)
+            for number, name in enumerate(review.questions)
             for answer in get_args(Answer)
         }
-        self._server = Server(answers, review.port, host=review.host, index=Page(self._index, _POLICY))
-        self.address = self._server.root
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), daemon=True)
+        pages = {
+            name: Page(partial(_acted, action), kind="text/plain", is_action=True)
+            for name, action in {**actions, "finish": review.is_done.set}.items()
+        }
+        super().__init__(pages, review.port, host=review.host, index=Page(self._index, _POLICY))
+        self._thread = threading.Thread(target=self.serve_forever, args=(0.2,), daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """Stop serving."""
-        self._server.shutdown()
+        self.shutdown()
         self._thread.join()
-        self._server.server_close()
-
-    def _answered(self, name: str, answer: Answer) -> bytes:
-        with self._lock:
-            self._review.answer(name, answer)
-            self._open.discard(name)
-            if not self._open:
-                self._review.is_done.set()
-        return b"kept"
+        self.server_close()
 
     def _index(self) -> bytes:
         review = self._review
         asked = []
-        for question, sides in zip(review.questions.values(), self._shown, strict=True):
-            edges = (question.before.end_ns, question.after.begin_ns) if question.after else (question.before.begin_ns,)
-            asked.append(
-                {
-                    "text": "Are these one person?" if question.after else "Is this a person?",
-                    "when": [f"{(t_ns - review.start_ns) / NS_PER_S:.1f} s" for t_ns in edges],
-                    "jpegs": [[b64encode(encode_image(crop, "jpeg")).decode() for crop in side] for side in sides],
-                }
-            )
-        data = {"root": self._server.path("").decode(), "questions": asked}
+        for question, shown in zip(review.questions.values(), self._shown, strict=True):
+            edges = [(f"from {self._at(question.after.begin_ns)}", shown[1])]
+            if question.before:
+                edges.insert(0, (f"until {self._at(question.before.end_ns)}", shown[0]))
+            sides = [
+                {"when": when, "jpegs": [b64encode(encode_image(crop, "jpeg")).decode() for crop in crops]}
+                for when, crops in edges
+            ]
+            asked.append({"text": "Are these one person?" if question.before else "Is this a person?", "sides": sides})
+        first = next((n for n, name in enumerate(review.questions) if name not in review.answers), len(asked))
+        data = {"root": self.path("").decode(), "questions": asked, "first": first}
         return render("review.html", __package__ or "", title=review.log.name, data=data, policy=_POLICY).encode()
+
+    def _at(self, t_ns: int) -> str:
+        return f"{(t_ns - self._review.start_ns) / NS_PER_S:.1f} s"
+
+
+def _acted(action: Callable[[], None]) -> bytes:
+    action()
+    return b"kept"

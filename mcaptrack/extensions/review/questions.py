@@ -8,8 +8,9 @@ Letters: W worlds, K tracklets, E pairs of tracklets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Final
 
 import numpy as np
@@ -18,10 +19,10 @@ from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ragged import find_rows, run_starts
+from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.pipeline.rebuild import rebuild
 from mcaptrack.schema import DECISIONS, TRACKS, WORLDS, DecisionKind, Frame, Rows
-from mcaptrack.schema.framing import join_frames
+from mcaptrack.schema.framing import join_frames, split_rows
 from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.corrections import ANSWERS
 from mcaptrack.transforms import STAGES
@@ -31,6 +32,10 @@ from mcaptrack.transforms.retrack.options import LikelihoodOptions
 _WORLDS: Final = 100
 #: Answers that are less likely to change anything are not asked for.
 _LEAST: Final = 0.5
+
+
+#: The samples that a question is about: track and time before a gap (-1 if none is), and after it.
+Key = tuple[int, int, int, int]
 
 
 @dataclass(frozen=True)
@@ -44,30 +49,22 @@ class Tracklet:
 
 @dataclass(frozen=True)
 class Question:
-    """A question: whether the ends of two tracklets are one person, or, without ``after``, whether one is a person.
+    """A question: whether ``after`` goes on from the end of ``before``, or, without ``before``, whether it is a person.
 
     ``probability`` is that of yes, ``decided`` what re-tracking has decided, and ``rows`` what changes otherwise.
     """
 
-    before: Tracklet
-    after: Tracklet | None
+    before: Tracklet | None
+    after: Tracklet
     probability: float
     decided: bool
     rows: int
 
     @property
-    def key(self) -> tuple[int, int, int, int]:
+    def key(self) -> Key:
         """The samples that it is about: the same question has the same key, also after other answers."""
-        after = self.after or Tracklet(-1, -1, -1)
-        return self.before.source_id, self.before.end_ns, after.source_id, after.begin_ns
-
-    def name(self, start_ns: int) -> str:
-        """Its name, with seconds since the start of the log."""
-        edge = self.before.end_ns if self.after else self.before.begin_ns
-        name = f"{self.before.source_id}@{(edge - start_ns) / NS_PER_S:.3f}"
-        return name + (
-            f"-{self.after.source_id}@{(self.after.begin_ns - start_ns) / NS_PER_S:.3f}" if self.after else ""
-        )
+        end = (self.before.source_id, self.before.end_ns) if self.before else (-1, self.after.begin_ns)
+        return *end, self.after.source_id, self.after.begin_ns
 
     @property
     def value(self) -> float:
@@ -106,7 +103,7 @@ def solve(opened: log.Log, prefix: str, answers: Sequence[Frame] | None = None) 
     return Solved(frames, outputs[""], outputs["decisions"], outputs["worlds"])
 
 
-def questions(solved: Solved, answered: Sequence[tuple[int, Rows]], count: int) -> list[Question]:
+def questions(solved: Solved, answered: Sequence[Frame], count: int) -> list[Question]:
     """The most valuable questions, the best first, without those that a person answered; the same for the same log."""
     worlds = join_frames(WORLDS, solved.worlds)
     if not len(worlds.rows):
@@ -115,57 +112,53 @@ def questions(solved: Solved, answered: Sequence[tuple[int, Rows]], count: int) 
     track = worlds.rows["track_id"][order].reshape(int(worlds.rows["world"].max()), -1)
     first = order[: track.shape[1]]
     rows, begins = worlds.rows[first], worlds.row_ns[first]
-    tracklets = _placed(solved.samples, rows, begins)
-    decided = _decided(solved.tracks, rows, begins)
-    frames = rows["frames"].astype(np.int64)
-    asked = [*_of_pairs(track, decided, tracklets, frames), *_of_people(track, decided, tracklets, frames)]
-    done = {key for answer in answered if answer[1]["probability"][0] in (0, 1) for key in keys_of(*answer)}
-    asked = [question for question in asked if question.key not in done and question.value >= _LEAST]
-    asked.sort(key=lambda question: (-question.value, question.key))
+    tracks = join_frames(TRACKS, solved.tracks)
+    at = find_rows((tracks.row_ns, tracks.rows["source_id"]), (begins, rows["source_id"]))
+    decided = np.where(at >= 0, tracks.rows["track_id"][at], -1 - np.arange(len(at)))  # those left out have no other's
+    is_certain = np.isin(join_frames(DECISIONS, answered).rows["probability"], (0, 1))
+    done = {*compress(keys_of(answered), is_certain)}
+    asked = _asked(track, decided, _tracklets(solved.samples, rows, begins), rows["frames"].astype(np.int64))
     out: list[Question] = []
-    ends: set[tuple[int, int]] = set()
-    for question in asked:  # one question for each end and each beginning: the others follow from its answer
-        sides = {question.key[:2], (question.key[2], -1 - question.key[3])}
-        if not sides & ends or question.after is None:
-            out.append(question)
-            ends |= sides if question.after else set()
+    ends: set[tuple[int, ...]] = set()
+    for question in sorted(asked, key=lambda question: (-question.value, question.key)):
+        before, end_ns, after, begin_ns = question.key
+        exchange = (*sorted([before, after]), begin_ns)
+        sides = {(before, end_ns), (after, begin_ns, 1), exchange} if question.before else set()
+        if question.key in done or question.value < _LEAST or sides & ends:
+            continue  # one for each end, each beginning and each exchange: the others follow from its answer
+        out.append(question)
+        ends |= sides
     return out[:count]
 
 
-def _decided(tracks: Sequence[Frame], tracklets: Rows, begins: Ints) -> Ints:
-    """The track of each tracklet (K,) as it was decided; those that are left out have negative numbers of their own."""
-    joined = join_frames(TRACKS, tracks)
-    at = find_rows((joined.row_ns, joined.rows["source_id"]), (begins, tracklets["source_id"]))
-    return np.where(at >= 0, joined.rows["track_id"][at], -1 - np.arange(len(at)))
-
-
-def _placed(samples: Sequence[Frame], rows: Rows, begins: Ints) -> list[Tracklet]:
+def _tracklets(samples: Sequence[Frame], rows: Rows, begins: Ints) -> list[Tracklet]:
     """The tracklets of worlds, with the times of their last samples: durations are in steps, which may jitter."""
     joined = join_frames(TRACKS, samples)
-    seen = joined.rows["observed"]
-    order = np.lexsort((joined.row_ns[seen], joined.rows["track_id"][seen]))
-    ids, t_ns = joined.rows["track_id"][seen][order], joined.row_ns[seen][order]
-    out = []
-    for row, begin in zip(rows, begins.tolist(), strict=True):
-        low, high = (int(np.searchsorted(ids, row["source_id"], side)) for side in ("left", "right"))
-        first = low + int(np.searchsorted(t_ns[low:high], begin))
-        end = int(t_ns[min(first + int(row["frames"]), high) - 1])
-        out.append(Tracklet(int(row["source_id"]), begin, end))
-    return out
+    order = np.lexsort((joined.row_ns, joined.rows["track_id"]))
+    order = order[joined.rows["observed"][order]]
+    ids, t_ns = joined.rows["track_id"][order], joined.row_ns[order]
+    last = find_rows((ids, t_ns), (rows["source_id"], begins)) + rows["frames"] - 1
+    last = np.minimum(last, np.searchsorted(ids, rows["source_id"], "right") - 1)
+    columns = rows["source_id"].tolist(), begins.tolist(), t_ns[last].tolist()
+    return [Tracklet(*values) for values in zip(*columns, strict=True)]
 
 
-def _of_pairs(track: Ints, decided: Ints, tracklets: Sequence[Tracklet], frames: Ints) -> list[Question]:
-    """A question for each two tracklets that follow each other in a world (W, K), or as was decided."""
+def _asked(track: Ints, decided: Ints, tracklets: Sequence[Tracklet], frames: Ints) -> Iterator[Question]:
+    """Yield a question for each tracklet, and for each two that follow each other in a world (W, K), or as decided."""
+    people = (track >= 0).mean(axis=0), decided >= 0, frames
+    for after, *values in zip(tracklets, *(column.tolist() for column in people), strict=True):
+        yield Question(None, after, *values)
     begins = np.array([tracklet.begin_ns for tracklet in tracklets])
-    pairs = np.unique(np.concatenate([_following(of, begins) for of in (decided, *track)], axis=1), axis=1)
-    a, b = pairs
+    a, b = np.unique(np.concatenate([_following(of, begins) for of in (decided, *track)], axis=1), axis=1)
+    order = np.lexsort((begins, decided))
+    total, of = np.cumsum(frames[order]), decided[order]
+    up_to, since = np.empty_like(frames), np.empty_like(frames)  # samples of its track, each with its own
+    up_to[order] = total - (total - frames[order])[np.searchsorted(of, of)]
+    since[order] = total[np.searchsorted(of, of, "right") - 1] - total + frames[order]
     together = ((track[:, a] == track[:, b]) & (track[:, a] >= 0)).mean(axis=0)
-    heads, tails = _sides(decided, frames)
-    columns = pairs.T, together, decided[a] == decided[b], np.minimum(heads[a], tails[b])
-    return [
-        Question(tracklets[i], tracklets[j], p, is_one, count)
-        for (i, j), p, is_one, count in zip(*(column.tolist() for column in columns), strict=True)
-    ]
+    pairs = a, b, together, decided[a] == decided[b], np.minimum(up_to[a], since[b])
+    for before, after, *values in zip(*(column.tolist() for column in pairs), strict=True):
+        yield Question(tracklets[before], tracklets[after], *values)
 
 
 def _following(track: Ints, begins: Ints) -> Ints:
@@ -175,69 +168,51 @@ def _following(track: Ints, begins: Ints) -> Ints:
     return np.stack([order[same], order[same + 1]])
 
 
-def _sides(track: Ints, frames: Ints) -> tuple[Ints, Ints]:
-    """The samples of the track of each tracklet (K,) up to its end, and from its beginning on."""
-    order = np.argsort(track, kind="stable")
-    total = np.cumsum(frames[order])
-    starts = run_starts(track[order])
-    before = (total - frames[order])[starts][np.cumsum(starts) - 1]
-    heads, tails = np.empty_like(frames), np.empty_like(frames)
-    heads[order] = total - before
-    whole = np.bincount(np.cumsum(starts) - 1, frames[order])[np.cumsum(starts) - 1].astype(np.int64)
-    tails[order] = whole - (total - before) + frames[order]
-    return heads, tails
-
-
-def _of_people(track: Ints, decided: Ints, tracklets: Sequence[Tracklet], frames: Ints) -> list[Question]:
-    """A question for each tracklet: whether it is a person."""
-    columns = (track >= 0).mean(axis=0), decided >= 0, frames
-    return [
-        Question(tracklet, None, p, is_kept, count)
-        for tracklet, p, is_kept, count in zip(tracklets, *(column.tolist() for column in columns), strict=True)
-    ]
-
-
-def keys_of(t_ns: int, rows: Rows) -> list[tuple[int, int, int, int]]:
-    """The keys of the questions that rows of answers at a time are about (``Question.key``)."""
-    gap_ns = np.round(rows["duration_s"] * NS_PER_S).astype(np.int64)
-    return [
-        (int(row["previous_id"]), t_ns - int(gap), int(row["source_id"]), t_ns)
-        if row["kind"] == DecisionKind.JOINED
-        else (int(row["source_id"]), t_ns + int(gap), -1, -1)
-        for row, gap in zip(rows, gap_ns, strict=True)
-    ]
-
-
-def answer_row(question: Question, yes: float, samples: Sequence[Frame]) -> tuple[int, Rows]:
-    """The time and the row of an answer: ``yes`` is the probability that it is yes."""
-    rows = DECISIONS.empty(1)
-    about = question.after or question.before
-    t_ns = about.begin_ns
-    rows["kind"] = DecisionKind.JOINED if question.after else DecisionKind.KEPT
-    rows["track_id"] = rows["alternative_id"] = -1
-    rows["previous_id"] = question.before.source_id if question.after else -1
-    rows["source_id"], rows["probability"] = about.source_id, yes
-    since = (t_ns - question.before.end_ns) if question.after else question.before.end_ns - t_ns
-    rows["duration_s"], rows["frames"] = since / NS_PER_S, 0
-    rows["additional"] = np.nan
-    number = int(np.searchsorted([frame.t_ns for frame in samples], t_ns))
-    sample = samples[number].rows[samples[number].rows["track_id"] == about.source_id][0]
-    for axis in "xy":
-        rows[f"{axis}_m"] = sample[f"{axis}_m"]
-        rows[f"{axis}_px"] = sample[f"{axis}_px"] + sample[f"{'wh'['xy'.index(axis)]}_px"] / 2
-    return t_ns, DECISIONS.check(rows)
-
-
-def in_frames(answers: Sequence[tuple[int, Rows]]) -> list[Frame]:
-    """Rows of answers at their times, as frames in order."""
-    by_time: dict[int, list[Rows]] = {}
-    for t_ns, rows in sorted(answers, key=lambda answer: answer[0]):
-        by_time.setdefault(t_ns, []).append(rows)
-    return [Frame(t_ns, number, DECISIONS.joined(rows)) for number, (t_ns, rows) in enumerate(by_time.items())]
-
-
-def read_answers(opened: log.Log, prefix: str) -> list[tuple[int, Rows]]:
-    """The answers in a log: the time and the row of each."""
+def read_answers(opened: log.Log, prefix: str) -> Sequence[Frame]:
+    """The answers in a log."""
     topic = f"{prefix}/{ANSWERS}"
-    frames = opened.frame_columns(topic, DECISIONS) if topic in opened.channels else ()
-    return [(frame.t_ns, frame.rows[number : number + 1]) for frame in frames for number in range(len(frame.rows))]
+    return opened.frame_columns(topic, DECISIONS) if topic in opened.channels else ()
+
+
+def name_of(key: Key, start_ns: int) -> str:
+    """The name of a question, with seconds since the start of the log."""
+    ends = [f"{track}@{(t_ns - start_ns) / NS_PER_S:.3f}" for track, t_ns in (key[:2], key[2:])]
+    return ends[1] if key[0] < 0 else "-".join(ends)
+
+
+def keys_of(answers: Sequence[Frame]) -> list[Key]:
+    """The key of the question that each row of answers is about (``Question.key``)."""
+    joined = join_frames(DECISIONS, answers)
+    gap_ns = np.round(joined.rows["duration_s"] * NS_PER_S).astype(np.int64)
+    columns = joined.rows["previous_id"], joined.row_ns - gap_ns, joined.rows["source_id"], joined.row_ns
+    return [*zip(*(column.tolist() for column in columns), strict=True)]
+
+
+def with_answers(
+    answers: Sequence[Frame], new: Sequence[tuple[Key, float | None]], samples: Sequence[Frame]
+) -> list[Frame]:
+    """``answers`` with new ones in place of those to the same questions: the probability of yes, or None for none."""
+    again = {key for key, _ in new}
+    earlier, seen = join_frames(DECISIONS, answers), join_frames(TRACKS, samples)
+    kept = np.array([key not in again for key in keys_of(answers)], bool)
+    keys = [key for key, yes in new if yes is not None]
+    before, end_ns, after, t_ns = np.array(keys, np.int64).reshape(-1, 4).T
+    at = seen.rows[find_rows((seen.row_ns, seen.rows["track_id"]), (t_ns, after))]
+    rows = DECISIONS.rows(
+        kind=np.where(before < 0, DecisionKind.KEPT, DecisionKind.JOINED),
+        track_id=np.full(len(at), -1),
+        alternative_id=np.full(len(at), -1),
+        previous_id=before,
+        source_id=after,
+        probability=[yes for _, yes in new if yes is not None],
+        duration_s=(t_ns - end_ns) / NS_PER_S,
+        frames=np.zeros(len(at), np.int64),
+        x_m=at["x_m"],
+        y_m=at["y_m"],
+        x_px=at["x_px"] + at["w_px"] / 2,
+        y_px=at["y_px"] + at["h_px"] / 2,
+    )
+    times = np.concatenate([earlier.row_ns[kept], t_ns])
+    order = np.argsort(times, kind="stable")
+    rows, steps = DECISIONS.joined([earlier.rows[kept], rows])[order], np.unique(times)
+    return split_rows(steps.tolist(), range(len(steps)), rows, np.searchsorted(times[order], steps, "right"))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 import urllib.error
 import urllib.request
+import webbrowser
 from collections.abc import Sequence
 
 import numpy as np
@@ -37,8 +39,9 @@ def scene(seed: int) -> list[Frame]:
 
 
 def solved_with(frames: list[Frame], answers: Sequence[tuple[asking.Question, float]] = ()) -> Solved:
-    given = asking.in_frames([asking.answer_row(question, yes, frames) for question, yes in answers])
-    made = Retrack(worlds=20, answers=given)
+    made = Retrack(
+        worlds=20, answers=asking.with_answers((), [(question.key, yes) for question, yes in answers], frames)
+    )
     out = dict(zip(made.writes, map(list, zip(*made(frames), strict=True)), strict=True))
     return Solved(frames, out[""], out["decisions"], out["worlds"])
 
@@ -51,10 +54,10 @@ def track_at(solved: Solved, t_ns: int, source: int) -> int | None:
 
 
 def obeys(solved: Solved, question: asking.Question, yes: bool) -> bool:
-    before = track_at(solved, question.before.end_ns, question.before.source_id)
-    if question.after is None:
-        return (track_at(solved, question.before.begin_ns, question.before.source_id) is not None) is yes
     after = track_at(solved, question.after.begin_ns, question.after.source_id)
+    if question.before is None:
+        return (after is not None) is yes
+    before = track_at(solved, question.before.end_ns, question.before.source_id)
     return (before == after) if yes else (before != after or before is None)
 
 
@@ -81,7 +84,7 @@ def test_the_same_log_has_the_same_questions_fewer_are_the_first_and_answered_on
     assert asking.questions(solved_with(frames), [], 8) == asked
     assert asking.questions(solved, [], 3) == asked[:3]
     assert [question.value for question in asked] == sorted((q.value for q in asked), reverse=True)
-    answered = [asking.answer_row(question, 1.0, frames) for question in asked[:2]]
+    answered = asking.with_answers((), [(question.key, 1.0) for question in asked[:2]], frames)
     again = asking.questions(solved, answered, 100)
     assert not {question.key for question in again} & {question.key for question in asked[:2]}
 
@@ -158,6 +161,13 @@ def test_a_file_of_answers_is_kept_obeyed_and_taken_back_by_drop(own, tmp_path):
     assert question["name"] not in {one["name"] for one in described(own)}
     done("run", own, "-q", "--no-tables")  # nothing is due: the tracks know the answers that they were made with
     assert len(mcaptrack.run(own, tables=False).stages) == 0
+    changed = log_tracks(own)
+    file.write_text(json.dumps({question["name"]: "skip"}))  # an earlier answer can be given again, or taken back
+    assert printed("review", own, "--answers", file, "-q")[0].count("answered 0")
+    assert log_tracks(own) == before
+    file.write_text(json.dumps({question["name"]: "no" if question["decided"] == "yes" else "yes"}))
+    done("review", own, "--answers", file, "-q")
+    assert log_tracks(own) == changed
     done("drop", own, "/camera/answers", "-q")
     done("run", own, "-q", "--no-tables")
     assert log_tracks(own) == before
@@ -202,9 +212,11 @@ def test_an_answer_that_is_interrupted_leaves_the_log_before_it(own, monkeypatch
 def test_bad_answers_are_refused_in_a_line(own, tmp_path):
     name, file = described(own)[0]["name"], tmp_path / "answers.json"
     for content, text in (
-        (f'{{"{name}": "yes", "{name}": "no"}}', "has two answers to"),
         (f'{{"{name}": "perhaps"}}', "has no answers; it holds them by question"),
-        ("[", "is not JSON"),
+        (f'{{"{name}": "yes", "{name}": "no"}}', "stands there twice"),
+        ("[", "is not valid JSON"),
+        (f'{{"{name}": ["yes"]}}', "has no answers; it holds them by question"),
+        (f'{{"{name}": "yes", "1@2": "no"}}', "has no question 1@2"),
         ('{"1@2": "yes"}', "has no question 1@2"),
     ):
         file.write_text(content)
@@ -240,7 +252,7 @@ def test_a_judge_weighs_where_there_are_pictures_and_is_never_certain(seen, tmp_
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(asking, "_LEAST", 0.0)
     review = mcaptrack.review(own, judge="alike:Alike", questions=50)
-    asked = [name for name, question in review.questions.items() if question.after]
+    asked = [name for name, question in review.questions.items() if question.before]
     assert asked
     assert {*review.answers} == {*asked}
     assert all(0.9 < yes < 1 for yes in review.answers.values())
@@ -268,12 +280,61 @@ def test_the_page_keeps_each_answer_at_once_and_takes_it_back(seen, tmp_path, mo
         tab.run(key % "n")
         tab.wait(number % 2)
         tab.run(key % "s")
+        tab.wait("document.getElementById('text').textContent.startsWith('That was the last')")
+        assert not review.is_done.is_set()
+        tab.run(key % "f")
         tab.wait("document.getElementById('text').textContent.startsWith('Thank')")
         assert review.is_done.is_set()
         assert review.answers == {first: 0.0}
         assert tab.said == []
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(review.address + "yes-0")
+
+
+def test_every_option_of_the_command_has_an_effect(seen, tmp_path, monkeypatch):
+    own, opened = shutil.copyfile(seen, tmp_path / "walk.mcap"), []
+    monkeypatch.setattr(asking, "_LEAST", 0.0)
+    assert len(json.loads(printed("review", own, "--print", "--json", "--questions", 1, "-q")[0])["questions"]) == 1
+    assert "has no camera other" in call("review", own, "--camera", "other").err
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert f"port {port} of this machine can't be used" in call("review", own, "--port", port).err
+    assert "port 0 of this machine can't be used" in call("review", own, "--host", "192.0.2.1").err
+
+    def open_and_stop(address: str) -> None:
+        opened.append(address)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(webbrowser, "open", open_and_stop)
+    assert "answered 0" in done("review", own, "--open").out
+    assert opened[0].startswith("http://127.0.0.1:")
+
+
+def test_only_a_post_answers(seen, tmp_path, monkeypatch):
+    """Neither GET nor HEAD, as previews of links send them, and an answer that can't be kept says why."""
+    own = shutil.copyfile(seen, tmp_path / "walk.mcap")
+    monkeypatch.setattr(asking, "_LEAST", 0.0)
+    with mcaptrack.review(own, questions=1) as review:
+        page = urllib.request.urlopen(review.address).read().decode()
+        address = review.address.rstrip("/") + json.loads(page.partition('id="data">')[2].partition("<")[0])["root"]
+        for method, status in (("GET", 405), ("HEAD", 405), ("PUT", 501), ("POST", 200)):
+            assert review.answers == {}
+            assert asked_by(method, f"{address}yes-0")[0] == status
+        assert list(review.answers.values()) == [1.0]
+        assert asked_by("POST", review.address)[0] == 501
+        own.unlink()
+        status, text = asked_by("POST", f"{address}no-0")
+        assert status == 500
+        assert "does not exist" in text
+        assert list(review.answers.values()) == [1.0]
+
+
+def asked_by(method: str, address: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, method=method)) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
 
 
 def kept(path) -> list[float]:

@@ -1,46 +1,54 @@
 "use strict";
-const { root, questions } = JSON.parse(document.getElementById("data").textContent);
+const { root, questions, first } = JSON.parse(document.getElementById("data").textContent);
 const at = (id) => document.getElementById(id);
-let number = 0, isBusy = false;
+const keys = { y: "yes", n: "no", s: "skip", u: "undo", f: "finish" };
+let number = first, isBusy = false, isFinished = false;
 function show() {
-  const one = questions[number];
-  at("count").textContent = one ? `question ${number + 1} of ${questions.length}` : "";
-  at("text").textContent = one ? one.text : "Thank you. The log is solved again; close this page.";
-  at("sides").replaceChildren(...(one ? one.when : []).map((when, side) => {
+  const asked = isFinished ? undefined : questions[number];
+  at("count").textContent = asked ? `question ${number + 1} of ${questions.length}` : "";
+  at("text").textContent = asked ? asked.text
+    : isFinished ? "Thank you. The log is solved again; close this page." : "That was the last question: finish.";
+  at("sides").replaceChildren(...(asked ? asked.sides : []).map(({ when, jpegs }) => {
     const figure = document.createElement("figure"), caption = document.createElement("figcaption");
-    caption.textContent = one.when.length > 1 ? (side ? `from ${when}` : `until ${when}`) : `from ${when}`;
+    caption.textContent = when;
     const pictures = document.createElement("div");
-    for (const jpeg of one.jpegs[side]) {
+    for (const jpeg of jpegs) {
       const picture = document.createElement("img");
       picture.src = `data:image/jpeg;base64,${jpeg}`;
-      picture.alt = caption.textContent;
+      picture.alt = when;
       pictures.append(picture);
     }
-    if (!one.jpegs[side].length) pictures.textContent = "no picture of this can be shown";
+    if (!jpegs.length) pictures.textContent = "no picture of this can be shown";
     figure.append(caption, pictures);
     return figure;
   }));
-  for (const id of ["yes", "no", "skip"]) at(id).disabled = !one;
-  at("undo").disabled = !number || !one;
+  at("which").hidden = !asked || asked.sides.length < 2;
+  at("how").hidden = isFinished;
+  for (const id of ["yes", "no", "skip"]) at(id).hidden = !asked;
+  at("undo").hidden = !number || isFinished;
+  at("finish").hidden = isFinished;
 }
 async function answer(id) {
-  if (isBusy || at(id).disabled) return;
+  if (isBusy || at(id).hidden) return;
   isBusy = true;
   const about = id === "undo" ? number - 1 : number;
+  const name = id === "finish" ? id : `${id === "undo" ? "skip" : id}-${about}`;
+  let note = "";
   try {
-    const reply = await fetch(`${root}${id === "undo" ? "skip" : id}-${about}`, { cache: "no-store" });
-    if (!reply.ok) throw new Error(await reply.text());
-    number = id === "undo" ? about : number + 1;
-    at("note").textContent = "";
+    const reply = await fetch(root + name, { method: "POST" });
+    if (reply.ok) number = id === "undo" ? about : id === "finish" ? number : number + 1;
+    else note = `This answer was not kept: ${await reply.text()}`;
   } catch {
-    at("note").textContent = "This answer was not kept: the command that asks has ended, or the log can't be written.";
+    if (id !== "finish") note = "This answer was not kept: the command that asks has ended.";
   }
+  at("note").textContent = note;
+  isFinished = id === "finish";
   isBusy = false;
   show();
 }
-for (const id of ["yes", "no", "skip", "undo"]) at(id).addEventListener("click", () => answer(id));
+for (const id of Object.values(keys)) at(id).addEventListener("click", () => answer(id));
 document.addEventListener("keydown", (event) => {
-  const id = { y: "yes", n: "no", s: "skip", u: "undo" }[event.key];
-  if (id && !event.ctrlKey && !event.metaKey && !event.altKey) answer(id);
+  const id = keys[event.key];
+  if (id && !event.repeat && !event.ctrlKey && !event.metaKey && !event.altKey) answer(id);
 });
 show();
