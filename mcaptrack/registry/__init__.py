@@ -290,7 +290,7 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
         return Entry(name, kind, implementation, implementation.__module__, *distribution_of(implementation.__module__))
     named = [point for point in points(kind) if point.name == name]
     if not named:
-        raise McaptrackError((missing_extension(name) if kind == "command" else "") or _unknown(kind, name))
+        raise McaptrackError(missing_extension(name, kind) or _unknown(kind, name))
     named = [point for point in named if point.package[0] == distribution] or named
     if len(named) > 1:
         values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))

@@ -232,7 +232,7 @@ def review(
     host: Annotated[str, Option(_SERVED)] = LOOPBACK,
     progress: Reports = no_progress,
 ) -> Review:
-    """Answer what re-tracking is least sure of, and solve the log again.
+    """Answer what re-tracking is least sure of, and solve it again.
 
     A page shows two tracks and asks whether they are one person, or whether a track is a person, where the answer
     would change most. Keys are y, n, s (skip) and u (undo). Each answer is kept in the log at once, in
