@@ -68,11 +68,9 @@ def missing_extension(name: str, kind: str = "name") -> str:
     extensions from outside.
     """
     stub = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
-    is_in_python = kind in ("name", "command")
-    start, end = (
-        ("from ", rf"\S* import {re.escape(name)} as") if is_in_python else (f"# {kind} {re.escape(name)}: ", "$")
-    )
-    match = re.search(rf"^{start}{re.escape(_EXTENSIONS)}\.(\w+){end}", stub, re.M)
+    place, own = rf"{re.escape(_EXTENSIONS)}\.(\w+)", re.escape(name)
+    in_python = kind in ("name", "command")
+    match = re.search(rf"^from {place}\S* import {own} as" if in_python else rf"^# {kind} {own}: {place}$", stub, re.M)
     folder = f"mcaptrack/extensions/{match[1]}" if match else ""
     return f"{name} is an extension that isn't installed; install mcaptrack again, with {folder}" if folder else ""
 
