@@ -147,3 +147,10 @@ __all__ = [
 ]
 __version__: str
 SCHEMA_VERSION: int
+
+# What extensions have beside these, for the message that names what is missing:
+# exporter boxes-csv: mcaptrack.extensions.exchange
+# exporter coco: mcaptrack.extensions.exchange
+# exporter cvat: mcaptrack.extensions.exchange
+# exporter kitti: mcaptrack.extensions.exchange
+# exporter rerun: mcaptrack.extensions.rerun

@@ -61,13 +61,16 @@ def declared() -> Declared:
     return _declared(_places())
 
 
-def missing_extension(name: str) -> str:
-    """Say what to do about a name of mcaptrack that is of an extension which isn't installed; "" for other names.
+def missing_extension(name: str, kind: str = "name") -> str:
+    """Say what to do about a name that is of an extension which isn't installed; "" for other names.
 
-    The stub for type checkers says which names those are: it alone names extensions from outside.
+    The stub for type checkers says which names those are, in Python and, in comments, of other kinds: it alone names
+    extensions from outside.
     """
     stub = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
-    match = re.search(rf"^from {_EXTENSIONS}\.(\w+)\S* import {re.escape(name)} as", stub, re.M)
+    place, own = rf"{re.escape(_EXTENSIONS)}\.(\w+)", re.escape(name)
+    in_python = kind in ("name", "command")
+    match = re.search(rf"^from {place}\S* import {own} as" if in_python else rf"^# {kind} {own}: {place}$", stub, re.M)
     folder = f"mcaptrack/extensions/{match[1]}" if match else ""
     return f"{name} is an extension that isn't installed; install mcaptrack again, with {folder}" if folder else ""
 

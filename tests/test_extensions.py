@@ -25,7 +25,6 @@ import mcaptrack
 from mcaptrack import log, testing
 from mcaptrack.api.declared import declared
 from mcaptrack.choices import BagFormat, BoxFormat, TableFormat
-from mcaptrack.cli.group import _LISTED
 from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS
@@ -113,7 +112,6 @@ def test_the_names_of_options_are_those_of_the_registry():
 
     exporters = (*get_args(TableFormat), *get_args(BagFormat), *get_args(BoxFormat))
     assert exporters == tuple(BUILT_IN["exporter"])
-    assert set(BUILT_IN["command"]) == {name for name, *_ in _LISTED}
 
 
 def test_doctor_lists_what_packages_bring_and_what_of_it_fails(site):

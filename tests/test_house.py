@@ -17,6 +17,8 @@ from mcaptrack.installed import declared
 ROOT = Path(__file__).parent.parent
 POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 EXTENSIONS = sorted(path.parent.name for path in (ROOT / "mcaptrack" / "extensions").glob("*/__init__.py"))
+#: Groups of what users choose by name, beside commands and names in Python.
+CHOSEN = POINTS.keys() - {f"mcaptrack.{kind}s" for kind in ("command", "name", "page", "player", "viewer")}
 #: Says of a house which commands its help lists, what becomes of names, and which modules of the core can't be imported.
 ASK = """
 import importlib, io, json, pkgutil, sys
@@ -31,13 +33,20 @@ def call(*words):
         except SystemExit:
             return out.getvalue()
 
-names, core = json.loads(sys.argv[1])
+from mcaptrack.registry import find
+
+names, parts, core = json.loads(sys.argv[1])
 said = {}
 for name in names:
     try:
         said[name] = getattr(mcaptrack, name).__module__
     except AttributeError as error:
         said[name] = str(error)
+for kind, name in parts:
+    try:
+        said[f"{kind} {name}"] = find(kind, name).module
+    except mcaptrack.McaptrackError as error:
+        said[f"{kind} {name}"] = str(error)
 broken = []
 for module in pkgutil.walk_packages(mcaptrack.__path__, "mcaptrack.") if core else ():
     if not module.name.startswith(("mcaptrack.extensions", "mcaptrack.__main__")):
@@ -78,8 +87,9 @@ def house_without(extensions: list[str], folder: Path) -> None:
 
 def ask(folder: Path, *, core: bool) -> dict[str, Any]:
     names = sorted({name for group in ("commands", "names") for name in POINTS[f"mcaptrack.{group}"]})
+    parts = [(group.partition(".")[2][:-1], name) for group in CHOSEN for name in POINTS[group]]
     done = subprocess.run(
-        [sys.executable, "-c", ASK, json.dumps([names, core])], cwd=folder, env={"PYTHONPATH": str(folder), "COLUMNS": "200"},
+        [sys.executable, "-c", ASK, json.dumps([names, parts, core])], cwd=folder, env={"PYTHONPATH": str(folder), "COLUMNS": "200"},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert not done.returncode, done.stderr
@@ -102,6 +112,11 @@ def test_without_an_extension_the_rest_works_and_what_is_missing_is_named(gone, 
             if group == "commands":
                 assert (f"\n  {name} " in said["help"]) is is_there
                 assert (f"mcaptrack: {text}{room_of(value)}\n" == said["commands"][name]) is not is_there
+    for group in CHOSEN:
+        for name, value in POINTS[group].items():
+            text = f"{name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/"
+            is_named = said["names"][f"{group.partition('.')[2][:-1]} {name}"] == f"{text}{room_of(value)}"
+            assert is_named is (room_of(value) in missing)
     assert "\n  ingest " in said["help"]
 
 

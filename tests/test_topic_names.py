@@ -64,7 +64,7 @@ FUNCTIONS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     ),
     "drop": ("decisions", _of_copy(lambda p, t, o: mcaptrack.drop(p, t, output=o))),
     "cut": ("tracks", lambda p, t, o: mcaptrack.cut(p, o / "copy.mcap", topic=t).messages),
-    "export": ("tracks", lambda p, t, f: dict(mcaptrack.export(p, f / "a.xml", form="cvat", topic=t).rows)),
+    "export": ("tracks", lambda p, t, f: dict(mcaptrack.export(p, f / "a.txt", form="mot", topic=t).rows)),
     "render": ("tracks", lambda p, t, f: mcaptrack.render(p, f / "a.mp4", topic=t, end_s=0.3).views),
     "evaluate": ("tracks", lambda p, t, _: repr(mcaptrack.evaluate(p, topic=t).rows)),
     "tune": (

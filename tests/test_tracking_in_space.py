@@ -195,7 +195,11 @@ def test_what_transforms_and_boxes_lack_is_one_line(boxes, keep, count, words, t
     assert result.frames == {"/lidar/tracks": count}
     assert sum(words in line for line in said(result)) == 1, said(result)
     assert not any("\n" in line for line in said(result))
-    kept = mcaptrack.query(path, "select message from warnings where topic = '/lidar/tracks'").column("message").to_pylist()
+    kept = (
+        mcaptrack.query(path, "select message from warnings where topic = '/lidar/tracks'")
+        .column("message")
+        .to_pylist()
+    )
     assert sum(words in line for line in kept) == 1
     assert not any(path.name in line for line in kept)
 

@@ -117,7 +117,11 @@ class CalibrateResult:
     seconds: float = 0.0
 
 
-@declared(most_used=("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"))
+@declared(
+    most_used=("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
+    heading="Improve and repair",
+    printed_by="mcaptrack.cli.calibrate:Calibrate",
+)
 def calibrate(
     log: EachLog,
     *,

@@ -27,7 +27,7 @@ _LEAST_BYTES_PER_S, _PATIENCE_S = 2000, 60
 _CHUNK = 4096
 
 
-@declared()
+@declared(printed_by="mcaptrack.cli.models:Models")
 def models(
     name: Annotated[
         str | None,

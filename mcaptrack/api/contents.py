@@ -182,7 +182,7 @@ class LogInfo:
         return out | {"channels": list(out["channels"]), "frames": None if self.frames is None else list(out["frames"])}
 
 
-@declared()
+@declared(heading="Start here", printed_by="mcaptrack.cli.show:Info")
 def info(log: EachLog, *, frames: bool = False) -> LogInfo:
     """Show the channels of a log, and what was made from what.
 

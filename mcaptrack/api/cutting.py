@@ -63,7 +63,11 @@ class CutResult:
     warnings: tuple[Notice, ...]
 
 
-@declared(most_used=("output", "start_s", "end_s", "around", "topic", "exclude", "force"))
+@declared(
+    most_used=("output", "start_s", "end_s", "around", "topic", "exclude", "force"),
+    heading="Results",
+    printed_by="mcaptrack.cli.files:Cut",
+)
 def cut(
     log: Annotated[PathLike | Sequence[PathLike], Argument("logs", "LOG", LOGS)],
     output: Annotated[PathLike | None, output("LOG.cut.mcap beside the log")] = None,

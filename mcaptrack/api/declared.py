@@ -321,9 +321,9 @@ def declared(
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help.
 
-    What the annotations say of parameters that the docstring leaves out is added to it. For commands of entry points:
-    ``heading`` is theirs in ``mcaptrack --help``, which reads it from the source, and ``printed_by`` the class that
-    prints the result, as MODULE:CLASS (of the kind ``mcaptrack.cli.declared.Once``, or ``mcaptrack.cli.many.EachLog``).
+    What the annotations say of parameters that the docstring leaves out is added to it. ``heading`` is that of the
+    command in ``mcaptrack --help``, which reads it from the source, and ``printed_by`` the class that prints the
+    result, as MODULE:CLASS (of the kind ``mcaptrack.cli.declared.Once``, or ``mcaptrack.cli.many.EachLog``).
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:

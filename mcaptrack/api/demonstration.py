@@ -58,7 +58,7 @@ class DemoResult:
     warnings: tuple[Notice, ...]
 
 
-@declared()
+@declared(heading="Start here", printed_by="mcaptrack.cli.demo:Demo")
 def demo(
     output: Annotated[PathLike, Option(FILES, short="o", shown=True)] = "mcaptrack-demo",
     *,

@@ -24,7 +24,11 @@ from mcaptrack.api.options import (
 from mcaptrack.choices import Similarity
 
 
-@declared(most_used=("topic", "similarity", "gate_m", "output", "force"))
+@declared(
+    most_used=("topic", "similarity", "gate_m", "output", "force"),
+    heading="Results",
+    printed_by="mcaptrack.cli.running:Events",
+)
 def events(
     log: EachLog,
     *,

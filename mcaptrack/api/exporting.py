@@ -121,7 +121,11 @@ class _Part(NamedTuple):
         return MessagesPart(self.blobs, self.columns, *span)
 
 
-@declared(most_used=("form", "topic", "all_topics", "output", "force"))
+@declared(
+    most_used=("form", "topic", "all_topics", "output", "force"),
+    heading="Results",
+    printed_by="mcaptrack.cli.show:Export",
+)
 def export(
     log: EachLog,
     output: Annotated[PathLike | None, output("LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log")] = None,

@@ -46,7 +46,10 @@ def _of_feet(name: str) -> Option:
     )
 
 
-@declared(most_used=("to", "cameras", "clock_offset_s", "min_score", "output", "force"))
+@declared(
+    most_used=("to", "cameras", "clock_offset_s", "min_score", "output", "force"),
+    printed_by="mcaptrack.cli.running:Fuse",
+)
 def fuse(
     log: EachLog,
     *,

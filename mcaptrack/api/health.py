@@ -193,7 +193,7 @@ class DoctorResult:
         return data | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
 
 
-@declared()
+@declared(heading="Improve and repair", printed_by="mcaptrack.cli.doctor:Doctor")
 def doctor(
     store: Annotated[
         str | None, Argument("store", "STORE", "A bucket or prefix to try, such as s3://robots/night.")

@@ -110,6 +110,8 @@ class IngestResult:
 
 @declared(
     most_used=("output", "into", "role", "ground_plane", "truth", "detections", "fps", "camera", "force"),
+    heading="Start here",
+    printed_by="mcaptrack.cli.ingest:Ingest",
 )
 def ingest(
     source: Source,

@@ -28,7 +28,7 @@ else:
 QUERY: Final = "Query and answer"
 
 
-@declared()
+@declared(heading="Results", printed_by="mcaptrack.cli.query:Query")
 def query(
     log: Annotated[
         PathLike | Sequence[PathLike],

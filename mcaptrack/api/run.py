@@ -47,6 +47,8 @@ _AGAIN: Final = "The {kind}, also where another one was used before"
 
 @declared(
     most_used=("output", "topic", "camera", "detector", "tracker", "retracker", "predictor", "zones", "force"),
+    heading="Start here",
+    printed_by="mcaptrack.cli.running:Run",
 )
 def run(
     log: EachLog,

@@ -312,7 +312,7 @@ def _check_name(name: str, row: Mapping[str, Any]) -> None:
 _Gates = Annotated[float | Sequence[float] | Floats, replace(gate_m(), commas=True, tuning=r"[0-9.eE+, -]+")]
 
 
-@declared()
+@declared(heading="Results", printed_by="mcaptrack.cli.evaluate:Evaluate")
 def evaluate(
     tracks: Annotated[
         PathLike | Sequence[PathLike],

@@ -55,7 +55,7 @@ class LogCheck:
         return tuple(finding for file in self.files for finding in file.findings)
 
 
-@declared()
+@declared(heading="Improve and repair", printed_by="mcaptrack.cli.files:Check")
 def check(log: EachLog, *, progress: Reports = no_progress) -> LogCheck:
     """Check every byte of a log.
 
@@ -122,7 +122,7 @@ class LogRecovery:
     warnings: tuple[Notice, ...]
 
 
-@declared()
+@declared(heading="Improve and repair", printed_by="mcaptrack.cli.files:Recover")
 def recover(
     log: EachLog,
     output: Annotated[PathLike | None, output("LOG.recovered.mcap beside the log")] = None,
@@ -193,7 +193,7 @@ class DropResult:
     warnings: tuple[Notice, ...]
 
 
-@declared()
+@declared(heading="Improve and repair", printed_by="mcaptrack.cli.files:Drop")
 def drop(
     log: Annotated[PathLike, OneOfMany("logs", "LOG", _ONE_LOG, is_one=True, help="The log.")],
     topics: Annotated[str | Sequence[str], Argument("topics", "TOPIC", _TOPICS, help=_TOPICS)],

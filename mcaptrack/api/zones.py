@@ -42,7 +42,9 @@ def zones_of(source: ZonesLike | None) -> tuple[Zone, ...]:
     return read_zones(as_path(source))
 
 
-@declared(most_used=("zones", "topic", "camera", "output", "force"))
+@declared(
+    most_used=("zones", "topic", "camera", "output", "force"), heading="Results", printed_by="mcaptrack.cli.zones:Zones"
+)
 def zones(
     log: EachLog,
     *,

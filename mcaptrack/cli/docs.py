@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError, did_you_mean
 Pages = dict[str, Path]
 
 
-@declared()
+@declared(heading="Improve and repair", printed_by="mcaptrack.cli.docs:Docs")
 def documentation(
     page: Annotated[str | None, Argument("page", "PAGE", "The page to print.", shown="a list of the pages")] = None,
 ) -> Pages:

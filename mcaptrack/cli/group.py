@@ -1,4 +1,4 @@
-"""All commands by name. One is made when it is called: ``mcaptrack --help`` makes none, and shows this table."""
+"""All commands by name. One is made when it is called: ``mcaptrack --help`` makes none, and reads their sources."""
 
 from __future__ import annotations
 
@@ -21,34 +21,38 @@ from mcaptrack.cli.text import log_format, refuse_usage
 from mcaptrack.environment import variable
 from mcaptrack.errors import command
 from mcaptrack.installed import Declared, declared, missing_extension
-from mcaptrack.registry import BUILT_IN, Kind, load, points, titled
+from mcaptrack.registry import BUILT_IN, Kind, points
 
-_FIRST, _STEP, _RESULTS, _IMPROVE = "Start here", "One step alone", "Results", "Improve and repair"
-_OF_PACKAGES = "Of installed packages"
+#: The headings of commands that declare none: of mcaptrack, and of other packages.
+_STEP, _OF_PACKAGES = "One step alone", "Of installed packages"
 #: The options of the program, which may stand before the command or after it.
 PROGRAM_OPTIONS: Final = ("--config", "--log-format")
 
 
 class Listed(NamedTuple):
-    """A command: its heading in the help, and where its class and its function are, as MODULE:NAME.
-
-    A command without a class of its own prints what its function returns. ``package`` is that of a stranger.
-    """
+    """A command: the MODULE:NAME of its function, or of the class of a stage; ``package`` is that of a stranger."""
 
     name: str
-    panel: str
     place: str
-    function: str
+    kind: Kind = "command"
     package: str = ""
 
     @property
     def command(self) -> Any:
         """The class of the command (``cli.declared.Called``), which is imported now."""
-        if self.place:
-            return load(titled("command", self.name), self.place)
+        if self.kind == "stage" or self.name in BUILT_IN["stage"]:
+            from mcaptrack.cli.stages import StageCommand
+
+            return StageCommand
         from mcaptrack.cli.installed import class_of
 
         return class_of(self.name)
+
+    @property
+    def panel(self) -> str:
+        """Its heading in the help, which is read from the source."""
+        heading = re.search(r'\bheading="([ -~]+?)"', _in_source(self.place).get("declared") or "")
+        return heading[1] if heading else _OF_PACKAGES if self.package else _STEP
 
     @property
     def summary(self) -> str:
@@ -56,7 +60,7 @@ class Listed(NamedTuple):
 
         It is read from the source, because an import of all commands takes half a second.
         """
-        text = _in_source(self.function).get("doc") or ""
+        text = _in_source(self.place).get("doc") or ""
         if not (text or self.package):
             text = (self.command.declaration(self.name).__doc__ or "").partition("\n\n")[0]
         line = "".join(character for character in " ".join(text.split()) if character.isprintable())
@@ -89,37 +93,8 @@ def _source_of(module: str) -> str:
         return ""
 
 
-_STAGE: Final = "stages:StageCommand"
-#: The commands of the core: name, heading, and the class in ``mcaptrack.cli``.
-_LISTED: Final = (
-    ("demo", _FIRST, "demo:Demo"),
-    ("ingest", _FIRST, "ingest:Ingest"),
-    ("run", _FIRST, "running:Run"),
-    ("view", _FIRST, "view:ViewCommand"),
-    ("info", _FIRST, "show:Info"),
-    ("detect", _STEP, _STAGE),
-    ("motion", _STEP, _STAGE),
-    ("track", _STEP, _STAGE),
-    ("sample", _STEP, _STAGE),
-    ("predict", _STEP, _STAGE),
-    ("retrack", _STEP, _STAGE),
-    ("fuse", _STEP, "running:Fuse"),
-    ("models", _STEP, "models:Models"),
-    ("query", _RESULTS, "query:Query"),
-    ("export", _RESULTS, "show:Export"),
-    ("cut", _RESULTS, "files:Cut"),
-    ("evaluate", _RESULTS, "evaluate:Evaluate"),
-    ("events", _RESULTS, "running:Events"),
-    ("zones", _RESULTS, "zones:Zones"),
-    ("calibrate", _IMPROVE, "calibrate:Calibrate"),
-    ("check", _IMPROVE, "files:Check"),
-    ("recover", _IMPROVE, "files:Recover"),
-    ("drop", _IMPROVE, "files:Drop"),
-    ("doctor", _IMPROVE, "doctor:Doctor"),
-    ("docs", _IMPROVE, "docs:Docs"),
-)
 #: Those with options of plug-ins.
-_WITH_PLUGINS: Final = ("run", *(name for name, _, place in _LISTED if place == _STAGE))
+_WITH_PLUGINS: Final = ("run", *BUILT_IN["stage"])
 
 
 def make(entry: Listed, function: Any = None) -> Any:
@@ -131,14 +106,13 @@ def make(entry: Listed, function: Any = None) -> Any:
         cls=Command,
         help=function.help,
         context_settings={"help_option_names": ["--help", "-h"]},
-        rich_help_panel=entry.panel,
     )(function)
     return get_command(app)
 
 
 def entries() -> dict[str, Listed]:
     """The commands of mcaptrack by name: those of the core, and of its extensions. Imports none of them."""
-    core = [Listed(name, panel, f"mcaptrack.cli.{place}", BUILT_IN["command"][name]) for name, panel, place in _LISTED]
+    core = [Listed(*each) for each in BUILT_IN["command"].items()]
     return {entry.name: entry for entry in (*core, *_by_entry_point(declared())) if not entry.package}
 
 
@@ -156,13 +130,10 @@ def _by_entry_point(_: Declared) -> list[Listed]:
     kinds: tuple[Kind, ...] = ("command", "stage")
     out = []
     for kind in kinds:
-        place = f"mcaptrack.cli.{_STAGE}" if kind == "stage" else ""
         for point in sorted(points(kind), key=lambda point: point.name):
             if re.fullmatch(r"\w[\w-]*", point.name):
                 package = "" if point.is_own else " ".join(point.package).strip() or point.value
-                heading = re.search(r'\bheading="([ -~]+?)"', _in_source(point.value).get("declared") or "")
-                panel = heading[1] if heading else _OF_PACKAGES if package else _STEP
-                out.append(Listed(point.name, panel, place, point.value, package))
+                out.append(Listed(point.name, point.value, kind, package))
     return out
 
 
@@ -218,7 +189,7 @@ class Group(TyperGroup):
             if cmd_name not in self.commands:
                 self.commands = self.commands.changed({cmd_name: _made_of_package(entry)})
             return super().get_command(ctx, cmd_name)
-        line: Any = typer.core.TyperCommand(cmd_name, help=entry.summary, rich_help_panel=entry.panel)
+        line: Any = typer.core.TyperCommand(cmd_name, help=entry.summary)
         return line
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping
-from contextlib import nullcontext
 from typing import Any
-
-import numpy as np
 
 from mcaptrack.api.declared import OneOfMany, Parameter, arguments_of, options_of
 from mcaptrack.cli import common
@@ -68,19 +66,22 @@ def class_of(name: str) -> type[Called[Any]]:
     entry = find("command", name)
     if not hasattr(entry.cls, "most_used"):
         raise McaptrackError(f"{entry} is not declared; `@declared()` of mcaptrack.api.declared makes it a command")
-    with blamed(entry, "can't be a command") if not entry.is_built_in else nullcontext():
+    with blamed(entry, "can't be a command"):
         each = any(isinstance(about, OneOfMany) for about in arguments_of(entry.cls).values())
         usual = PlainEachLog if each else PlainOnce
         kind: type[Called[Any]] = load(str(entry), entry.cls.printed_by) if entry.cls.printed_by else usual
-        own = {option.name for option in options_of(entry.cls)}
-        if taken := sorted(own & {option.name for option in (*kind.options(), *parameters_of(OfAll))}):
-            raise McaptrackError(f"a parameter can't have the name of the option {', '.join(taken)}")
-        kind.function_of(name)
+        if not entry.is_built_in:
+            own = {option.name for option in options_of(entry.cls)}
+            if taken := sorted(own & {option.name for option in (*kind.options(), *parameters_of(OfAll))}):
+                raise McaptrackError(f"a parameter can't have the name of the option {', '.join(taken)}")
+            kind.function_of(name)
     return kind
 
 
 def plain(value: Any) -> Any:
     """A result as values of JSON: numbers that are not finite are None."""
+    import numpy as np  # here: most commands print their results by themselves
+
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = dataclasses.asdict(value)
     if isinstance(value, np.ndarray | np.generic):
@@ -90,7 +91,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(member) for member in value]
     if isinstance(value, float):
-        return value if np.isfinite(value) else None
+        return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)
 
 

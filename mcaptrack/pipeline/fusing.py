@@ -488,7 +488,7 @@ def _results(fuser: Transform, compared: Compared, progress: Callable[[str, int,
     collectors = {"": FrameCollector(DETECTIONS), "sightings": FrameCollector(SIGHTINGS)}
     gathered = compared.gathered
     results: Iterator[tuple[Frame, ...]]
-    if FUSION.is_built_in(type(fuser)):
+    if type(fuser) is FootFuser:
         results = compared.fuser.fused(gathered.joined(compared.fuser))
     else:
         results = guarded(FUSION.entry(type(fuser)), fuser, gathered)

@@ -14,7 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.predictors import entry_of as predictor_entry
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.registry import BUILT_IN, Entry, find, is_installed
+from mcaptrack.registry import Entry, find, is_installed
 from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import FUSION, Stage, Transform
 from mcaptrack.transforms.protocol import member_type
@@ -43,8 +43,8 @@ class OlderVersionError(McaptrackError):
 
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
     """Return the classes of other packages in a transform: "transform" for itself, "predictor" for its predictor."""
-    cls = type(transform)
-    plugins = {} if stage.is_built_in(cls) else {"transform": _plugin(stage.entry(cls))}
+    own = stage.entry(type(transform))
+    plugins = {} if own.is_built_in else {"transform": _plugin(own)}
     predictor = getattr(transform, "predictor", None)
     if isinstance(predictor, str):
         entry, _ = predictor_entry(predictor)
@@ -131,9 +131,10 @@ def _class_of(
     if plugin is None:
         if not name:
             return stage.default
-        if stage.kind is None or name not in BUILT_IN[stage.kind]:
+        entry = stage.find(name) if stage.kind and is_installed(stage.kind, name) else None
+        if entry is None or not entry.is_built_in:
             raise McaptrackError(f"{stage.kind} {name} made it, which this version does not have")
-        made_by: type[Transform] = stage.find(name).cls
+        made_by: type[Transform] = entry.cls
         return made_by
     users = named_by_user.get(stage.name)
     if users is not None and stage.entry(type(users)).implementation == plugin.implementation:

@@ -381,8 +381,7 @@ def _transform(work: Work, counts: list[int]) -> None:
     transform, stage = work.transform, work.stage
     collectors = [FrameCollector(schema) for schema in transform.writes.values()]
     stream = _Repeatable(lambda: _counting(work.source.stream, counts))
-    is_own, entry = stage.is_built_in(type(transform)), stage.entry(type(transform))
-    for result in transform(stream) if is_own else guarded(entry, transform, stream):
+    for result in guarded(stage.entry(type(transform)), transform, stream):
         for frame, collector in zip(result, collectors, strict=True):
             collector.append(frame)
     for (topic, schema), collector in zip(work.job.outputs().items(), collectors, strict=True):

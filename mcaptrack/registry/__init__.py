@@ -64,10 +64,10 @@ _SIGNALLED: Final = frozenset(128 + number for number in (signal.SIGINT, signal.
 
 _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
-#: Commands that a function of the library of this name declares.
+#: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
-    "ingest demo run detect motion track sample predict retrack fuse models info view query export "
-    "evaluate events zones calibrate check recover cut drop doctor"
+    "demo ingest run view info detect motion track sample predict retrack fuse models query export cut "
+    "evaluate events zones calibrate check recover drop doctor"
 )
 #: Kinds that only entry points name.
 _BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "viewer", "name")
@@ -290,7 +290,7 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
         return Entry(name, kind, implementation, implementation.__module__, *distribution_of(implementation.__module__))
     named = [point for point in points(kind) if point.name == name]
     if not named:
-        raise McaptrackError((missing_extension(name) if kind == "command" else "") or _unknown(kind, name))
+        raise McaptrackError(missing_extension(name, kind) or _unknown(kind, name))
     named = [point for point in named if point.package[0] == distribution] or named
     if len(named) > 1:
         values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pkgutil import resolve_name
 from types import MappingProxyType
@@ -160,7 +159,7 @@ class Stage:
     def entry(self, cls: type[Transform]) -> Entry:
         """The entry of a class of transforms of this stage."""
         if self.kind is None and _base(cls) is self.default:
-            return Entry(self.name, "stage", cls, cls.__module__, *self.package)
+            return replace(find("stage", self.name), cls=cls)
         return entry_of(self.kind or self.name, cls)
 
     def choose(self, name: str) -> type[Transform]:
@@ -185,14 +184,6 @@ class Stage:
             return str(getattr(transform, self.parameter))
         file = getattr(transform, _FILE, "")
         return self.entry(type(transform)).name + (f":{file}" if file else "") if self.kind else ""
-
-    def is_built_in(self, cls: type[Transform]) -> bool:
-        """Whether a class is a built-in transform of this stage. Only those of its name are imported."""
-        base = _base(cls)
-        if self.kind is None:
-            return base is self.default and not any(self.package)
-        names = (name for name, where in BUILT_IN[self.kind].items() if where.endswith(f":{base.__qualname__}"))
-        return any(find(self.kind, name).cls is base for name in names)
 
     def make(self, chosen: str = "", /, **parameters: Any) -> Transform:
         """Make a transform of this stage.
@@ -221,7 +212,7 @@ class Stage:
         """
         entry = self.find(chosen) if chosen else self.entry(self.default)
         cls = self.with_part(entry.cls, parameters.get(self.parameter))
-        names, is_own = [f.name for f in fields(cls) if f.init], self.is_built_in(cls)
+        names = [f.name for f in fields(cls) if f.init]
         for name in parameters:
             if name not in names:
                 what = entry if self.kind else self.name
@@ -230,7 +221,7 @@ class Stage:
                 )
         if (file := self.split(chosen)[1]) is not None and parameters.setdefault(_FILE, file) != file:
             raise McaptrackError(f"{chosen} and `{_FILE}={parameters[_FILE]}` are two files; give one")
-        with nullcontext() if is_own else blamed(entry, "could not be made"):
+        with blamed(entry, "could not be made"):
             transform: Transform = cls(**parameters)
             check_options(transform)
         return transform

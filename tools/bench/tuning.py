@@ -17,7 +17,7 @@ from mcaptrack.evaluation import EvaluateOptions
 from mcaptrack.extensions.tuning.search import Task, trial_scores
 from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import detections_and_ground_truth
-from mcaptrack.transforms import Sort
+from mcaptrack.transforms import STAGES, Sort
 
 # This file's folder is where Python looks first, and a file in it is named like the peer.
 sys.path.pop(0)
@@ -33,7 +33,7 @@ def main() -> None:
     for path in folders:
         both = detections_and_ground_truth(path / "det/det.txt", path / "gt/gt.txt", IngestOptions())
         tasks.append(Task(path.name, both.detections, both.ground_truth, {}))
-    scoring = EvaluateOptions(similarities=("iou",))
+    scoring, entry = EvaluateOptions(similarities=("iou",)), STAGES["track"].entry(Sort)
     with tempfile.TemporaryDirectory() as name:
         scratch = Path(name)
         for part, source in (("gt", "gt/gt.txt"), ("det", "det/det.txt")):
@@ -56,7 +56,7 @@ def main() -> None:
         def ours(trials: int) -> float:
             start = time.perf_counter()
             for number in range(trials):
-                trial_scores(Sort(min_iou=0.2 + 0.01 * number), tasks, scoring)
+                trial_scores(Sort(min_iou=0.2 + 0.01 * number), tasks, scoring, entry)
             return time.perf_counter() - start
 
         ours(1)

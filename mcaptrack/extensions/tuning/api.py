@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -179,7 +178,7 @@ def tune(
     if tracker is not None and not has_tracker:
         raise McaptrackError(f"the stage {stage} has no tracker; leave `tracker=` out")
     base = transform_of(stage, tracker, {})
-    entry = None if STAGES[stage].is_built_in(type(base)) else STAGES[stage].entry(type(base))
+    entry = STAGES[stage].entry(type(base))
     ranges = _ranges(type(base), search, entry)
     chosen: Similarity = similarity or ("iou" if has_tracker else "metres")
     scoring = EvaluateOptions(similarities=(chosen,), gates_m=(gate_m,), min_iou=min_iou)
@@ -205,8 +204,8 @@ def tune(
                 detail(f"trial {trial.number}: {metric} {trial.scores[metric]:.4f} {values}".rstrip())
 
         first, best = searching.tune(
-            base, tasks, ranges, scoring, metric=metric, trials=trials, seed=seed, study=trials_file, on_trial=tell,
-            entry=entry,
+            base, tasks, ranges, scoring, entry, metric=metric, trials=trials, seed=seed, study=trials_file,
+            on_trial=tell,
         )  # fmt: skip
     settings = ({"tracker": tracker or "sort"} if has_tracker else {}) | dict(best.parameters)
     return TuneResult(
@@ -223,7 +222,7 @@ def tune(
     )
 
 
-def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -> dict[str, Range]:
+def _ranges(kind: type[Transform], search: Search | None, entry: Entry) -> dict[str, Range]:
     """Return the ranges to search: those that are asked for, or all that are declared; ``entry`` as in ``tune``."""
     declared = declared_ranges(kind)
     if not (search and declared):
@@ -240,7 +239,7 @@ def _ranges(kind: type[Transform], search: Search | None, entry: Entry | None) -
             if not low <= high:
                 raise McaptrackError(f"`search=` needs a range from low to high for {name}, not {low:g} to {high:g}")
             whole = declared[name].whole
-            with blamed(entry, "could not be made with the ends of `search=`") if entry else nullcontext():
+            with blamed(entry, "could not be made with the ends of `search=`"):
                 for end in span:
                     kind(**{name: int(end) if whole else end})  # both ends have to be allowed
             out[name] = Range(low, high, whole)

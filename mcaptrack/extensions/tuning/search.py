@@ -11,7 +11,6 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, Literal, get_type_hints
@@ -83,13 +82,13 @@ def tune(
     tasks: Sequence[Task],
     ranges: Mapping[str, Range],
     scoring: EvaluateOptions,
+    entry: Entry,
     *,
     metric: Metric = "IDF1",
     trials: int = 100,
     seed: int = 0,
     study: Path | None = None,
     on_trial: Callable[[Trial, Trial, int], None] = lambda *_: None,
-    entry: Entry | None = None,
 ) -> tuple[Trial, Trial]:
     """Search parameters, and return the first trial (``base`` unchanged) and the best; the earliest of equals.
 
@@ -100,6 +99,8 @@ def tune(
     ranges : mapping of str to Range
         The parameters to search.
     scoring : EvaluateOptions
+    entry : Entry
+        The entry of ``base``. Outputs of another package are checked, and errors name it.
     metric : str
         The score to maximise.
     trials : int
@@ -110,8 +111,6 @@ def tune(
         A file of earlier trials, to which new ones are appended.
     on_trial : callable
         Called with each new trial, the best so far and the number of trials.
-    entry : Entry, optional
-        The entry of a transform of another package. Its outputs are checked, and errors name it.
 
     Raises
     ------
@@ -120,8 +119,7 @@ def tune(
     """
     if not ranges:
         raise McaptrackError(
-            f"{entry or type(base).__name__.lower()} declares no ranges to search in; a field of the class "
-            "has one with option(0.3, search=(0.1, 0.9))"
+            f"{entry} declares no ranges to search in; a field of the class has one with option(0.3, search=(0.1, 0.9))"
         )
     searched = _Study(study, _about(base, tasks, ranges, scoring))
     done = searched.trials
@@ -129,7 +127,7 @@ def tune(
     while len(done) < trials:
         number = len(done)
         parameters = {} if number == 0 else propose.ask(number)
-        with blamed(entry, f"could not be made with {parameters}") if entry else nullcontext():
+        with blamed(entry, f"could not be made with {parameters}"):
             transform = replace(base, **parameters)
         trial = Trial(number, parameters, trial_scores(transform, tasks, scoring, entry))
         propose.tell(trial)
@@ -143,7 +141,7 @@ def _best(trials: Sequence[Trial], metric: str) -> Trial:
 
 
 def trial_scores(
-    transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions, entry: Entry | None = None
+    transform: Transform, tasks: Sequence[Task], scoring: EvaluateOptions, entry: Entry
 ) -> dict[str, float]:
     """The scores of a transform's main output, over all sequences together; ``entry`` as in ``tune``."""
 
@@ -151,7 +149,7 @@ def trial_scores(
         for task in tasks:
             names = {f.name for f in fields(transform)}
             told = replace(transform, **{name: value for name, value in task.context.items() if name in names})
-            results = guarded(entry, told, task.frames) if entry else told(task.frames)
+            results = guarded(entry, told, task.frames)
             main = list(told.writes).index("")
             out = [result[main] for result in results]
             yield EvaluationInput(task.name, task.ground_truth, [Candidate("tracks", None, out)])

@@ -21,7 +21,6 @@ from mcaptrack.files import is_same_file, missing, refuse_special
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
-from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import CLOCK, Provenance
@@ -42,7 +41,7 @@ from mcaptrack.sources.ingest.job import (
     Progress,
 )
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
-from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package
+from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_named
 from mcaptrack.sources.ingest.labels.reading import known_format, label_file
 from mcaptrack.sources.ingest.labels.timeline import (
     Timeline,
@@ -214,7 +213,8 @@ def ingest(
     McaptrackError
         If a part of the input can't be understood; then nothing is written.
     """
-    format_of_package(options.label_format)  # refused before anything is read
+    if options.label_format != "auto":
+        format_named(options.label_format)  # refused before anything is read
     if not re.fullmatch(r"[A-Za-z0-9_\-/]+", options.camera) or options.camera.strip("/") == "":
         raise McaptrackError(f"a camera's name is made of letters, digits, _, - and /, not {options.camera!r}")
     if not source.exists():
@@ -590,7 +590,7 @@ def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log
         return LabelJob([(role, source)], options, into)
     file.refuse_binary()
     if file.is_folder and not file.holds_pictures:
-        raise file.unknown(", ".join(BUILT_IN["label_format"]))
+        raise file.unknown()
     if file.is_folder or _is_video(source) or _is_binary(source):
         return VideoJob(source, options, progress, into)
     return LabelJob([(role, source)], options, into)

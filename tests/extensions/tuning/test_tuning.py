@@ -7,19 +7,22 @@ import os
 import sys
 import tomllib
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions
-from mcaptrack.extensions.tuning.search import Range, Task, tune
+from mcaptrack.extensions.tuning import search
+from mcaptrack.extensions.tuning.search import Range, Task
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import STAGES, Sort
 from tests.commands import call, printed
 from tests.worlds import boxed, boxes_at, detections, ns
 
 IOU = EvaluateOptions(similarities=("iou",))
+tune = partial(search.tune, entry=STAGES["track"].entry(Sort))
 
 
 def scene() -> Task:

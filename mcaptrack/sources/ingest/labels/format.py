@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Final, TypeVar
 
 from mcaptrack.errors import McaptrackError, call, list_names
 from mcaptrack.files import read_json, visible
+from mcaptrack.registry import names
 from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
 from mcaptrack.sources.ingest.labels.text import MAX_ROW, Lines, lines_of, split
@@ -169,8 +170,9 @@ class LabelFile:
         """Its lines as ``lines_of`` gives them. Raises McaptrackError if it isn't text."""
         return lines_of(self.path, most) if self._lines is None else self._lines
 
-    def unknown(self, formats: str) -> McaptrackError:
-        """The error for a file of none of these formats, with what it is instead."""
+    def unknown(self) -> McaptrackError:
+        """The error for a file of no known format, with what it is instead."""
+        formats = ", ".join(names("label_format"))
         if self.is_folder:
             held = list_names([path.name for path in self.entries], _LISTED) or "nothing"
             hint = instead_of_images(self.entries)

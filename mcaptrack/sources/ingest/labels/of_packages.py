@@ -18,7 +18,7 @@ from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.registry import BUILT_IN, Entry, blamed, find, others
+from mcaptrack.registry import Entry, blamed, find, others
 from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
@@ -162,12 +162,13 @@ def _classes(given: LabelBoxes, count: int) -> tuple[Ints, dict[int, str]]:
     return np.array([names.number(text) for text in texts], np.int64), names.names
 
 
-def format_of_package(name: str) -> FormatOfPackage | None:
-    """The format of another package that has this name; None for "auto" and built-in ones.
+def format_named(name: str) -> Format:
+    """The format of this name, our own or of another package.
 
     Raises McaptrackError if there is none, or if it can't be used.
     """
-    return None if name == "auto" or name in BUILT_IN[_KIND] else _made(find(_KIND, name))
+    entry = find(_KIND, name)
+    return entry.cls() if entry.is_built_in else _made(entry)
 
 
 @lru_cache(maxsize=16)
@@ -175,19 +176,19 @@ def _made(entry: Entry) -> FormatOfPackage:
     return FormatOfPackage(entry, entry.made("read"))
 
 
-def recognised(file: LabelFile) -> FormatOfPackage | None:
-    """The format of another package that a file is of, by what these say; one that can't say is named in a warning.
+def recognised(file: LabelFile) -> Format | None:
+    """The format by an entry point that a file is of, by what these say; one that can't say is named in a warning.
 
     Raises McaptrackError if several say so.
     """
-    formats: list[FormatOfPackage] = []
+    formats: dict[str, Format] = {}
     for name in others(_KIND):
         try:
-            made = format_of_package(name)
-            formats += [made] if made is not None and made.recognises(file) else []
+            made = format_named(name)
+            formats |= {name: made} if made.recognises(file) else {}
         except McaptrackError as error:
             warn(str(error), "other")
     if len(formats) > 1:
-        names = " and ".join(str(made.entry) for made in formats)
+        names = " and ".join(str(find(_KIND, name)) for name in formats)
         raise McaptrackError(f"{file.path} is of the {names}; choose one with `label_format=`")
-    return formats[0] if formats else None
+    return next(iter(formats.values()), None)

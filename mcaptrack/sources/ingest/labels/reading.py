@@ -16,12 +16,12 @@ import numpy as np
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import refuse_special, visible
-from mcaptrack.registry import BUILT_IN, find
+from mcaptrack.registry import BUILT_IN, entry_of
 from mcaptrack.schema.classes import ClassMap
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, check
 from mcaptrack.sources.ingest.labels.format import PLACES, Format, LabelFile
-from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_of_package, recognised
+from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_named, recognised
 from mcaptrack.sources.ingest.labels.roles import WantedClasses, rename, settled
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Extent
 from mcaptrack.sources.ingest.labels.text import lines_of, split
@@ -34,27 +34,18 @@ _LONG_BYTES: Final = 20_000_000
 _PART_ROWS: Final = 200_000
 
 
-def _made(name: str) -> Format:
-    """The format of a name. Raises McaptrackError if there is none, or if it can't be used."""
-    if name in BUILT_IN["label_format"]:
-        return find("label_format", name).cls()  # type: ignore[no-any-return]
-    made = format_of_package(name)
-    assert made is not None
-    return made
-
-
 def known_format(file: LabelFile, label_format: str = _AUTO, columns: Mapping[str, str] | None = None) -> Format | None:
     """The format of a file: the one that is given, or by its content; None if it is of no known one.
 
     Raises McaptrackError if there is no such format, or if formats of several other packages recognise the file.
     """
     if label_format != _AUTO:
-        return _made(label_format)
+        return format_named(label_format)
     for name in BUILT_IN["label_format"]:
-        made = _made(name)
+        made = format_named(name)
         if (not columns or "columns" in made.takes) and made.recognises(file):
             return made
-    return _made("records" if file.is_json else _TABLE) if columns else recognised(file)
+    return format_named("records" if file.is_json else _TABLE) if columns else recognised(file)
 
 
 def label_file(path: Path, label_format: str = _AUTO) -> LabelFile:
@@ -135,11 +126,11 @@ def read_labels(
     made = known_format(file, label_format, columns)
     if made is None:
         file.refuse_binary()
-        raise file.unknown(", ".join(BUILT_IN["label_format"]))
+        raise file.unknown()
     name = label_format if label_format != _AUTO else _name_of(made)
     for option in ("columns", "scene"):
         if getattr(asked, option) and option not in made.takes:
-            takers = [other.title for other in map(_made, BUILT_IN["label_format"]) if option in other.takes]
+            takers = [other.title for other in map(format_named, BUILT_IN["label_format"]) if option in other.takes]
             raise McaptrackError(f"{path}: `{option}=` is for {', '.join(takers[::-1])}, not for {name}")
     if file.is_folder and not made.reads_folders:
         raise McaptrackError(f"{path} is a folder, and {name} labels are a file")
@@ -169,10 +160,7 @@ def read_by(made: Format, file: LabelFile, asked: Asked) -> BoxTable:
 
 
 def _name_of(made: Format) -> str:
-    if isinstance(made, FormatOfPackage):
-        return made.entry.name
-    where = f"{type(made).__module__}:{type(made).__qualname__}"
-    return next(name for name, place in BUILT_IN["label_format"].items() if place == where)
+    return (made.entry if isinstance(made, FormatOfPackage) else entry_of("label_format", type(made))).name
 
 
 def read_homography(path: Path) -> tuple[float, ...]:
