@@ -299,6 +299,10 @@ def _write_all(
     topics_before = job.known_topics()
     kept = (topic for topic in topics_before if topic in opened.channels)
     wanted = sorted({*topics, *kept, *job.contents.own_topics()})
+    alike: dict[str, str] = {}
+    for topic in wanted:
+        if (other := alike.setdefault(recording_key(topic_folder(topic)), topic)) != topic:
+            job.done.notes.append(f"the tables of {other} and {topic} are in one folder where capitals don't count")
     total, done = len(TABLES) + len(wanted), len(TABLES) - 1
     for count, name in enumerate(names, start=1):
         job.table(name)
