@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
@@ -73,7 +74,10 @@ def fields(data: bytes) -> tuple[float, str, bytes]:
 def table_of(folder: Path, topic: str) -> Any:
     (manifest,) = folder.glob("manifest/*/part-0.json")
     (about,) = [row for row in json.loads(manifest.read_text()) if row["topic"] == topic]
-    return pq.read_table(folder / about["file"], partitioning=None), about
+    assert (about["file"] is None) == (about["messages"] == 0) == (about["reason"] == "it has no messages")
+    columns = ("t_ns", "x", "name", "blob", "chunk_offset")
+    empty = pa.table([[]] * len(columns), columns)
+    return pq.read_table(folder / about["file"], partitioning=None) if about["messages"] else empty, about
 
 
 def rows(table: Any) -> list[tuple[Any, ...]]:
@@ -206,6 +210,7 @@ ODD = (
     (b'{"at": {"nanosec": 1, "sec": 2}}',), (b'{"at": {"sec": 99999999999, "nanosec": 1}}',), (b'{"sec": 1, "nanosec": 2}',),
     (b'{"at": {"sec": 1, "nanosec": true}}',), (b'{"in": {"z": true}}', b'{"in": null}'), (b'{"in": {"y": 1}, "z": 1}',),
     (b'{"in": {"x": 1}}', b'{"z": 1, "in": {"y": 1}}'), (b'{"in": {}}', b'{"in": 1}'), (b'{"a": 1}', b'{"b": 1}'),
+    (b'{"a": []}', b'{"a": ' + b"[" * 40 + b"]" * 40 + b"}"), (b'{"s": "' + b"]" * 10**5 + b'", "a": ' + b"[" * 10**5 + b"]" * 10**5 + b"}",),
 )  # fmt: skip
 
 
@@ -261,3 +266,21 @@ def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
                     tables.append(("", str(error)))
         assert tables[0] == tables[1], seed
     assert at_once > 5
+
+
+def test_types_without_fields_have_tables_and_others_without_one_say_why(tmp_path: Path) -> None:
+    with recorder(tmp_path / "a.mcap") as writer:
+        for topic, name, definition, data in (
+            ("/CASE", "std_msgs/msg/Empty", b"", b"\0\1\0\0\0"),
+            ("/case", "std_msgs/msg/Empty", b"", b"\0\1\0\0\0"),
+            ("/wide", "my_msgs/msg/Wide", b"wstring text", b"\0\1\0\0\0\0\0\0"),
+        ):
+            schema = writer.register_schema(name, "ros2msg", definition)
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 1, data, 1)
+    with collected() as warnings:
+        done = mcaptrack.export(tmp_path / "a.mcap", tmp_path / "t", all_topics=True)
+    assert {topic: done.rows[f"topics/{topic}"] for topic in ("CASE", "case")} == {"CASE": 1, "case": 1}
+    texts = " ".join(map(str, warnings))
+    assert "the tables of /CASE and /case are in one folder where capitals don't count" in texts
+    assert "a field is a wstring, which is not read" in texts
+    assert "does not say what std_msgs/msg/Empty is" not in texts

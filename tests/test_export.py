@@ -18,7 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
-from mcaptrack.tables.export import LogTables, export, recording_name, topic_folder
+from mcaptrack.tables.export import ALWAYS, LogTables, export, recording_name, topic_folder
 from tests.commands import call, done
 from tests.logs import add_rows, recorder, some_log
 from tests.ros_messages import ros_writer
@@ -53,8 +53,9 @@ def test_a_log_becomes_a_folder_that_duckdb_joins(tmp_path):
         "join '@/recordings/*/*.parquet' using (recording) where topic = '/camera/tracks' order by track_id",
         folder,
     ) == [(4, 3, 1.0, 2.0, 0.5, "/camera/detections", True, 0), (9, 3, 0.5, 2.0, 0.25, "/camera/detections", True, 0)]
-    for name, table in tables.TABLES.items():
-        key = ", ".join(dict.fromkeys(("recording", *table.key)))
+    assert {path.name for path in folder.iterdir()} == {*ALWAYS, "recordings"} == {*tables.TABLES} - {*done.spare}
+    for name in (*ALWAYS, "recordings"):
+        key = ", ".join(dict.fromkeys(("recording", *tables.TABLES[name].key)))
         assert ask(f"select {key} from '@/{name}/*/*.parquet' group by all having count(*) > 1", folder) == [], name
 
 
@@ -125,9 +126,10 @@ def test_exporting_again_writes_what_changed_and_touches_nothing_else(tmp_path):
     second = exported(some_log(tmp_path / "b.mcap"), folder)
     before = stamps(folder)
     with_rows = {f"{name}/recording=b/part-0.parquet" for name, rows in second.rows.items() if rows}
-    assert before.keys() == with_rows | {f"{name}/recording=a/part-0.parquet" for name in first.rows} | {
+    with_file = first.rows.keys() - {*first.spare}
+    assert before.keys() == with_rows | {f"{name}/recording=a/part-0.parquet" for name in with_file} | {
         "manifest/recording=a/part-0.json"
-    }  # b has no tables without rows: those of a say what their columns are
+    }  # b has no tables without rows: patterns find those of a
     assert exported(path, folder).written == []
     assert stamps(folder) == before
 

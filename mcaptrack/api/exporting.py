@@ -63,6 +63,8 @@ class ExportResult:
         What was left out.
     files : tuple of pathlib.Path
         What the export owes: the last of the tables, the bag, or the file.
+    left_out : tuple of str
+        The tables that have no file here, because they have no rows.
 
     """
 
@@ -72,6 +74,7 @@ class ExportResult:
     written: tuple[str, ...]
     warnings: tuple[Notice, ...]
     files: tuple[Path, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def is_up_to_date(self) -> bool:
@@ -235,8 +238,8 @@ def export(
                 done = write_tables(opened, folder, progress, form=kind, topics=which, part=chosen, force=force)
             for note in done.notes:
                 warn(note, "left-out")
-        owed = (main_file(path, folder, kind),)
-        return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed)
+        owed, spare = (main_file(path, folder, kind),), tuple(done.spare)
+        return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed, spare)
 
 
 def _export_bag(

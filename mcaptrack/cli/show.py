@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Printed
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import console, print_table, printable, show_left_out
+from mcaptrack.cli.text import console, counted, print_table, printable, show_left_out
 from mcaptrack.geometry.clocks import FIRST_DATE_NS
 from mcaptrack.location import Location
 
@@ -80,13 +80,15 @@ class Export(EachLog["ExportResult"]):
         talk.detail(f"{done.folder}: written {', '.join(done.written) or 'nothing, all tables are up to date'}")
 
     def line(self, done: ExportResult) -> str:
-        """Return the number of rows of each table."""
-        return ", ".join(f"{name} {count}" for name, count in done.rows.items())
+        """Return the number of rows of each table that has a file."""
+        rows = ", ".join(f"{name} {count}" for name, count in done.rows.items() if name not in done.left_out)
+        without = len(done.left_out)
+        return f"{rows}; {counted(without, 'table')} without rows left out" if without else rows
 
     def data(self, done: ExportResult) -> dict[str, Any]:
         """Return the result as values of JSON."""
         written = {"log": str(done.log), "folder": str(done.folder), "rows": done.rows}
-        return written | {"written": list(done.written)}
+        return written | {"written": list(done.written), "left_out": list(done.left_out)}
 
     def print_result(self, results: Sequence[ExportResult], totals: Mapping[str, Any]) -> None:
         """Print the results; bring the catalogue of several logs in one folder up to date."""

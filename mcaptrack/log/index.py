@@ -56,8 +56,8 @@ _NUMBERS: Final = (
 _numbers_of: Final = attrgetter(*_NUMBERS)
 _WIDTH: Final = len(_NUMBERS)
 _START, _END, _OFFSET, _LENGTH, _INDEX_LENGTH = range(5)
-#: So many entries of chunks are kept.
-_MOST_KEPT: Final = 8
+#: So many entries of chunks are kept: all, but of very long logs.
+_MOST_KEPT: Final = 4096
 
 
 class ChunkList:

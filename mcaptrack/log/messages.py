@@ -47,6 +47,8 @@ T = TypeVar("T")
 OPEN_BYTES: Final = 128 * 2**20
 #: Limit for chunks that stay open for the other channels in them, in bytes.
 _KEPT_BYTES: Final = 8 * 2**20
+#: Limit for locations of messages that are kept, 16 bytes each.
+_KEPT_MESSAGES: Final = 4 * 2**20
 #: Messages outside of chunks are read one by one if their average distance in the file is larger.
 _MAX_GAP_BYTES: Final = 16 * 2**10
 #: Payloads come in batches of this many bytes at least: fewer make each step for few messages, more exceed the caches.
@@ -344,16 +346,9 @@ class MessageBatches:
         offsets = np.append(self._index.chunks.offsets.astype(np.int64), -1)  # the last one is that of _OUTSIDE
         return np.repeat(offsets[rows], np.diff(self.edges))
 
-    def of(self, channels: Sequence[int]) -> Ints:
-        """The numbers of the batches of some of the channels."""
-        return np.flatnonzero(np.isin(np.frombuffer(self._channel, np.uint16), channels))
-
-    def in_order(self, some: Ints | None = None) -> Iterator[list[MessageBatch]]:
-        """Batches, all or ``some``, in groups that follow one another in time; batches of one group overlap, and keep
-        their order.
-        """
+    def in_order(self) -> Iterator[list[MessageBatch]]:
+        """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
         numbers = np.flatnonzero(np.diff(self.edges))
-        numbers = numbers if some is None else some[np.diff(self.edges)[some] > 0]
         first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
         order = np.argsort(first_ns, kind="stable")
         group: list[int] = []
@@ -518,6 +513,7 @@ class Messages:
         self.source, self.index = source, index
         self._opened: OrderedDict[int, Bytes] = OrderedDict()  # the last chunks that were opened, for other channels
         self._opened_bytes = 0
+        self._asked: OrderedDict[tuple[tuple[int, ...], Span], MessageBatches] = OrderedDict()
         # Checksums of what was read, to detect changes: of chunks by number (-1: not read), of pieces by start with
         # their end.
         self._chunks = array("q")
@@ -641,11 +637,8 @@ class Messages:
         lost with a damaged chunk, with the number of the topic, that of messages, and the damage; without it, Damaged
         is raised.
         """
-        located = self._located([channel for channels in topics for channel in channels], span)
-        streams = [
-            zip(repeat(number), located.in_order(located.of(channels)), strict=False)
-            for number, channels in enumerate(topics)
-        ]
+        located = self._located_each(topics, span)
+        streams = [zip(repeat(number), batches.in_order(), strict=False) for number, batches in enumerate(located)]
         waiting: dict[int, list[Payloads]] = {}
         held: Counter[int] = Counter()
         total = 0
@@ -752,13 +745,20 @@ class Messages:
         )
 
     def _located(self, channels: Sequence[int], span: Span, *, are_read: bool = True) -> MessageBatches:
-        """The batches of channels. A store learns what will be read of them: their indexes, and if they ``are_read``
-        their chunks.
+        """The batches of channels."""
+        (batches,) = self._located_each([channels], span, are_read=are_read)
+        return batches
+
+    def _located_each(
+        self, topics: Sequence[Sequence[int]], span: Span, *, are_read: bool = True
+    ) -> list[MessageBatches]:
+        """The batches of several topics. A store learns what will be read of them: their indexes, and if they
+        ``are_read`` their chunks.
         """
         if not self.source.is_remote:
-            return MessageBatches(self.source, self.index, channels, span)
+            return [self._batches(channels, span) for channels in topics]
         indexes, wholes = [], []
-        for chunk in self.index.chunks.with_channels(channels):
+        for chunk in self.index.chunks.with_channels([channel for channels in topics for channel in channels]):
             if not overlaps(chunk, span):
                 continue
             end = chunk.chunk_start_offset + chunk.chunk_length  # its message indexes follow
@@ -767,9 +767,18 @@ class Messages:
             wholes.append((end if is_direct else chunk.chunk_start_offset, end + chunk.message_index_length))
         is_one = are_read and sum(end - start for start, end in wholes) <= _READ_AT_ONCE_BYTES
         self.source.expect(wholes if is_one else indexes, GAP_BYTES if is_one or not are_read else _MIN_GAP_BYTES)
-        batches = MessageBatches(self.source, self.index, channels, span)
+        batches = [self._batches(channels, span) for channels in topics]
         if are_read and not is_one:
             self.source.expect(wholes)
+        return batches
+
+    def _batches(self, channels: Sequence[int], span: Span) -> MessageBatches:
+        """The batches of channels; those that were asked for last are kept."""
+        key = (tuple(channels), span)
+        batches = self._asked.pop(key, None) or MessageBatches(self.source, self.index, channels, span)
+        self._asked[key] = batches
+        while sum(len(kept.t_ns) for kept in self._asked.values()) > _KEPT_MESSAGES:
+            self._asked.popitem(last=False)
         return batches
 
     def _content(self, chunk: ChunkIndex) -> Bytes:

@@ -51,6 +51,9 @@ _UNITS: Final[Mapping[str, str]] = {
     "Pa": r"/FluidPressure\.fluid_pressure",
     "1": r"\.(orientation|rotation)\.[xyzw]",
 }
+#: Messages in JSON that are deeper are read one by one.
+_MAX_DEPTH: Final = 30
+_STRING: Final = re.compile(rb'"(?:[^"\\]|\\.)*"', re.DOTALL)
 #: A part of flat messages ends after so many of them.
 _PART_MESSAGES: Final = 4096
 #: Whole numbers below are exact in 64 bits of a float; seconds and nanoseconds below are together in 64 bits.
@@ -272,14 +275,15 @@ def _json_columns(batch: Payloads, rows: Ints, flatten: Flatten) -> Columns:
     """Messages in JSON as columns, without a loop over their values; none unless all messages are alike.
 
     Arrow's reader takes dates for times, rounds large numbers and refuses what JSON of Python allows: messages with
-    such values, or with other fields than the first one, are read one by one.
+    such values, or with other fields than the first one, are read one by one; so are deep ones, for which its stack
+    has no room.
     """
     import pyarrow as pa
     import pyarrow.json as pj
 
     payloads = [batch.data[start:end].tobytes() for start, end in zip(batch.start[rows], batch.end[rows], strict=True)]
     if not all(start >= 0 for start in batch.start[rows]) or not all(
-        payload[:1] == b"{" and payload[-1:] == b"}" for payload in payloads
+        payload[:1] == b"{" and payload[-1:] == b"}" and not _is_deep(payload) for payload in payloads
     ):  # so that no two of them are one
         return {}
     text = b"\n".join(payloads)
@@ -290,6 +294,15 @@ def _json_columns(batch: Payloads, rows: Ints, flatten: Flatten) -> Columns:
     except (pa.ArrowException, McaptrackError, _Unlike):
         return {}
     return columns if are_alike else {}
+
+
+def _is_deep(text: bytes) -> bool:
+    """Whether lists and objects of JSON are more than a few deep within each other."""
+    if text.count(b"[") + text.count(b"{") <= _MAX_DEPTH:
+        return False
+    signs = np.frombuffer(_STRING.sub(b"", text), np.uint8)
+    steps = np.isin(signs, np.frombuffer(b"[{", np.uint8)).astype(np.int64)
+    return bool(np.cumsum(steps - np.isin(signs, np.frombuffer(b"]}", np.uint8))).max(initial=0) > _MAX_DEPTH)
 
 
 class _Unlike(Exception):

@@ -59,6 +59,8 @@ _IDL_ENUM: Final = re.compile(
 )
 #: What changes how messages in IDL are encoded, and isn't read.
 _IDL_UNREAD: Final = re.compile(r"@optional|@mutable|@extensibility\(\s*MUTABLE\s*\)|\bunion\b")
+#: Types with a definition that is empty.
+_EMPTY: Final = re.compile(r"\w+(/msg)?/Empty")
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*$", re.MULTILINE)
 
 #: The messages of vision_msgs, which rosbags doesn't know: of a version those that differ from the next one.
@@ -182,7 +184,9 @@ def parsed(name: str, schema_encoding: str, data: bytes) -> Types:
         raise ValueError(f"it has {len(data)} bytes; at most {_MAX_DEFINITION} are read")
     text = data.decode("utf-8", "replace").replace("\r\n", "\n")
     if not text.strip():
-        return {}
+        if not _EMPTY.fullmatch(name):
+            return {}
+        text = "# no fields"
     try:
         if schema_encoding not in (SchemaEncoding.ROS2IDL, "omgidl") and not _IDL.match(text):
             return get_types_from_msg(_SEPARATOR.sub("=" * 80, text), name)
@@ -243,7 +247,8 @@ def _whole(name: str, look_ups: Sequence[LookUp]) -> Types:
             known = (look_up(wanted) for look_up in look_ups)
             types[wanted] = next((fields for fields in known if fields is not None), None)
             if types[wanted] is None:
-                raise ValueError(f"{wanted} is not defined")
+                is_wide = wanted.endswith("/wstring")
+                raise ValueError("a field is a wstring, which is not read" if is_wide else f"{wanted} is not defined")
             missing += [inner for _, kind in types[wanted][1] for inner in _names_in(kind)]
     return types
 
@@ -332,7 +337,7 @@ def typestore_of(distribution: str) -> Any:
 def is_defined(kind: MessageType) -> bool:
     """Whether a message type has its definition, needs none, or has no name by which it could be looked up."""
     is_ros = kind.encoding in (MessageEncoding.ROS1, MessageEncoding.CDR)
-    return not (is_ros and kind.name) or bool(kind.schema.strip())
+    return not (is_ros and kind.name) or bool(kind.schema.strip() or _EMPTY.fullmatch(kind.name))
 
 
 class Defined(NamedTuple):

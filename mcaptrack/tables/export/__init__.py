@@ -48,13 +48,20 @@ from mcaptrack.tables.files import FORMATS
 TOPICS: Final = "topics"
 #: The folder of what these tables are.
 MANIFEST: Final = "manifest"
+#: Tables that have a file also without rows, because most queries name one of them.
+ALWAYS: Final = frozenset(
+    ("frames", "detections", "tracks", "predictions", "events", "track_summary", "metrics", "channels", "warnings")
+)
 
 
 @dataclass
 class Exported:
-    """The tables of a log in a folder: rows of each, which were written and removed, and notes for people."""
+    """The tables of a log in a folder: rows of each, those that have no file because they have no rows, which were
+    written and removed, and notes for people.
+    """
 
     rows: dict[str, int] = field(default_factory=dict)
+    spare: list[str] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
     removed: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -234,8 +241,8 @@ def export(
     force: bool = False,
     boxes: BoxesRead | None = None,
 ) -> Exported:
-    """Update the tables of a log in a folder. A table without rows is written for one log of the folder only, so that
-    its columns are known, and patterns such as ``events/*/*.parquet`` find a file.
+    """Update the tables of a log in a folder. Of tables without rows only those in ``ALWAYS`` are written, for one log
+    of the folder, so that patterns such as ``events/*/*.parquet`` find a file.
 
     Parameters
     ----------
@@ -292,6 +299,10 @@ def _write_all(
     topics_before = job.known_topics()
     kept = (topic for topic in topics_before if topic in opened.channels)
     wanted = sorted({*topics, *kept, *job.contents.own_topics()})
+    alike: dict[str, str] = {}
+    for topic in wanted:
+        if (other := alike.setdefault(recording_key(topic_folder(topic)), topic)) != topic:
+            job.done.notes.append(f"the tables of {other} and {topic} are in one folder where capitals don't count")
     total, done = len(TABLES) + len(wanted), len(TABLES) - 1
     for count, name in enumerate(names, start=1):
         job.table(name)
@@ -369,6 +380,7 @@ class _Job:
             return None
         if self._is_spare(name, path, self.contents.timing(topic, part).messages):
             self.reasons[topic] = "it has no messages"
+            self.done.notes.append(f"{topic} has no messages in the table's span of time, and no table")
             return None
         messages = self.contents.typed_messages(topic, part) if self.form == "parquet" else None
         if messages is not None:
@@ -407,11 +419,15 @@ class _Job:
         return True
 
     def _is_spare(self, name: str, path: Path, rows: int) -> bool:
-        """Whether a table has no rows, and another log of the folder says what its columns are."""
-        is_spare = not rows and not path.exists() and any(self.folder.glob(f"{name}/{_PREFIX}*/{path.name}"))
-        if is_spare:
-            self.done.rows[name] = 0
-        return is_spare
+        """Whether a table has no rows and needs no file; one that there is goes."""
+        if rows or (name in ALWAYS and (path.exists() or not any(self.folder.glob(f"{name}/{_PREFIX}*/{path.name}")))):
+            return False
+        self.done.rows[name] = 0
+        self.done.spare.append(name)
+        if path.exists():
+            _remove(path)
+            self.done.removed.append(name)
+        return True
 
     def _write(self, name: str, path: Path, pieces: object, metadata: dict[str, str], order: Sequence[str]) -> None:
         rows = pieces.num_rows  # type: ignore[attr-defined]  # a table, which only tables knows
