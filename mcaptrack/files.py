@@ -29,7 +29,7 @@ def publish(path: Path) -> Iterator[Path]:
 
     The bytes are synced to disk before the file is renamed, so that an interruption at any time leaves the old file or
     the new one. If the block fails, the temporary file is removed. Raises McaptrackError if it can't be written, as far
-    as errors name it; libraries of video do.
+    as errors name it; libraries of video do, and a full disk is named for open files.
     """
     sweep(path.parent, path.name)
     part = _part_of(path)
@@ -42,7 +42,8 @@ def publish(path: Path) -> Iterator[Path]:
         if lost:
             notices.warn(f"{path} is a new file now, without the {' and '.join(lost)} of the old one")
     except OSError as error:
-        if error.errno is None or part.name not in str(error.filename):
+        is_full = error.filename is None and error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+        if error.errno is None or not (is_full or part.name in str(error.filename)):
             raise
         raise McaptrackError(f"{path} can't be written: {error.strerror}") from error
     finally:

@@ -13,14 +13,14 @@ import pytest
 
 from mcaptrack.log.journal import journal_of
 from mcaptrack.viewing.serving import Server
-from tests.commands import GROUP, ONLY_READ, call, done, made_log, press_ctrl_c
+from tests.commands import GROUP, LACKS, ONLY_READ, call, done, made_log, press_ctrl_c
 from tests.effects.commands import CASES
 from tests.interrupted import everything, interrupt
 from tests.logs import READING
 from tests.tiers import one_in
 
 #: Those that read no log.
-OTHERS = {"calibrate", "demo", "docs", "doctor", "models"} | ({"train"} - READING.keys())
+OTHERS = {"calibrate", "demo", "docs", "doctor", "models"} | ({"train"} - READING.keys() - LACKS)
 pytestmark = pytest.mark.usefixtures("never_waits")
 
 

@@ -42,7 +42,7 @@ number: int = mcaptrack.open("log.mcap").fetch({}).payload
 #: What is only imported by type checkers, or by those who have it.
 ONLY_TYPES = {
     "pa": pa,
-    "Player": mcaptrack.Player,
+    "Player": getattr(mcaptrack, "Player", object),
     "CheckResult": CheckResult,
     "Finding": Finding,
     "Detections": type("Detections", (), {}),

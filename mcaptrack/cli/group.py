@@ -147,7 +147,9 @@ class Commands(Mapping[str, Any]):
         if name in self._changed:
             return self._changed[name]
         if name not in self._made:
-            self._made[name] = make(entries()[name])
+            if name not in (every := entries()):
+                raise KeyError(missing_extension(name) or name)
+            self._made[name] = make(every[name])
         return self._made[name]
 
     def __iter__(self) -> Iterator[str]:
