@@ -324,12 +324,8 @@ def _export_by(
         for place in places:
             if isinstance(place, Path) and place_of(target) in (place, *place.parents):
                 raise McaptrackError(f"{target} is a log, or holds it; give another name with `output=`")
-        options = {"topic": next(iter(part.topics), None), "progress": progress}
-        try:
-            with LogReader(path) as recording, (publish_folder if by.is_folder else publish)(target) as new:
-                rows = write_by(by, recording, new, options)
-        except OSError as error:
-            raise McaptrackError(f"{target} can't be written: {error.strerror or error}") from error
+        with LogReader(path) as recording, (publish_folder if by.is_folder else publish)(target) as new:
+            rows = write_by(by, recording, new, {"topic": next(iter(part.topics), None), "progress": progress})
     return ExportResult(path, target, rows, tuple(rows), tuple(dict.fromkeys(warnings)), files=(target,))
 
 
