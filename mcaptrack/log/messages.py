@@ -55,7 +55,7 @@ _MAX_GAP_BYTES: Final = 16 * 2**10
 _BATCH_BYTES: Final = 4 * 2**20
 #: Longer messages, on average, are not packed if they need not wait.
 _LONG_BYTES: Final = 2048
-#: Chunks are read together until they have so many bytes.
+#: Chunks are read together until they have so many bytes; of a batch, where nothing else is read.
 _WINDOW_BYTES: Final = 16 * 2**20
 #: Payloads of all topics together wait for others of their batch in so many bytes at most.
 _WAITING_BYTES: Final = 64 * 2**20
@@ -642,6 +642,7 @@ class Messages:
         waiting: dict[int, list[Payloads]] = {}
         held: Counter[int] = Counter()
         total = 0
+        most = min(_BATCH_BYTES, _WINDOW_BYTES) if len(topics) == 1 else _WINDOW_BYTES
         window = _Window()
 
         def batches() -> Iterator[tuple[int, Payloads]]:
@@ -658,7 +659,7 @@ class Messages:
         for number, group in heapq.merge(*streams, key=lambda numbered: numbered[1][0].place):
             for batch in group:
                 self._take(window, number, batch, lose)
-            if window.size >= _WINDOW_BYTES:
+            if window.size >= most:
                 yield from batches()
                 window = _Window()
         yield from batches()

@@ -50,7 +50,18 @@ TOPICS: Final = "topics"
 MANIFEST: Final = "manifest"
 #: Tables that have a file also without rows, because most queries name one of them.
 ALWAYS: Final = frozenset(
-    ("frames", "detections", "tracks", "predictions", "events", "track_summary", "metrics", "channels", "warnings")
+    (
+        "frames",
+        "detections",
+        "tracks",
+        "predictions",
+        "events",
+        "zone_crossings",
+        "track_summary",
+        "metrics",
+        "channels",
+        "warnings",
+    )
 )
 
 
