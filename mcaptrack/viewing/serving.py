@@ -85,10 +85,10 @@ class Limits:
 class Page:
     """A page of ours or a file to download: ``content`` makes it when it is asked for, ``policy`` says what it may load
     and run (a Content-Security-Policy). ``is_shared``: other origins may read it, as they may read files.
-    ``is_action``: it changes something, so only POST does it: no link does, and no preview of one.
+    ``is_action``: ``content`` changes something, so only POST does it: no link does, and no preview of one.
     """
 
-    content: Callable[[], bytes]
+    content: Callable[[], bytes | None]
     policy: str = "default-src 'none'"
     kind: str = "text/html; charset=utf-8"
     is_shared: bool = False
@@ -389,7 +389,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif isinstance(content, Page):
             status, kind = HTTPStatus.OK, content.kind
             try:
-                body = content.content()
+                body = content.content() or b""
             except McaptrackError as error:
                 status, kind, body = HTTPStatus.INTERNAL_SERVER_ERROR, _TEXT, str(error).encode()
             policy = f"{content.policy}; frame-ancestors 'self'"

@@ -41,7 +41,7 @@ _MOST_LOG_ODDS: Final = 10.0
 _AROUND: Final = 0.55
 #: A file of answers is at most so large.
 _MOST_BYTES: Final = 2**20
-_SAID: Final[Mapping[str, float | None]] = {"yes": 1.0, "no": 0.0, "skip": None}
+_PROBABILITIES: Final[Mapping[str, float | None]] = {"yes": 1.0, "no": 0.0, "skip": None}
 
 
 @dataclass(frozen=True)
@@ -150,9 +150,9 @@ class Review:
         for name, yes in answers.items():
             if name not in self._keys:
                 raise McaptrackError(f"{self.log} has no question {name}; {offer(name, list(self.questions))}")
-            if not (isinstance(yes, str) and yes in _SAID) and not (isinstance(yes, float) and 0 <= yes <= 1):
+            if not (isinstance(yes, str) and yes in _PROBABILITIES) and not (isinstance(yes, float) and 0 <= yes <= 1):
                 raise McaptrackError(f"the answer to {name} is yes, no, skip or a probability, not {yes!r:.40}")
-            kept[name] = _SAID[yes] if isinstance(yes, str) else yes
+            kept[name] = _PROBABILITIES[yes] if isinstance(yes, str) else yes
         with self._lock:
             with logs.read(self.log, sidecar=SidecarChoice(None)) as opened:
                 opened.lock()
@@ -180,20 +180,7 @@ class Review:
         return self.result
 
     def __enter__(self) -> Self:
-        return self.start()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def start(self) -> Self:
-        """Serve the page that asks, from another thread until ``close``.
-
-        Raises
-        ------
-        McaptrackError
-            If the log has no pictures, or if the port is taken.
-
-        """
+        """Serve the page that asks, from another thread. Raises McaptrackError without pictures, or a free port."""
         with logs.read(self.log) as opened:
             topic = camera_at(opened, self.camera).pictures
             if not topic:
@@ -206,8 +193,7 @@ class Review:
         self.address = self._server.root
         return self
 
-    def close(self) -> None:
-        """Stop serving."""
+    def __exit__(self, *_: object) -> None:
         if self._server is not None:
             self._server.close()
             self._server, self.address = None, ""
@@ -279,7 +265,7 @@ def review(
         raise McaptrackError("`answers=` and `judge=` both answer; leave one out")
     path, file = log_file(log), optional_path(answers)
     given = {} if file is None else read_json(file, "a file of answers", _MOST_BYTES, is_unique=True)
-    if not isinstance(given, dict) or not all(isinstance(yes, str) and yes in _SAID for yes in given.values()):
+    if not isinstance(given, dict) or not all(isinstance(yes, str) and yes in _PROBABILITIES for yes in given.values()):
         raise McaptrackError(f'{file} has no answers; it holds them by question, as in {{"31@50.8-32@51.6": "yes"}}')
     with logs.read(path) as opened:
         prefix = pipeline.find_camera(opened, camera)

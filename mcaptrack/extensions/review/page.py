@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from base64 import b64encode
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, get_args
 
@@ -29,15 +29,12 @@ class ReviewServer(Server):
 
     def __init__(self, review: Review, shown: Sequence[Sequence[Sequence[Image]]]) -> None:
         self._review, self._shown = review, shown
-        actions = {
-            f"{answer}-{number}": partial(review.answer, name, answer)
+        pages = {
+            f"{answer}-{number}": Page(partial(review.answer, name, answer), is_action=True)
             for number, name in enumerate(review.questions)
             for answer in get_args(Answer)
         }
-        pages = {
-            name: Page(partial(_acted, action), kind="text/plain", is_action=True)
-            for name, action in {**actions, "finish": review.is_done.set}.items()
-        }
+        pages["finish"] = Page(review.is_done.set, is_action=True)
         super().__init__(pages, review.port, host=review.host, index=Page(self._index, _POLICY))
         self._thread = threading.Thread(target=self.serve_forever, args=(0.2,), daemon=True)
         self._thread.start()
@@ -66,8 +63,3 @@ class ReviewServer(Server):
 
     def _at(self, t_ns: int) -> str:
         return f"{(t_ns - self._review.start_ns) / NS_PER_S:.1f} s"
-
-
-def _acted(action: Callable[[], None]) -> bytes:
-    action()
-    return b"kept"
