@@ -114,6 +114,7 @@ LINES = {
     "tune": "tune a.mcap --trials 1 --search min-iou --study {elsewhere}/b.jsonl",
     "train": "train a.mcap",
     "fuse": "fuse a.mcap",
+    "review": "review a.mcap --print",
 }
 
 
@@ -122,7 +123,7 @@ def line_of(command: str) -> str:
     base = LINES.get(command) or CASES[command]["json"].base
     name = {"train": "b", "export": "b", "report": "b.html", "render": "b.mp4", "tune": "b.toml"}
     output = f" -o {{elsewhere}}/{name.get(command, 'b.mcap')}"
-    return base if command in ONLY_READ else base + output
+    return base if command in (*ONLY_READ, "review") else base + output
 
 
 def seen(folder: Path) -> dict[str, tuple[object, ...]]:

@@ -26,6 +26,7 @@ DEEDS = {
     "calibrate": [],  # it has no log of several cameras here
     "fuse": [],  # it has no log of several cameras here
     "models": ["read"],
+    "review": ["read"],
     "tune": ["read", "write"],
     "view": ["read", "serve"],
 }

@@ -310,6 +310,7 @@ CASES: dict[str, dict[str, Case]] = {
 LINES = {
     "tune": "tune a.mcap --trials 1 --search min-iou -o b.toml",
     "docs": "docs tables",
+    "review": "review a.mcap --print",
     "run": "run fresh.mcap",
     "train": "train a.mcap -o b --epochs 1 --device cpu",
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
@@ -67,7 +67,6 @@ class ReviewResult:
     run: mcaptrack.RunResult | None
 
 
-@dataclass
 class Review:
     """Questions about a log, and their answers so far; made by ``mcaptrack.review``.
 
@@ -96,22 +95,25 @@ class Review:
 
     """
 
-    log: Path
-    camera: str
-    questions: Mapping[str, Question]
-    solved: asking.Solved = field(repr=False)
-    start_ns: int = field(repr=False)
-    answers: dict[str, float] = field(default_factory=dict)
-    result: ReviewResult | None = None
-    address: str = ""
-    host: str = field(default=LOOPBACK, repr=False)
-    port: int = field(default=0, repr=False)
-    #: Set when the page says that no more answers follow.
-    is_done: threading.Event = field(default_factory=threading.Event, repr=False)
-    #: What each question is about: also those that were answered before, and can be answered again.
-    _keys: Mapping[str, Key] = field(default_factory=dict, repr=False)
-    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
-    _server: ReviewServer | None = field(default=None, repr=False)
+    def __init__(
+        self,
+        log: Path,
+        camera: str,
+        questions: Mapping[str, Question],
+        keys: Mapping[str, Key],
+        solved: asking.Solved,
+        start_ns: int,
+        address: tuple[str, int],
+    ) -> None:
+        self.log, self.camera, self.questions = log, camera, questions
+        self.solved, self.start_ns = solved, start_ns
+        self.answers: dict[str, float] = {}
+        self.result: ReviewResult | None = None
+        self.address, (self.host, self.port) = "", address
+        self.is_done = threading.Event()  # set when the page says that no more answers follow
+        self._keys = keys  # what each question is about: also those that were answered before, and can be again
+        self._lock = threading.Lock()
+        self._server: ReviewServer | None = None
 
     def answer(self, name: str, yes: Answer | float) -> None:
         """Keep an answer in the log at once, in place of an earlier one; "skip" takes that back.
@@ -128,11 +130,31 @@ class Review:
         McaptrackError
             If there is no such question or answer, or if the log can't be written.
 
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> review = mcaptrack.review("log.mcap", questions=3)
+        >>> for name, question in review.questions.items():
+        ...     review.answer(name, "yes" if question.probability > 0.9 else "skip")
+
         """
         self._keep({name: yes})
 
     def described(self) -> list[dict[str, Any]]:
-        """Return the questions as values of JSON: name, probability of yes, decision, rows, and the answer so far."""
+        """Describe the questions for JSON.
+
+        Returns
+        -------
+        list of dict
+            Name, probability of yes, decision, number of rows, and the answer so far, of each.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> all(0 <= question["probability"] <= 1 for question in mcaptrack.review("log.mcap").described())
+        True
+
+        """
         return [
             {
                 "name": name,
@@ -274,7 +296,7 @@ def review(
         asked = {question.key: question for question in asking.questions(solved, answered, questions)}
         keys = {asking.name_of(key, opened.start_ns): key for key in (*asked, *asking.keys_of(answered))}
         named = {name: asked[key] for name, key in keys.items() if key in asked}
-        out = Review(path, prefix, named, solved, opened.start_ns, host=host, port=port or 0, _keys=keys)
+        out = Review(path, prefix, named, keys, solved, opened.start_ns, (host, port or 0))
         given |= {} if judge is None else _judged(judge, opened, out)
     if file is not None or judge is not None:
         out._keep(given)
