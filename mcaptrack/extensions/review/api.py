@@ -189,7 +189,25 @@ class Review:
             self.answers = {name: yes for name, yes in {**self.answers, **kept}.items() if yes is not None}
 
     def finish(self, progress: Reports = no_progress) -> ReviewResult:
-        """Solve the log again with the answers, and say what they changed."""
+        """Solve the log again with the answers.
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Called with the name of a stage, the number of finished steps, and their total.
+
+        Returns
+        -------
+        ReviewResult
+            The changes that the answers made.
+
+        Examples
+        --------
+        >>> import mcaptrack
+        >>> mcaptrack.review("log.mcap").finish().rows
+        0
+
+        """
         run, topic = None, f"{self.camera}/retracks"
         with self._lock:
             with logs.read(self.log) as opened:
