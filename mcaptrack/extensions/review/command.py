@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mcaptrack.api.declared import Option
 from mcaptrack.cli import common
+from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import show
 from mcaptrack.errors import command
@@ -38,6 +39,8 @@ class ReviewCommand(Once["Review"]):
                     talk.detail("no more questions")
                 done.finish(talk.progress)
             talk.clear()
+        else:
+            warn_unused("no page is served", "open", "port", "host")
         super().print_result(done, talk)
 
     def data(self, done: Review) -> dict[str, Any]:
