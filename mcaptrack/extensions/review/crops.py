@@ -63,14 +63,16 @@ def _chosen(times: Ints, tracklet: Tracklet, question: Question) -> list[int]:
 
 
 def _crop(picture: Image, box: Floats, around: float) -> Image:
-    left, top, width, height = box
+    """The part of a picture around a box, darker outside of it."""
+    corner, size = box[1::-1], box[:1:-1]  # down, and to the right
 
-    def cut(share: float) -> tuple[slice, slice]:
-        low = np.maximum([top - share * height, left - share * width], 0).astype(int)
-        high = np.maximum([top + (1 + share) * height, left + (1 + share) * width], 0).astype(int) + 1
-        return slice(low[0], high[0]), slice(low[1], high[1])
+    def cut(share: float) -> Ints:
+        ends = np.stack([corner - share * size, corner + (1 + share) * size])
+        return np.asarray(np.maximum(ends, 0).astype(np.int64) + np.array([[0], [1]]))
 
-    out = picture.copy()
-    out[cut(_AROUND)] = (picture[cut(_AROUND)] * around).astype(np.uint8)
-    out[cut(0)] = picture[cut(0)]
-    return out[cut(_AROUND)].copy()
+    outer, inner = cut(_AROUND), cut(0)
+    shown = picture[outer[0, 0] : outer[1, 0], outer[0, 1] : outer[1, 1]]
+    (top, left), (bottom, right) = inner - outer[0]
+    crop = (shown * around).astype(np.uint8)
+    crop[top:bottom, left:right] = shown[top:bottom, left:right]
+    return crop
