@@ -293,12 +293,15 @@ def _exporter(form: str) -> FoundExporter:
 
 def exporter_for(entry: Entry, exporter: Any) -> FoundExporter:
     """An exporter with what its class says. Raises McaptrackError for what it can't say."""
+    from mcaptrack.registry import blamed
+
     end = getattr(exporter, "end", f".{entry.name.rpartition(':')[2].lower()}")
     if not isinstance(end, str) or not re.fullmatch(r"(\.[\w-]+)+", end):
         raise McaptrackError(
             f"{entry} has end = {end!r:.40}; it is the end of the name of a file, such as '.speeds.csv'"
         )
-    options = {"topic", "progress"} & inspect.signature(exporter.write).parameters.keys()
+    with blamed(entry, "has a method write without a signature that can be read"):
+        options = {"topic", "progress"} & inspect.signature(exporter.write).parameters.keys()
     return FoundExporter(entry, exporter, end, bool(getattr(exporter, "is_folder", False)), frozenset(options))
 
 
