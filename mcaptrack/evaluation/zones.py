@@ -30,8 +30,6 @@ from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, j
 #: Frames of counts that are made at once.
 _FRAMES_AT_ONCE: Final = 4096
 _SIZES: Final = {"metres": "m", "pixels": "px"}
-#: Durations in rows are rounded by less than this.
-_ROUNDED_NS: Final = 1000
 
 
 @dataclass(frozen=True)

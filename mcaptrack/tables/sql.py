@@ -74,7 +74,6 @@ select world, source_id, track_id, kept, duration_s, t_ns from worlds where reco
 #: What rows that were not detected lack.
 _DETECTED: Final = ("x_px", "y_px", "w_px", "h_px", "score")
 #: Queries about pairs of tracks, such as how near people are to each other.
-_CODE: Final = "not-compared"
 _PAIRS: Final = re.compile(r"\btracks(\s+(as\s+)?\w+)?\s*(,|(\s\w+)*\sjoin\s)\s*tracks\b", re.IGNORECASE)
 _MISSING: Final = re.compile(r'Table with name "?(.+?)"? does not exist')
 

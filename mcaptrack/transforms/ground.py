@@ -64,7 +64,6 @@ BOX: Final = slice(X, HEADING + 1)
 
 
 _SIZE: Final = slice(LENGTH, HEIGHT + 1)
-_SHAPE: Final = slice(Z, HEADING + 1)
 
 # Rows of tracks: those of detections first (velocities are those of the filter), then the rest.
 (

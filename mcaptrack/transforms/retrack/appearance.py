@@ -336,8 +336,6 @@ class Sides:
     def __init__(self, appearance: Appearance, tracks: Tracks) -> None:
         descriptors, order = appearance.descriptors, tracks.order
         step, starts = tracks.step[order], run_starts(tracks.track[order])
-        self._place = np.empty_like(order)
-        self._place[order] = np.arange(len(order))
         self._calibration, self._values = appearance.calibration, descriptors.values
         self._step_s = appearance.step_s
         self._starts = np.append(np.flatnonzero(starts), len(order))
@@ -359,11 +357,6 @@ class Sides:
         stop, start = self._starts[end + 1], self._starts[begin]
         ratio = self._compare(end, stop, begin, start)
         return np.where(self._at_border[stop - 1] & self._at_border[start], np.minimum(ratio, 0), ratio)
-
-    def of_assignments(self, before: Ints, after: Ints) -> Floats:
-        """The log likelihood ratio (E,) that a track up to an assignment and one from another on are one person."""
-        before, after = self._place[before], self._place[after]
-        return self._compare(self._number[before], before + 1, self._number[after], after)
 
     def of_swaps(self, track: Ints, other: Ints, since: Ints, until: Ints) -> Floats:
         """The log likelihood ratio (E,) that two tracks were exchanged from step ``since`` to ``until``."""
