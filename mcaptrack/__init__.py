@@ -7,36 +7,12 @@ __version__ = "0.3.0.dev0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
 SCHEMA_VERSION = 1
 
-_PARTS = {
-    "calibrating": ["CalibrateResult", "CameraCorrection", "calibrate"],
-    "catalogue": ["Model", "get_model", "models"],
-    "contents": ["ChannelInfo", "FrameInfo", "LogInfo", "info"],
-    "cutting": ["CutResult", "cut"],
-    "demonstration": ["DemoResult", "demo"],
-    "events": ["events"],
-    "exporting": ["ExportResult", "export"],
-    "fusing": ["fuse"],
-    "health": ["DoctorResult", "doctor"],
-    "ingesting": ["IngestResult", "ingest"],
-    "messages": ["DecodedMessage"],
-    "querying": ["ColumnInfo", "TableInfo", "TableList", "list_tables", "query"],
-    "recording": ["Recording", "open"],
-    "rows": ["detections", "schema_of"],
-    "run": ["run"],
-    "running": ["RunResult"],
-    "scoring": ["Scores", "evaluate"],
-    "reading": ["FetchedMessage"],
-    "stages": ["detect", "motion", "predict", "retrack", "sample", "stage", "track"],
-    "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
-    "viewing": ["LogServer", "view"],
-    "zones": ["draw_zones", "zones"],
-}
-#: Where the names of the package are defined; each is imported when it is first used.
-_MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() for name in names} | {
-    "McaptrackError": "mcaptrack.errors",
-    "McaptrackWarning": "mcaptrack.notices",
-    "Notice": "mcaptrack.notices",
-}
+
+def _listed(file: str) -> dict[str, str]:
+    """The module of each name of a package, by the stub beside its ``file``, which alone lists them."""
+    with open(f"{file}i", encoding="utf-8") as stub:
+        imports = [line.split() for line in stub if line.startswith("from mcaptrack.") and ".extensions." not in line]
+    return {name: module for _, module, _, name, *_ in imports}
 
 
 def _lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], object]:
@@ -59,7 +35,9 @@ def _unknown(package: str, name: str, names: Iterable[str]) -> AttributeError:
     return AttributeError(f"module {package!r} has no attribute {name!r}{meant}")
 
 
-_imported = _lazily(__name__, _MODULES)  # `import mcaptrack` stays light
+#: Where the names of the package are defined; each is imported when it is first used: `import mcaptrack` stays light.
+_MODULES = _listed(__file__)
+_imported = _lazily(__name__, _MODULES)
 
 
 def __getattr__(name: str) -> object:

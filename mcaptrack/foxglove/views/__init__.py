@@ -25,10 +25,10 @@ __all__ = ["DRAWN", "SCENE_SUFFIX", "SUFFIX", "SUFFIXES", "Drawing", "MovingCame
 
 
 #: Ends of the topics of views.
-SUFFIX: Final = VIEW_SUFFIX
+SUFFIX: Final[str] = VIEW_SUFFIX
 SUFFIXES: Final = (SUFFIX, SCENE_SUFFIX)
 #: The schemas of rows that can be drawn.
-DRAWN: Final = (DETECTIONS, TRACKS, PREDICTIONS)
+DRAWN: Final[tuple[Schema, ...]] = (DETECTIONS, TRACKS, PREDICTIONS)
 
 
 class Drawing:

@@ -22,7 +22,9 @@ _TILT_DEG: Final = 45.0
 #: The distance of the camera, in radii of the places of people: they are as large as can be, and all in sight.
 _DISTANCE: Final = 2.0
 #: The names of plots with known limits.
-PEOPLE, ERRORS, SPREAD = "people", "errors", "spread"
+PEOPLE: Final = "people"
+ERRORS: Final = "errors"
+SPREAD: Final = "spread"
 #: The suffix of the text of events, after the topic of tracks.
 _EVENTS: Final = "/events/view/log"
 #: The suffix of zones, after the topic of tracks.
