@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -18,7 +19,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
+from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import ALWAYS, LogTables, export, recording_name, topic_folder
+from mcaptrack.tables.fields import table_version
 from tests.commands import call, done
 from tests.logs import add_rows, recorder, some_log
 from tests.ros_messages import ros_writer
@@ -150,6 +153,21 @@ def test_a_table_that_was_damaged_or_lost_is_made_again(tmp_path):
     (folder / "tracks/recording=a/part-0.parquet").write_bytes(b"PAR1 half a table")
     (folder / "events/recording=a/part-0.parquet").unlink()
     assert set(exported(path, folder).written) == {"tracks", "events"}
+
+
+@pytest.mark.parametrize("change", [{"unit": "km"}, {"description": "in words"}])
+def test_tables_with_other_columns_have_another_version_and_are_made_again(tmp_path, monkeypatch, change):
+    path, folder = some_log(tmp_path / "a.mcap"), tmp_path / "tables"
+    exported(path, folder)
+    *others, last = TABLES["frames"].fields
+    changed = replace(TABLES["frames"], fields=(*others, replace(last, **change)))
+    monkeypatch.setitem(TABLES, "frames", changed)
+    table_version.cache_clear()
+    assert "frames" in exported(path, folder).written
+    monkeypatch.undo()
+    table_version.cache_clear()
+    assert exported(path, folder).written
+    assert exported(path, folder).written == []
 
 
 def test_tables_of_channels_that_are_gone_go(tmp_path):

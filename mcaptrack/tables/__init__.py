@@ -38,7 +38,7 @@ from mcaptrack.tables.build import (
     with_recording,
 )
 from mcaptrack.tables.catalogue import join
-from mcaptrack.tables.fields import RECORDING, TABLE_VERSION, TABLES
+from mcaptrack.tables.fields import RECORDING, TABLES, table_version
 from mcaptrack.tables.files import FORMATS, ParquetTable, file_metadata, verify, write
 from mcaptrack.tables.messages import MessageSource, MessagesTable, TypedMessages, inferred_table, typed_table
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, summary_table

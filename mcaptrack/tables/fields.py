@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.geometry.camera_path import Verdict
@@ -31,8 +32,8 @@ from mcaptrack.schema.classes import has_classes
 if TYPE_CHECKING:
     import pyarrow as pa
 
-#: Version of the tables' columns: the second number grows when columns are added.
-TABLE_VERSION: Final = "2.0"
+#: Grows when values of columns mean something else.
+_MEANING: Final = 2
 
 #: The unit of counts and ids.
 _NONE: Final = "1"
@@ -423,3 +424,10 @@ def _all_tables() -> Iterator[Table]:
 
 #: All tables of a log by name, in the order in which they are written.
 TABLES: Final = {table.name: table for table in _all_tables()}
+
+
+@cache
+def table_version() -> str:
+    """The version of tables, which changes with any column: tables of another version are written again."""
+    columns = [(f.name, str(f.type), f.nullable, f.metadata) for table in TABLES.values() for f in table.arrow]
+    return f"{_MEANING}.{sha256(repr(columns).encode()).hexdigest()[:8]}"

@@ -22,7 +22,7 @@ from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish
 from mcaptrack.tables.build import PIECE_ROWS, pieces_of
-from mcaptrack.tables.fields import TABLE_VERSION
+from mcaptrack.tables.fields import table_version
 
 FORMATS: Final[tuple[TableFormat, ...]] = get_args(TableFormat)
 _ZSTD_LEVEL: Final = 1  # higher levels hardly make floats that are split by byte smaller
@@ -81,7 +81,7 @@ class _Unchanged(Exception):
 
 
 def _stated(provenance: Mapping[str, str]) -> dict[str, str]:
-    return {"table_version": TABLE_VERSION} | dict(provenance)
+    return {"table_version": table_version()} | dict(provenance)
 
 
 @contextmanager

@@ -93,7 +93,7 @@ def current_file(contents: LogTables, folder: Path, name: str) -> Path | None:
     path = folder.joinpath(name, f"recording={contents.recording}", "part-0.parquet")
     metadata = tables.file_metadata(path, "parquet") or {}
     stored = (metadata.get("recording"), metadata.get("table_version"), metadata.get("source"))
-    now = (file_name(contents.opened.path), tables.TABLE_VERSION)
+    now = (file_name(contents.opened.path), tables.table_version())
     return path if stored[:2] == now and stored[2] == contents.source(name) else None
 
 
@@ -424,7 +424,7 @@ class _Job:
         if self.force:
             return False
         metadata = tables.file_metadata(path, self.form) or {}
-        if (metadata.get("source"), metadata.get("table_version")) != (source, tables.TABLE_VERSION):
+        if (metadata.get("source"), metadata.get("table_version")) != (source, tables.table_version()):
             return False
         self.done.rows[name] = int(metadata["rows"])
         return True
