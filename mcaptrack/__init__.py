@@ -8,14 +8,12 @@ __version__ = "0.3.0.dev0"
 SCHEMA_VERSION = 1
 
 _PARTS = {
-    "calibrating": ["CalibrateResult", "CameraCorrection", "calibrate"],
     "catalogue": ["Model", "get_model", "models"],
     "contents": ["ChannelInfo", "FrameInfo", "LogInfo", "info"],
     "cutting": ["CutResult", "cut"],
     "demonstration": ["DemoResult", "demo"],
     "events": ["events"],
     "exporting": ["ExportResult", "export"],
-    "fusing": ["fuse"],
     "health": ["DoctorResult", "doctor"],
     "ingesting": ["IngestResult", "ingest"],
     "messages": ["DecodedMessage"],

@@ -1,8 +1,5 @@
 import collections.abc
 
-from mcaptrack.api.calibrating import CalibrateResult as CalibrateResult
-from mcaptrack.api.calibrating import CameraCorrection as CameraCorrection
-from mcaptrack.api.calibrating import calibrate as calibrate
 from mcaptrack.api.catalogue import Model as Model
 from mcaptrack.api.catalogue import get_model as get_model
 from mcaptrack.api.catalogue import models as models
@@ -17,7 +14,6 @@ from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.events import events as events
 from mcaptrack.api.exporting import ExportResult as ExportResult
 from mcaptrack.api.exporting import export as export
-from mcaptrack.api.fusing import fuse as fuse
 from mcaptrack.api.health import DoctorResult as DoctorResult
 from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
@@ -55,6 +51,10 @@ from mcaptrack.api.viewing import view as view
 from mcaptrack.api.zones import draw_zones as draw_zones
 from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.extensions.cameras.api import CalibrateResult as CalibrateResult
+from mcaptrack.extensions.cameras.api import CameraCorrection as CameraCorrection
+from mcaptrack.extensions.cameras.api import calibrate as calibrate
+from mcaptrack.extensions.cameras.api import fuse as fuse
 from mcaptrack.extensions.notebook.api import Player as Player
 from mcaptrack.extensions.render.api import RenderResult as RenderResult
 from mcaptrack.extensions.render.api import render as render
@@ -154,3 +154,5 @@ SCHEMA_VERSION: int
 # exporter cvat: mcaptrack.extensions.exchange
 # exporter kitti: mcaptrack.extensions.exchange
 # exporter rerun: mcaptrack.extensions.rerun
+# fuser feet: mcaptrack.extensions.cameras
+# scene fused: mcaptrack.extensions.cameras

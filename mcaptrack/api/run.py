@@ -30,7 +30,7 @@ from mcaptrack.api.zones import ZonesLike, zones_of
 from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
-from mcaptrack.transforms import FUSION, STAGES, Transform
+from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
 
 if TYPE_CHECKING:
@@ -181,6 +181,7 @@ def run(
     from mcaptrack.api.running import Fusing, Where, transform_of, transforms_of, work
     from mcaptrack.evaluation.zones import ZoneOptions
     from mcaptrack.pipeline import PlaneChoice, Watch, ZoneWatch, plan_all
+    from mcaptrack.pipeline.scenes import Scenes
     from mcaptrack.pipeline.several import unfitting
     from mcaptrack.sources.foreign.boxes import choosing
     from mcaptrack.sources.foreign.definitions import definitions_of
@@ -193,7 +194,7 @@ def run(
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
-    joins = None if fuser is None else transform_of(FUSION.name, fuser, {})
+    fuses = Fusing(names, Scenes(fuse=fuse, fuser=fuser))
 
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
     settings = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
@@ -218,7 +219,6 @@ def run(
     where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
     earlier = _log_before(as_location(log), follows)
     finishing = (watch, counted) if watch else (counted,)
-    fuses = Fusing(names, fuse, joins)
     with definitions_of(definitions), choosing(topic, map, class_map):
         return work(
             where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier

@@ -28,11 +28,13 @@ from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.foreign.boxes import choosing
 from mcaptrack.sources.foreign.definitions import definitions_of
 from mcaptrack.sources.sidecar import SidecarChoice
-from mcaptrack.transforms import FUSION, STAGES, Transform
+from mcaptrack.transforms import STAGES, Stage, Transform
 
 if TYPE_CHECKING:
     from mcaptrack.evaluation.zones import ZoneTotals
     from mcaptrack.pipeline import Summary, Watch, ZoneWatch
+    from mcaptrack.pipeline.scenes import Scenes
+    from mcaptrack.pipeline.write import Made
 
 
 @dataclass(frozen=True)
@@ -160,11 +162,10 @@ class Where:
 
 
 class Fusing(NamedTuple):
-    """The cameras to run, all without names; whether they are fused to a scene; and by which fuser, if it is named."""
+    """The cameras to run, all without names, and what makes scenes of them."""
 
-    names: tuple[str, ...] = ()
-    is_on: bool = True
-    fuser: Transform | None = None
+    names: tuple[str, ...]
+    joins: Scenes
 
 
 def work(
@@ -193,9 +194,9 @@ def work(
 
         def act(opened: logs.Log, output: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
             at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
-            fused = {}
+            fused: Mapping[str, Made] = {}
             if fuses is not None:
-                fused = pipeline.fuse_again(opened, at, where.force, say, progress, not fuses.names, fuses.fuser)
+                fused = fuses.joins.join_again(opened, at, where.force, not fuses.names, say, progress)
             run = partial(pipeline.run, opened, at, output=output, progress=progress, plane=plane, boxes=boxes)
             run = partial(run, finishing=finishing, views=views, fused=fused)
             if follows is None:
@@ -213,17 +214,9 @@ def work(
 
         return act
 
-    def fuse_to(scene: str, names: Sequence[str], progress: Progress) -> Act:
-        def act(opened: logs.Log, output: Path | None, say: Say, _: BoxesRead) -> tuple[str, pipeline.Report]:
-            say(f"fusing {', '.join(names)} to /{scene}")
-            fuser = (fuses.fuser if fuses is not None else None) or FUSION.make()
-            return pipeline.fuse_cameras(opened, names, scene, fuser, {}, output, progress, is_asked=False)
-
-        return act
-
     each = None
     if fuses is not None and where.topic is None and (where.camera is None or len(fuses.names) > 1):
-        each = EveryCamera(fuses.names, fuses.is_on, run_at, fuse_to)
+        each = EveryCamera(*fuses, run_at)
     result = change(where, run_at("", progress), progress, tables, each)
     return replace(result, continued=pipeline.Continued.joined(continued)) if continued else result
 
@@ -347,14 +340,14 @@ def warn_stale(topic: str, log: Location, cameras: Mapping[str, str] = {}) -> No
     warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
 
 
-def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Value]) -> Transform:
+def transform_of(stage: str | Stage, chosen: str | Transform | None, options: Mapping[str, Value]) -> Transform:
     """Return the transform of a stage: the one of this name, or this one; with these options.
 
     Raises McaptrackError for a name or an option that does not exist, and for what is no transform.
     """
     options = {name: value.item() if isinstance(value, np.generic) else value for name, value in options.items()}
     if chosen is None or isinstance(chosen, str):
-        step = FUSION if stage == FUSION.name else STAGES[stage]
+        step = STAGES[stage] if isinstance(stage, str) else stage
         if chosen and step.parameter:
             return step.make(**{step.parameter: chosen, **options})
         return step.make(chosen or "", **options)

@@ -1,8 +1,7 @@
-"""Commands that run stages on logs, and what they print: ``run``, ``events``, ``fuse`` (``stages`` has the others)."""
+"""Commands that run stages on logs, and what they print: ``run``, ``events`` (``stages`` has the others)."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -59,15 +58,6 @@ class Events(RunsStages):
     shows_events = True
 
 
-class Fuse(RunsStages):
-    """Fuse the detections of several cameras."""
-
-    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
-        """Return the arguments of the function."""
-        arguments = super().arguments(names)
-        return arguments | {"clock_offset_s": offsets_of(arguments["clock_offset_s"])}
-
-
 class Run(RunsStages):
     """Run all stages that are missing or out of date."""
 
@@ -120,23 +110,6 @@ class Run(RunsStages):
         if len(logs) < 2:
             raise McaptrackError("--continue needs several logs, in the order of their times; name the one before, too")
         return logs
-
-
-def offsets_of(texts: Sequence[str] | None) -> dict[str, float]:
-    """Return the offsets of clocks by camera. Raises McaptrackError for others than CAMERA=SECONDS."""
-    out: dict[str, float] = {}
-    for text in texts or ():
-        name, equals, value = text.partition("=")
-        try:
-            seconds = float(value)
-        except ValueError:
-            seconds = math.nan
-        if not equals or not name or not math.isfinite(seconds):
-            raise McaptrackError(f"--clock-offset-s {text} is no CAMERA=SECONDS, as in front=0.3")
-        if name in out:
-            raise McaptrackError(f"--clock-offset-s is given twice for {name}")
-        out[name] = seconds
-    return out
 
 
 def _as_json(result: RunResult) -> dict[str, Any]:

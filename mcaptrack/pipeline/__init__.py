@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from mcaptrack.pipeline.drawing import RobotPath, find_views, robot_path, views_from_above
     from mcaptrack.pipeline.events import Watch
     from mcaptrack.pipeline.following import Before, Continued, begins_here
-    from mcaptrack.pipeline.fusing import fusable, fuse_again, fuse_cameras
     from mcaptrack.pipeline.plan import plan_all, plan_stage
     from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice
     from mcaptrack.pipeline.runner import Report, input_of, outdated_by, run
@@ -34,7 +33,6 @@ _NAMES: Final = {
     "mcaptrack.pipeline.drawing": "RobotPath find_views robot_path views_from_above",
     "mcaptrack.pipeline.events": "Watch",
     "mcaptrack.pipeline.following": "Before Continued begins_here",
-    "mcaptrack.pipeline.fusing": "fusable fuse_again fuse_cameras",
     "mcaptrack.pipeline.plan": "plan_all plan_stage",
     "mcaptrack.pipeline.planes": "AS_BEFORE PlaneChoice",
     "mcaptrack.pipeline.runner": "Report input_of outdated_by run",

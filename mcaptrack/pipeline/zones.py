@@ -42,7 +42,7 @@ from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import may_add
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
-from mcaptrack.pipeline.scene_views import PictureClock, picture_clock
+from mcaptrack.pipeline.pictures import PictureClock, picture_clock
 from mcaptrack.pipeline.staleness import is_outdated, planes_to_json, read_planes
 from mcaptrack.pipeline.write import DrawnMessages, Made, RunState
 from mcaptrack.schema import TRACKS, WORLDS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS

@@ -55,6 +55,7 @@ Kind = Literal[
     "player",
     "viewer",
     "name",
+    "scene",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
@@ -66,11 +67,11 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
-    "demo ingest run view info detect motion track sample predict retrack fuse models query export cut "
-    "evaluate events zones calibrate check recover drop doctor"
+    "demo ingest run view info detect motion track sample predict retrack models query export cut "
+    "evaluate events zones check recover drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "viewer", "name")
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "viewer", "name", "scene")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -102,9 +103,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "likelihood": "mcaptrack.transforms.retrack:Retrack",
             "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
         },
-        "fuser": {
-            "feet": "mcaptrack.transforms.fuse:FootFuser",
-        },
+        "fuser": {},
         # The default transform of each; mcaptrack.transforms.stages says the rest.
         "stage": {
             "detect": "mcaptrack.transforms.detect.median:MedianDetector",
@@ -161,6 +160,8 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "player": {},
         # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
         "name": {},
+        # What makes a scene of several cameras (mcaptrack.pipeline.scenes).
+        "scene": {},
         # Viewers on the web that `mcaptrack view` links, besides Lichtblick and Foxglove.
         "viewer": {},
     }
@@ -234,6 +235,11 @@ def _group(kind: str) -> str:
 def names(kind: Kind) -> tuple[str, ...]:
     """All names of a kind: built-in ones, then those of entry points. Imports nothing."""
     return (*BUILT_IN[kind], *sorted({point.name for point in points(kind)}))
+
+
+def own_names(kind: Kind) -> tuple[str, ...]:
+    """The names of a kind in mcaptrack: built-in ones, the default first, then those of extensions. Imports nothing."""
+    return (*BUILT_IN[kind], *sorted({point.name for point in points(kind) if point.is_own}))
 
 
 def points(kind: Kind) -> list[Point]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from mcaptrack import _lazily
 from mcaptrack.transforms.protocol import Transform
-from mcaptrack.transforms.stages import FULL, FUSION, STAGES, Stage
+from mcaptrack.transforms.stages import FULL, STAGES, Stage
 
 if TYPE_CHECKING:
     from mcaptrack.transforms.detect import KnnDetector, MedianDetector, OnnxDetector
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FULL",
-    "FUSION",
     "PROFILES",
     "STAGES",
     "TRACKERS",

@@ -17,13 +17,14 @@ from hypothesis import strategies as st
 
 import mcaptrack
 from mcaptrack import McaptrackError
+from mcaptrack.extensions.cameras import feet as fuse
+from mcaptrack.extensions.cameras.feet import CameraView, FootFuser, group, places_of
+from mcaptrack.extensions.cameras.fusers import FUSION
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.registry import names
 from mcaptrack.schema import SIGHTINGS, Frame
 from mcaptrack.testing import check_transform
-from mcaptrack.transforms import FUSION, fuse
-from mcaptrack.transforms.fuse import CameraView, FootFuser, group, places_of
 from tests.commands import call
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
@@ -210,9 +211,9 @@ def test_what_is_kept_of_comparing_changes_nothing(tmp_path: Path, monkeypatch: 
     path = write_log(tmp_path / "scene.mcap", CAMERAS[:3], people=0.8)
     mcaptrack.fuse(path)
     kept = fused(path)
-    monkeypatch.setattr("mcaptrack.pipeline.fusing._KEPT_BYTES", 1500)  # some frames only
-    monkeypatch.setattr("mcaptrack.transforms.fuse._BLOCK", 40)
-    monkeypatch.setattr("mcaptrack.pipeline.fusing._TOGETHER", 3)
+    monkeypatch.setattr("mcaptrack.extensions.cameras.fusing._KEPT_BYTES", 1500)  # some frames only
+    monkeypatch.setattr("mcaptrack.extensions.cameras.feet._BLOCK", 40)
+    monkeypatch.setattr("mcaptrack.extensions.cameras.fusing._TOGETHER", 3)
     mcaptrack.fuse(path)
     for t_ns, rows in fused(path).items():
         for name in ("x_m", "y_m", "cov_xx_m2", "score", "seen_by", "expected_by"):
@@ -342,7 +343,7 @@ class TestPersistence:
     def test_blocks_of_frames_are_seamless(self, monkeypatch: pytest.MonkeyPatch) -> None:
         drawn = [[0.0, 9.0], [0.4], [0.9, 9.3, 30.0], [], [1.0], [1.1, 9.0]]
         together = self.scores(drawn)
-        monkeypatch.setattr("mcaptrack.transforms.fuse._BLOCK", 1)
+        monkeypatch.setattr("mcaptrack.extensions.cameras.feet._BLOCK", 1)
         assert self.scores(drawn) == together
 
 

@@ -1,31 +1,162 @@
-"""Correct the ground planes of cameras by the people that they see together."""
+"""Fuse the detections of several cameras, and correct their ground planes by the people that they see together."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from mcaptrack.api.common import as_location, clock_offsets, split_names, warn_unused, warnings_about
+import mcaptrack
+from mcaptrack.api.common import as_location, split_names, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
 from mcaptrack.api.options import (
-    Cameras,
-    ClockOffsets,
+    FILES,
     EachLog,
     Force,
     Output,
+    Progress,
     Reports,
     Sidecar,
+    Views,
+    chooser,
     no_progress,
 )
+from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.cameras.feet import FootFuser
+from mcaptrack.extensions.cameras.fusers import FUSION
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
+from mcaptrack.transforms import Transform
 
 if TYPE_CHECKING:
-    from mcaptrack.pipeline.calibrating import CorrectedPlanes, Refined
+    from mcaptrack import log as logs
+    from mcaptrack import pipeline
+    from mcaptrack.extensions.cameras.calibrating import CorrectedPlanes, Refined
     from mcaptrack.pipeline.several import Say
+    from mcaptrack.pipeline.write import Made
     from mcaptrack.sources.fixed_frame import BoxesRead
+
+Cameras = Annotated[str | Sequence[str] | None, Option(metavar="A,B", commas=True, shown="all with a ground plane")]
+ClockOffsets = Annotated[
+    Mapping[str, float] | None,
+    Option(
+        metavar="CAMERA=SECONDS",
+        shown="estimated from people who walk",
+        help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
+    ),
+]
+#: The largest offset of a clock, a day: more is no offset, but another recording.
+_MOST_OFFSET_S: Final = 86_400.0
+
+
+#: The parameters of the usual fuser.
+_OPTIONS: Final = ("max_sigma", "max_distance_m", "min_score", "noise", "noise_m")
+
+
+def _of_feet(name: str) -> Option:
+    """The option for a parameter of the usual fuser, which declares its range and its help."""
+    (about,) = (field.metadata for field in fields(FootFuser) if field.name == name)
+    text = about["help"]
+    return Option(
+        "", about["least"], about["most"], tuning=True, is_set=not about["flag"], help=f"{text[:1].upper()}{text[1:]}."
+    )
+
+
+@declared(
+    most_used=("to", "cameras", "clock_offset_s", "min_score", "output", "force"),
+    printed_by="mcaptrack.extensions.cameras.command:Fuse",
+)
+def fuse(
+    log: EachLog,
+    *,
+    cameras: Cameras = None,
+    clock_offset_s: ClockOffsets = None,
+    fuser: Annotated[str | Transform, chooser("fuser")] = "feet",
+    max_sigma: Annotated[float, _of_feet("max_sigma")] = FootFuser.max_sigma,
+    max_distance_m: Annotated[float, _of_feet("max_distance_m")] = FootFuser.max_distance_m,
+    min_score: Annotated[float, _of_feet("min_score")] = FootFuser.min_score,
+    noise: Annotated[float, _of_feet("noise")] = FootFuser.noise,
+    noise_m: Annotated[float, _of_feet("noise_m")] = FootFuser.noise_m,
+    to: Annotated[str, Option(FILES)] = "world",
+    output: Output = None,
+    sidecar: Sidecar = None,
+    views: Views = False,
+    force: Force = False,
+    progress: Reports = no_progress,
+) -> mcaptrack.RunResult:
+    """Fuse the detections of several cameras to those of one scene.
+
+    From /CAMERA/detections and /CAMERA/ground_plane to /world/detections: boxes that stand at the same place are
+    joined, at most one of each camera, and the score is the probability that a person is there. The ground planes have
+    to be in the same metres. /world/detections/sightings has the boxes that each detection was made of.
+
+    Cameras may have other rates. A camera that sees people elsewhere than the others do, or earlier or later, is named.
+
+    `mcaptrack run log.mcap --camera world` tracks them.
+
+    Parameters
+    ----------
+    cameras : str or sequence of str, optional
+        Cameras to fuse.
+
+        Also with commas between names. By default all that have detections and a measured ground plane.
+    to : str, default "world"
+        Name of the scene; its channels begin with /NAME.
+
+    Returns
+    -------
+    RunResult
+        What was made: /world/detections, and /world/detections/sightings with the boxes that each was made of.
+
+    Raises
+    ------
+    McaptrackError
+        If the log cannot be read or written, or if no camera has detections and a measured ground plane.
+
+    Examples
+    --------
+    On the command line:
+
+        mcaptrack fuse log.mcap --cameras front,left
+
+    >>> import mcaptrack
+    >>> mcaptrack.fuse("log.mcap", output="fused.mcap").channels
+    ('/world/detections', '/world/detections/sightings')
+
+    """
+    from mcaptrack.api.running import Where, change, transform_of
+    from mcaptrack.extensions.cameras.fusing import fuse_cameras
+    from mcaptrack.pipeline.several import write_scene
+
+    names = split_names("cameras", cameras if isinstance(cameras, str) else cameras or None)
+    values = dict(zip(_OPTIONS, (max_sigma, max_distance_m, min_score, noise, noise_m), strict=True))
+    changed = {name: value for name, value in values.items() if value != getattr(FootFuser, name)}
+    chosen = transform_of(FUSION, fuser, changed)
+    offsets = clock_offsets(clock_offset_s)
+    if not to.strip("/") or not to.isprintable() or "/" in to.strip("/"):
+        raise McaptrackError(f"`to={to!r}` is no name of a scene; give one such as world")
+
+    def act(opened: logs.Log, target: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
+        def join(prefix: str, progress: Progress) -> dict[str, Made]:
+            is_chosen = bool(names)
+            return fuse_cameras(opened, names, prefix, chosen, offsets, progress, is_chosen, takes_strangers=True)
+
+        return write_scene(opened, f"/{to.strip('/')}", join, progress, target, views)
+
+    return change(Where(log, None, None, output, sidecar, force), act, progress, None)
+
+
+def clock_offsets(seconds_by_camera: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the offsets of clocks in seconds, by the bare names of cameras.
+
+    Raises McaptrackError for more than a day, and for NaN.
+    """
+    offsets = {name.strip("/"): float(value) for name, value in (seconds_by_camera or {}).items()}
+    for name, value in offsets.items():
+        if not abs(value) <= _MOST_OFFSET_S:
+            raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
+    return offsets
 
 
 @dataclass(frozen=True)
@@ -120,7 +251,7 @@ class CalibrateResult:
 @declared(
     most_used=("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
     heading="Improve and repair",
-    printed_by="mcaptrack.cli.calibrate:Calibrate",
+    printed_by="mcaptrack.extensions.cameras.command:Calibrate",
 )
 def calibrate(
     log: EachLog,
@@ -186,7 +317,7 @@ def calibrate(
     from mcaptrack import log as logs
     from mcaptrack import pipeline
     from mcaptrack.api.running import Where, change, warn_stale
-    from mcaptrack.pipeline.calibrating import calibrate_cameras, changes_of, write_changes
+    from mcaptrack.extensions.cameras.calibrating import calibrate_cameras, changes_of, write_changes
     from mcaptrack.schema.provenance import REFINE
 
     names = split_names("cameras", cameras if isinstance(cameras, str) else cameras or None)

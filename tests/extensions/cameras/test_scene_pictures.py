@@ -15,15 +15,16 @@ from hypothesis import strategies as st
 import mcaptrack
 from mcaptrack import McaptrackError, log, pipeline
 from mcaptrack.api import demonstration
+from mcaptrack.extensions.cameras.feet import CameraView
+from mcaptrack.extensions.cameras.on_pictures import SceneCamera, SceneOnPictures
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.scene_views import PictureClock, SceneCamera, SceneOnPictures
+from mcaptrack.pipeline.pictures import PictureClock
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import DETECTIONS, EVENTS, SIGHTINGS, TRACKS, EventKind, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.demo import PLACES, Pedestrian, Pose, SyntheticScene, three_cameras
 from mcaptrack.sources.video import write_mp4
-from mcaptrack.transforms.fuse import CameraView
 from mcaptrack.viewing.links import find_moments
 from tests.commands import done
 from tests.logs import write_with_views
@@ -241,7 +242,7 @@ class TestOnOnePicture:
         boxes.sort(key=lambda frame: frame.t_ns)
         clock = PictureClock("/b/video", np.arange(8) * NS, np.arange(8) * NS)
         camera = SceneCamera(1, clock, cls.VIEW, boxes, 40_000_000)
-        return tracks, SceneOnPictures(detections, sightings, [camera]), camera
+        return tracks, SceneOnPictures(detections, sightings), camera
 
     @classmethod
     def slowly(cls, tracks: list[Frame], scene: SceneOnPictures, camera: SceneCamera, is_true: bool) -> list[tuple]:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mcaptrack.extensions.cameras import fusing
+from mcaptrack.extensions.cameras.feet import CameraView, FootFuser, Offset, Shared
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline import fusing
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.transforms.fuse import CameraView, FootFuser, Offset, Shared
 
 S = 10**9
 #: Of two cameras, the second at 2 cm to a pixel.

@@ -6,13 +6,14 @@ that stand there where the camera has none. Letters: N rows, F frames, D detecti
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from functools import partial
+from typing import Final
 
 import numpy as np
 
-from mcaptrack import log
+from mcaptrack.extensions.cameras.feet import CameraView
 from mcaptrack.foxglove.views.people import by_plane
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.assignment import assign
@@ -20,55 +21,19 @@ from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.pipeline.checks import read_frames
+from mcaptrack.pipeline.pictures import PictureClock, picture_clock
+from mcaptrack.pipeline.scenes import Member
+from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, TRACKS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, joined_parts
-from mcaptrack.schema.provenance import FUSE, Provenance
-from mcaptrack.sources import foreign
 from mcaptrack.sources.camera_motion import planes_in
-from mcaptrack.sources.cameras import VIDEO, camera_at, detections_of
-from mcaptrack.transforms import STAGES
-from mcaptrack.transforms.fuse import CameraView
-
-if TYPE_CHECKING:
-    from mcaptrack.pipeline.write import RunState
+from mcaptrack.sources.cameras import camera_at, detections_of, detections_topic
 
 #: A track is at a detection of its time if it is at most so far away.
 _AT_M: Final = 1.0
 #: Boxes that a camera doesn't have are drawn if so much of their height and width is in the picture.
 _INSIDE: Final = 0.5
-
-
-# The times of a camera's pictures.
-
-
-class PictureClock(NamedTuple):
-    """The topic of a camera's pictures, None without any; their times, rising, and their stamps (M,) in ns."""
-
-    topic: str | None
-    t_ns: Ints
-    stamp_ns: Ints
-
-
-def picture_clock(opened: log.Log, prefix: str, stamps: Mapping[str, Sequence[int]]) -> PictureClock:
-    """Return the times of a camera's pictures; ``stamps`` as for ``write``."""
-    usual = f"{prefix}/{VIDEO}"
-    video = usual if usual in opened.channels else next(iter(stamps), None) or camera_at(opened, prefix).pictures
-    picture_ns = opened.times(video) if video else np.empty(0, np.int64)
-    video = video if len(picture_ns) else None
-    stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
-    return PictureClock(video, picture_ns, stamp_ns)
-
-
-def _stamps(opened: log.Log, topic: str, read_before: Sequence[int]) -> Ints:
-    """Return the capture times of a channel's pictures in ns, (M,) for M pictures.
-
-    ``read_before`` are the times if they were read before. Pictures that were ingested have their capture time as log
-    time; in other recordings the messages contain it.
-    """
-    if Provenance.from_metadata(opened.channel(topic).metadata):
-        return opened.times(topic)
-    return np.array(read_before, np.int64) if read_before else foreign.stamps(opened, topic)
 
 
 @dataclass(frozen=True)
@@ -81,17 +46,12 @@ class SceneCamera:
     boxes: Sequence[Frame]
     late_ns: int
 
-    @property
-    def pictures(self) -> str:
-        """The topic of its pictures."""
-        return self.clock.topic or ""
-
 
 class SceneOnPictures:
-    """A scene, and the cameras of it that have pictures."""
+    """The detections of a scene, and the sightings that they were made of."""
 
-    def __init__(self, detections: Sequence[Frame], sightings: Sequence[Frame], cameras: Sequence[SceneCamera]) -> None:
-        self._detections, self._sightings, self.cameras = detections, sightings, cameras
+    def __init__(self, detections: Sequence[Frame], sightings: Sequence[Frame]) -> None:
+        self._detections, self._sightings = detections, sightings
 
     def on_camera(
         self, camera: SceneCamera, schema: Schema, frames: Sequence[Frame], is_true: bool
@@ -178,13 +138,11 @@ def _standing(view: CameraView, xy_m: Floats, t_ns: Ints) -> Floats:
     return box
 
 
-def scene_on_pictures(state: RunState) -> SceneOnPictures:
-    """The scene of a run and its cameras with pictures; no cameras if it is no scene."""
-    opened = state.opened
-    target = f"{state.prefix}/{STAGES['detect'].output_topic}"
+def members_of(state: RunState) -> list[Member]:
+    """Return the cameras of the scene of a run that have pictures, and what draws it on them."""
+    opened, target = state.opened, detections_topic(state.prefix)
     how = state.provenance(target)
-    if how is None or how.transform != FUSE:
-        return SceneOnPictures((), (), ())
+    assert how is not None
     scene_cameras = []
     offsets = dict(zip(how.parameters["cameras"], how.parameters["clock_offset_s"], strict=True))
     for number, (name, late_s) in enumerate(offsets.items()):
@@ -198,6 +156,6 @@ def scene_on_pictures(state: RunState) -> SceneOnPictures:
         view = CameraView(name=name, planes=tuple(planes)).with_heights_in(boxes)
         scene_cameras.append(SceneCamera(number, clock, view, boxes, seconds_to_ns(late_s)))
     if not scene_cameras:
-        return SceneOnPictures((), (), ())
-    sightings = state.frames(f"{target}/sightings", SIGHTINGS)
-    return SceneOnPictures(state.frames(target, DETECTIONS), sightings, scene_cameras)
+        return []
+    scene = SceneOnPictures(state.frames(target, DETECTIONS), state.frames(f"{target}/sightings", SIGHTINGS))
+    return [Member(camera.clock, partial(scene.on_camera, camera)) for camera in scene_cameras]

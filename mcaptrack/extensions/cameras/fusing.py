@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.extensions.cameras.feet import CameraView, FootFuser, Joined, Offset, Shared, compare
+from mcaptrack.extensions.cameras.fusers import FUSION, fuser_of
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -24,85 +25,16 @@ from mcaptrack.location import Location
 from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace, read_named_frames
 from mcaptrack.pipeline.choice_of_cameras import split_by_lack
-from mcaptrack.pipeline.rebuild import fuser_of, plugins_of
-from mcaptrack.pipeline.runner import Report, outdated_by
+from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
-from mcaptrack.pipeline.write import Made, RunState, write
+from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_times, nearest_times, split_rows
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
-from mcaptrack.sources.cameras import Camera, cameras, detections_of, provenance_of, scenes_of
-from mcaptrack.transforms import FUSION, STAGES, Transform
-from mcaptrack.transforms.fuse import CameraView, FootFuser, Joined, Offset, Shared, compare
+from mcaptrack.sources.cameras import Camera, cameras, detections_of, detections_topic, provenance_of, scenes_of
+from mcaptrack.transforms import Transform
 from mcaptrack.transforms.guarded import guarded
-
-
-def fuse_cameras(
-    opened: log.Log,
-    names: Sequence[str],
-    scene: str,
-    fuser: Transform,
-    clock_offset_s: Mapping[str, float],
-    output: Path | None,
-    progress: Callable[[str, int, int], None],
-    is_asked: bool = True,
-    views: bool = False,
-) -> tuple[str, Report]:
-    """Fuse the detections of cameras, and write them below the name of the scene.
-
-    Parameters
-    ----------
-    opened : Log
-    names : sequence of str
-        The cameras; without any, all that have detections and a ground plane.
-    scene : str
-        The name below which results are written, as if it were a camera.
-    fuser : Transform
-        As of the stage ``FUSION``.
-    clock_offset_s : mapping of str to float
-        How much later than the others the times of a camera are; others are estimated.
-    output : Path or None
-        Write to this copy instead.
-    progress : callable
-        Called as ``progress(stage, done, total)``.
-    is_asked : bool
-        Whether the user asked for it: otherwise cameras that don't see the same people are refused.
-    views : bool
-        Whether the scene is drawn for viewers.
-
-    Returns
-    -------
-    prefix : str
-        The name of the scene, as that of a camera.
-    Report
-
-    Raises
-    ------
-    McaptrackError
-        If there is nothing to fuse, or if a channel that others recorded would be replaced; without ``is_asked`` also
-        if the cameras don't agree.
-    """
-    prefix = "/" + scene.strip("/")
-    for topic in _topics(prefix):
-        if not may_replace(opened, topic, FUSE):
-            raise McaptrackError(
-                f"{opened.path}: {topic} {describe_origin(opened, topic)}; give the scene another name with `to=`"
-            )
-    with collected() as warnings:
-        out = _fuse(opened, names, prefix, fuser, clock_offset_s, progress, bool(names) and is_asked, is_asked)
-    state = RunState(opened, prefix, out)
-    drawn = None
-    if views:
-        from mcaptrack.pipeline.views import make_views
-
-        drawn = make_views(state, ())
-    write(state, output, drawn)
-    report = Report(stages=[FUSE], is_written=True, warnings=list(warnings))
-    for topic, channel in out.items():
-        report.count(topic, channel)
-    report.stale = outdated_by(opened, {topic: channel.provenance.digest for topic, channel in out.items()})
-    return prefix, report
 
 
 def fuse_again(
@@ -113,8 +45,9 @@ def fuse_again(
     progress: Callable[[str, int, int], None],
     adds: bool = False,
     fuser: Transform | None = None,
-) -> dict[str, Made]:
-    """Make the scene below ``prefix`` again if it is out of date, or with ``force``; {} if there is none to make.
+) -> dict[str, Made] | None:
+    """Make the scene below ``prefix`` again if it is out of date, or with ``force``; {} if it isn't, None if it has no
+    fuser.
 
     The cameras and parameters are those that it was made with; so are offsets of clocks that were given. With ``adds``
     it is also made again if cameras can be fused now that it lacks, unless its cameras were chosen; so it is by
@@ -123,8 +56,8 @@ def fuse_again(
     """
     target = next(iter(_topics(prefix)))
     provenance = provenance_of(opened, target)
-    if provenance is None or provenance.transform != FUSE:
-        return {}
+    if provenance is None or FUSION.kind not in provenance.parameters:
+        return None
     parameters = provenance.parameters
     names, is_chosen = list(map(str, parameters["cameras"])), bool(parameters.get("cameras_given"))
     more = sorted({*fusable(opened, (), prefix)[0]} - {*names}) if adds and not is_chosen else []
@@ -141,7 +74,7 @@ def fuse_again(
     given_offset_s = {name: float(offset_s[name]) for name in parameters.get("clock_offsets_given", ())}
     names = sorted((*names, *more)) if more else names
     say(f"{target} {why}: fusing {', '.join(names)} again, {how}")
-    return _fuse(opened, names, prefix, wanted, given_offset_s, progress, is_chosen, takes_strangers=True)
+    return fuse_cameras(opened, names, prefix, wanted, given_offset_s, progress, is_chosen, takes_strangers=True)
 
 
 def _fuser_again(
@@ -421,11 +354,11 @@ def _able(opened: log.Log, names: Sequence[str], scene: str) -> tuple[list[Camer
 
 def _topics(prefix: str) -> dict[str, Schema]:
     """The schemas of the channels of a scene, the main one first."""
-    target = f"{prefix}/{STAGES['detect'].output_topic}"
+    target = detections_topic(prefix)
     return {target: DETECTIONS, f"{target}/sightings": SIGHTINGS}
 
 
-def _fuse(
+def fuse_cameras(
     opened: log.Log,
     names: Sequence[str],
     prefix: str,
@@ -435,11 +368,40 @@ def _fuse(
     is_chosen: bool,
     takes_strangers: bool,
 ) -> dict[str, Made]:
-    """Fuse cameras as ``fuse_cameras`` does, and return the channels by topic.
+    """Fuse the detections of cameras.
 
-    ``is_chosen`` says that the user named the cameras, ``takes_strangers`` that they are fused even if they don't see
-    the same people.
+    Parameters
+    ----------
+    opened : Log
+    names : sequence of str
+        The cameras; without any, all that have detections and a ground plane.
+    prefix : str
+        The name of the scene, as that of a camera.
+    fuser : Transform
+        As of ``FUSION``.
+    clock_offset_s : mapping of str to float
+        How much later than the others the times of a camera are; others are estimated.
+    progress : callable
+        Called as ``progress(stage, done, total)``.
+    is_chosen, takes_strangers : bool
+        Whether the user named the cameras; and whether they are fused even if they don't see the same people.
+
+    Returns
+    -------
+    dict of str to Made
+        The channels by topic.
+
+    Raises
+    ------
+    McaptrackError
+        If there is nothing to fuse, or if a channel that others recorded would be replaced; without
+        ``takes_strangers`` also if the cameras don't agree.
     """
+    for topic in _topics(prefix):
+        if not may_replace(opened, topic, FUSE):
+            raise McaptrackError(
+                f"{opened.path}: {topic} {describe_origin(opened, topic)}; give the scene another name with `to=`"
+            )
     with collected() as warnings:
         detected = read_sources(opened, _chosen(opened, names, prefix), clock_offset_s)
         compared = compared_cameras(detected.sources, _feet_of(fuser), clock_offset_s)

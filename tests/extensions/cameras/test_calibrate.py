@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.geometry.ground_correction import MODELS, Corrector, Feet, moved, vote
+from mcaptrack.extensions.cameras.calibrating import Refined, Refiner, Watched
+from mcaptrack.extensions.cameras.ground_correction import MODELS, Corrector, Feet, moved, vote
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
-from mcaptrack.pipeline.calibrating import Refined, Refiner, Watched
 from mcaptrack.schema import GROUND_PLANE
 from mcaptrack.schema.encodings import PROTOBUF, record_of
 from mcaptrack.sources.cameras import camera_at

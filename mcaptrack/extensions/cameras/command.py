@@ -1,15 +1,17 @@
-"""``mcaptrack calibrate``: what it prints."""
+"""``mcaptrack fuse`` and ``mcaptrack calibrate``: what they print."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.running import offsets_of
+from mcaptrack.cli.running import RunsStages
+from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
@@ -24,6 +26,15 @@ _IN_WORDS: Final = {
     "full": "a homography",
     "pose": "another pose of the camera",
 }
+
+
+class Fuse(RunsStages):
+    """Fuse the detections of several cameras."""
+
+    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
+        """Return the arguments of the function."""
+        arguments = super().arguments(names)
+        return arguments | {"clock_offset_s": offsets_of(arguments["clock_offset_s"])}
 
 
 class Calibrate(EachLog["CalibrateResult"]):
@@ -69,6 +80,23 @@ class Calibrate(EachLog["CalibrateResult"]):
             "written_there_because": with_flags(done.written_because) or None,
             "seconds": done.seconds,
         }
+
+
+def offsets_of(texts: Sequence[str] | None) -> dict[str, float]:
+    """Return the offsets of clocks by camera. Raises McaptrackError for others than CAMERA=SECONDS."""
+    out: dict[str, float] = {}
+    for text in texts or ():
+        name, equals, value = text.partition("=")
+        try:
+            seconds = float(value)
+        except ValueError:
+            seconds = math.nan
+        if not equals or not name or not math.isfinite(seconds):
+            raise McaptrackError(f"--clock-offset-s {text} is no CAMERA=SECONDS, as in front=0.3")
+        if name in out:
+            raise McaptrackError(f"--clock-offset-s is given twice for {name}")
+        out[name] = seconds
+    return out
 
 
 def _words(camera: CameraCorrection, is_unchanged: bool) -> str:

@@ -16,10 +16,9 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.foxglove import views
-from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ground_correction import (
+from mcaptrack.extensions.cameras.feet import FootFuser, Places, group, means
+from mcaptrack.extensions.cameras.fusing import Gathered, Source, compared_cameras, fusable, read_sources, set_back
+from mcaptrack.extensions.cameras.ground_correction import (
     GATE,
     LENS_MODELS,
     MODELS,
@@ -31,10 +30,12 @@ from mcaptrack.geometry.ground_correction import (
     pair,
     vote,
 )
+from mcaptrack.foxglove import views
+from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace
-from mcaptrack.pipeline.fusing import Gathered, Source, compared_cameras, fusable, read_sources, set_back
 from mcaptrack.pipeline.staleness import digest_of
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import GROUND_PLANE, Frame
@@ -44,7 +45,6 @@ from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import Camera, camera_at, corrected_plane, given_plane, provenance_of, scenes_of
 from mcaptrack.sources.cameras import cameras as cameras_of
 from mcaptrack.sources.sidecar import check_topics, encoding_for
-from mcaptrack.transforms.fuse import FootFuser, Places, group, means
 
 #: Cameras are compared by at most so many frames.
 _COMPARED: Final = 200
