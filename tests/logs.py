@@ -173,7 +173,7 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "view": lambda log, out: [log, "--layout", "no such layout"],
     **{
         name: lambda log, out: [log, "-o", out / "other.mcap"]
-        for name in ("detect", "motion", "track", "sample", "predict", "retrack", "run", "fuse", "events")
+        for name in ("detect", "motion", "track", "sample", "predict", "retrack", "run", "events")
     },
 } | {name: words for name, words in of_extensions("READING").items() if words}
 

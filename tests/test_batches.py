@@ -44,8 +44,7 @@ def inputs(command: str, *names: str) -> list[str]:
     return list(names)
 
 
-# All but calibrate, which needs a log of several cameras.
-@pytest.mark.parametrize("command", one_in(6, sorted(SEVERAL - COMBINING - {"calibrate"})))
+@pytest.mark.parametrize("command", one_in(6, sorted(SEVERAL & READING.keys() - COMBINING)))
 def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")

@@ -174,7 +174,6 @@ def of_runs(to: Transcript) -> None:
     for more in ("", "-v", "-q", "--json"):
         to.run(f"events x.mcap {more}".strip(), events=stages)
     to.run("events x.mcap", events=run_result(stages=("events",), written_because="why", written_to=None))
-    to.run("fuse x.mcap", fuse=run_result(stages=("fuse",), frames={"/yard/detections": 4, "/other/x": 2}))
 
 
 def of_zones(to: Transcript) -> None:
@@ -252,23 +251,6 @@ def of_upkeep(to: Transcript) -> None:
         lost = tuple(f"byte {n}" for n in range(count))
         saved = LogRecovery(Path("a.mcap"), Path("saved.mcap"), 12, 3, lost, ())
         to.run(f"recover x.mcap -o saved.mcap {more}".strip(), recover=saved)
-
-
-def of_calibration(to: Transcript) -> None:
-    line = "people walk on one line"
-    cameras = {
-        "few": ("", 0.0, 0, None, None, None, None, "too few pairs", "", 0.0),
-        "agrees": ("", 0.0, 1200, 0.1, 0.3, None, None, "it agrees with the others", "", -0.5),
-        "off": ("rigid", 2.5, 90, 1.0, 2.0, 0.1, 0.2, "", line, 0.25),
-        "before": ("full", 2.5, 90, None, 2.0, 0.1, None, "", "", 0.0),
-    }
-    found = {name: mcaptrack.CameraCorrection(*one, homography=None) for name, one in cameras.items()}
-    given = Path("a.mcap"), found, {"off": "/off/plane", "before": "/before/plane"}, ("before",), ("/agrees/plane",)
-    for is_dry_run in (False, True):
-        result = mcaptrack.CalibrateResult(
-            *given, is_dry_run, (), None if is_dry_run else Path("b.mcap"), "why", (), 1.26
-        )
-        to.run("calibrate x.mcap", calibrate=result)
 
 
 def of_answers(to: Transcript) -> None:
@@ -356,7 +338,7 @@ def of_mistakes(to: Transcript) -> None:
 
 PARTS: Sequence[tuple[str, Callable[[Transcript], None]]] = (
     ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Zones", of_zones), ("Contents", of_contents),
-    ("Check and recover", of_upkeep), ("Calibrate", of_calibration), ("Query", of_answers),
+    ("Check and recover", of_upkeep), ("Query", of_answers),
     ("Many logs", of_many_logs), ("Mistakes", of_mistakes),
 )  # fmt: skip
 

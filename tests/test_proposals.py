@@ -21,7 +21,6 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import serving
-from tests import places
 from tests.bags import bag1
 from tests.commands import GROUP, call, done, zones_file
 from tests.extension_cases import of_extensions
@@ -109,12 +108,6 @@ class Scene:
         Path("boxes.txt").write_text("\n".join(rows))
         return self.ingested("boxes.txt", "--as", "detections", "--fps", "10").says("run", "LOG", "--no-tables")
 
-    def with_a_plane_off(self) -> str:
-        """Replace the log by one of three cameras, one of them with a ground plane that is 3 m off."""
-        self.path.unlink()
-        places.write_log(self.path.resolve(), places.CAMERAS[:3], moved_m={"east": 3.0})
-        return self.says("fuse", "LOG")
-
     def of_a_later_version(self) -> str:
         Path("mcaptrack.toml").write_text("[track]\nmax-age-s = 7.0\n")
         return self.says("run", "LOG", "--no-tables")
@@ -177,10 +170,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says(
         "evaluate", "LOG", "--set", "smoothed=true"
     ),
-    "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/following.py:_check_camera:run": Scene.followed,
-    "pipeline/fusing.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,
-    "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:products:export": lambda s: s.says("run", "s3://bucket/a.mcap"),

@@ -28,7 +28,6 @@ LINES = {
 DEEDS = {
     "demo": ["write"],
     "doctor": ["write"],
-    "fuse": [],  # it has no log of several cameras here
     "view": ["read", "serve"],
 } | of_extensions("DEEDS")
 MOMENTS = [

@@ -36,7 +36,7 @@ class RunsStages(EachLog["RunResult"]):
 
     def show(self, log: Location, done: RunResult, talk: common.Talk) -> None:
         """Print what was made, and commands to run next."""
-        _print(done, self.shows_events, talk)
+        _print(done, self.shows_events, self.next_commands(done), talk)
 
     def line(self, done: RunResult) -> str:
         """Return the result for one of many logs in one line."""
@@ -49,7 +49,11 @@ class RunsStages(EachLog["RunResult"]):
 
     def data(self, done: RunResult) -> dict[str, Any]:
         """Return the result of one log as values of JSON."""
-        return _as_json(done)
+        return _as_json(done) | {"next": self.next_commands(done)}
+
+    def next_commands(self, done: RunResult) -> list[str]:
+        """Return commands to run next."""
+        return _next(done)
 
 
 class Events(RunsStages):
@@ -141,7 +145,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
     data |= {"seconds": result.seconds, "seconds_by_part": dict(result.seconds_by_part)}
     if result.cameras or result.left_out:
         data |= {"left_out": dict(result.left_out), "not_fused": with_flags(result.not_fused) or None}
-    return data | {"next": _next(result)}
+    return data
 
 
 def _camera_as_json(camera: CameraResult) -> dict[str, Any]:
@@ -154,9 +158,6 @@ def _next(result: RunResult) -> list[str]:
     """Return commands to run next."""
     show = "view" if isinstance(result.log, Path) else "report"  # viewers open files
     if result.summary is None and not result.cameras:
-        if result.stages == ("fuse",):
-            scene = next(iter(result.frames)).split("/")[1]
-            return [command("run", result.log, "--camera", scene).strip("`")]
         steps = [show] if result.stages == ("events",) else ["run"]
     elif result.summary is None:
         steps = [show if show == "view" else "info"]  # a report is on one camera
@@ -167,7 +168,7 @@ def _next(result: RunResult) -> list[str]:
     return [command(step, result.log).strip("`") for step in steps]
 
 
-def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
+def _print(result: RunResult, shows_events: bool, commands: Sequence[str], talk: common.Talk) -> None:
     for topic, count in result.frames.items():
         talk.detail(f"{result.log}: {topic} {count} frames")
     for topic, kinds in result.events.items():
@@ -182,7 +183,7 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
         lines.append(("time", slow))
     if result.written_because and result.written_to:
         lines.append(("written", f"results are in {result.written_to}: {result.written_because}"))
-    lines.append(("next", "    ".join(_next(result))))
+    lines.append(("next", "    ".join(commands)))
     width = max(len(name) for name, _ in lines)
     for name, text in lines:
         talk.say(f"  {name:<{width}}  {text}")

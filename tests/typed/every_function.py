@@ -24,14 +24,9 @@ def make(folder: Path) -> str:
     made: mcaptrack.IngestResult = mcaptrack.ingest(
         "video.mp4", folder / "log.mcap", fps=25, ground_plane=folder / "h.txt", classes=None
     )
-    joined: mcaptrack.RunResult = mcaptrack.fuse(
-        made.log, cameras=["east", "west"], clock_offset_s={"east": 0.3}, progress=say
-    )
-    moved: mcaptrack.CalibrateResult = mcaptrack.calibrate(made.log, cameras=("east", "west"), dry_run=True)
-    corrections: dict[str, mcaptrack.CameraCorrection] = dict(moved.cameras)
     network: Path = mcaptrack.get_model("yolox-nano")
     catalogue: tuple[mcaptrack.Model, ...] = mcaptrack.models()
-    print(drawn, joined.channels, corrections, network, [model.name for model in catalogue])
+    print(drawn, network, [model.name for model in catalogue])
     return str(made.log)
 
 

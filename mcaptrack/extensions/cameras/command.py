@@ -11,11 +11,11 @@ from mcaptrack.cli import common
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.running import RunsStages
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, command
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:
-    from mcaptrack import CalibrateResult, CameraCorrection
+    from mcaptrack import CalibrateResult, CameraCorrection, RunResult
 
 #: Kinds of corrections in words.
 _IN_WORDS: Final = {
@@ -35,6 +35,11 @@ class Fuse(RunsStages):
         """Return the arguments of the function."""
         arguments = super().arguments(names)
         return arguments | {"clock_offset_s": offsets_of(arguments["clock_offset_s"])}
+
+    def next_commands(self, done: RunResult) -> list[str]:
+        """Return the command that runs the scene."""
+        scene = next(iter(done.frames)).split("/")[1]
+        return [command("run", done.log, "--camera", scene).strip("`")]
 
 
 class Calibrate(EachLog["CalibrateResult"]):
