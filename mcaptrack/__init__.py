@@ -27,7 +27,6 @@ _PARTS = {
     "stages": ["detect", "motion", "predict", "retrack", "sample", "stage", "track"],
     "upkeep": ["DropResult", "LogCheck", "LogRecovery", "check", "drop", "recover"],
     "viewing": ["LogServer", "view"],
-    "zones": ["draw_zones", "zones"],
 }
 #: Where the names of the package are defined; each is imported when it is first used.
 _MODULES = {name: f"mcaptrack.api.{module}" for module, names in _PARTS.items() for name in names} | {

@@ -1,4 +1,5 @@
 import collections.abc
+import typing
 
 from mcaptrack.api.catalogue import Model as Model
 from mcaptrack.api.catalogue import get_model as get_model
@@ -48,8 +49,6 @@ from mcaptrack.api.upkeep import drop as drop
 from mcaptrack.api.upkeep import recover as recover
 from mcaptrack.api.viewing import LogServer as LogServer
 from mcaptrack.api.viewing import view as view
-from mcaptrack.api.zones import draw_zones as draw_zones
-from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
 from mcaptrack.extensions.cameras.api import CalibrateResult as CalibrateResult
 from mcaptrack.extensions.cameras.api import CameraCorrection as CameraCorrection
@@ -67,12 +66,29 @@ from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
 from mcaptrack.extensions.tuning.api import tune as tune
+from mcaptrack.extensions.zones.api import ZonesLike as _ZonesLike
+from mcaptrack.extensions.zones.api import draw_zones as draw_zones
+from mcaptrack.extensions.zones.api import zones as zones
+from mcaptrack.extensions.zones.visits import ZoneTotals as _ZoneTotals
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
+from mcaptrack.transforms import Transform as _Transform
 
 _MODULES: dict[str, str]
 
 def _lazily(package: str, modules: collections.abc.Mapping[str, str]) -> collections.abc.Callable[[str], object]: ...
+
+class _RunOptions(typing.TypedDict, total=False):
+    """Options of ``run`` that are of extensions."""
+
+    fuse: bool
+    fuser: str | _Transform | None
+    zones: _ZonesLike | None
+
+class _OfFinishers:
+    """Attributes of ``RunResult`` that are of finishers of extensions."""
+
+    zones: collections.abc.Mapping[str, list[_ZoneTotals]]
 
 __all__ = [
     "CalibrateResult",

@@ -26,7 +26,7 @@ from mcaptrack import fleet
 from mcaptrack.api.upkeep import LogCheck, LogRecovery
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.intervals import WorldInterval
-from mcaptrack.evaluation.zones import ZoneInWorlds, ZoneTotals
+from mcaptrack.extensions.zones.visits import ZoneInWorlds, ZoneTotals
 from mcaptrack.fleet import FleetResult, LogOutcome
 from mcaptrack.log.check import CheckResult
 from mcaptrack.log.check_summary import Finding

@@ -14,7 +14,9 @@ import pytest
 import mcaptrack
 from mcaptrack import log, notices
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.zones import (
+from mcaptrack.extensions.zones.geojson import parse_zones, read_zones, zones_from_json, zones_to_json
+from mcaptrack.extensions.zones.shapes import Paths, Shape, crossings, visits
+from mcaptrack.extensions.zones.visits import (
     ZoneOptions,
     find_zone_events,
     ground_height_m,
@@ -24,9 +26,7 @@ from mcaptrack.evaluation.zones import (
 )
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.geometry.zones import Paths, Shape, crossings, visits
 from mcaptrack.schema import TRACKS, Frame
-from mcaptrack.sources.zones import parse_zones, read_zones, zones_from_json, zones_to_json
 from tests.commands import call, done
 from tests.worlds import ns, walk
 

@@ -14,7 +14,6 @@ from mcaptrack.cli.command import settings_of
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import counted, stdout_to_stderr
-from mcaptrack.cli.zones import zones_in_short
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.location import Location
 
@@ -123,11 +122,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         "stages": list(result.stages),
         "frames": result.frames,
         "events": result.events,
-        **(
-            {"zones": {topic: [total.to_json() for total in some] for topic, some in result.zones.items()}}
-            if result.zones
-            else {}
-        ),
+        **{name: report.data for name, report in result.finished.items()},
         "written_to": str(result.written_to) if result.written_to else None,
         "written_there_because": with_flags(result.written_because) or None,
     }
@@ -235,8 +230,8 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
         yield "fused", ", ".join(scenes) or f"no: {with_flags(result.not_fused)}"
     if result.summary is not None:
         yield from _lines_of_summary(result.summary)
-    if result.zones:
-        yield "zones", f"{zones_in_short(result)}; {command('zones', result.log)} prints them"
+    for name, report in result.finished.items():
+        yield name, report.text
     for line in result.continued.words() if result.continued else ():
         yield "goes on", line
     codes = [notice.code for notice in result.warnings]

@@ -111,7 +111,8 @@ def _best(opened: log.Log, prefix: str, suffix: str) -> list[str]:
     """Return the views with a suffix that layouts show by default."""
     topics = [topic for topic in opened.channels if topic.startswith(prefix + "/") and topic.endswith(suffix)]
     names = {topic.removeprefix(prefix + "/").removesuffix(suffix) for topic in topics}
-    return [f"{prefix}/{name}{suffix}" for name in layouts.best_channels(names)]
+    channels = {topic.removeprefix(prefix + "/") for topic in opened.channels}
+    return [f"{prefix}/{name}{suffix}" for name in layouts.best_channels(names, channels)]
 
 
 def _calibrated(opened: log.Log, prefix: str) -> list[str]:

@@ -7,16 +7,18 @@ cameras in the parameter ``cameras``.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from contextlib import suppress
+from typing import NamedTuple, TypeVar
 
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.pictures import PictureClock
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.write import Made, RunState
-from mcaptrack.registry import blamed, find, names
+from mcaptrack.registry import Entry, blamed, find, names
 from mcaptrack.schema import Frame, Schema
 from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.cameras import detections_topic, provenance_of
@@ -39,7 +41,10 @@ class Member(NamedTuple):
 
 
 class SceneMaker:
-    """What makes scenes. An entry point in ``mcaptrack.scenes`` names a subclass; ``off`` says why it does nothing."""
+    """What makes scenes: an object that the function of an entry point in ``mcaptrack.scenes`` returns.
+
+    The function is ``declared``; its parameters are options of ``run``. ``off`` says why it does nothing, if it does.
+    """
 
     off: str = ""
 
@@ -69,12 +74,20 @@ class SceneMaker:
         return ()
 
 
-class Scenes:
-    """All that makes scenes; ``options`` are those of a run. Each is asked in turn, those of extensions first."""
+def _usual() -> Iterator[tuple[Entry, SceneMaker]]:
+    for name in names("scene"):
+        with suppress(McaptrackError):  # which a run has said
+            entry = find("scene", name)
+            with blamed(entry, "failed"):
+                maker = entry.cls()
+            yield entry, maker
 
-    def __init__(self, **options: Any) -> None:
-        entries = [find("scene", name) for name in names("scene")]
-        self._makers = [(entry, entry.cls(**(options if entry.is_built_in else {}))) for entry in entries]
+
+class Scenes:
+    """All that makes scenes, with the options of a run, or without any. Each is asked in turn."""
+
+    def __init__(self, makers: Sequence[tuple[Entry, SceneMaker]] | None = None) -> None:
+        self._makers = makers if makers is not None else [*_usual()]
 
     def _answers(self, question: Callable[[SceneMaker], T]) -> Iterator[T]:
         for entry, maker in self._makers:

@@ -259,7 +259,6 @@ def together(reports: Sequence[Report]) -> Report:
         out.is_written |= report.is_written
         out.stale = [*dict.fromkeys([*out.stale, *report.stale])]
         out.warnings += report.warnings
-        out.finished |= report.finished
         for name, seconds in report.watch.seconds.items():
             out.watch.seconds[name] = out.watch.seconds.get(name, 0.0) + seconds
     return out

@@ -50,6 +50,8 @@ Kind = Literal[
     "message_reader",
     "exporter",
     "judge",
+    "finisher",
+    "report_section",
     "command",
     "page",
     "player",
@@ -68,10 +70,21 @@ _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
     "demo ingest run view info detect motion track sample predict retrack models query export cut "
-    "evaluate events zones check recover drop doctor"
+    "evaluate events check recover drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "viewer", "name", "scene")
+_BY_ENTRY_POINT: Final = (
+    "stage",
+    "message_reader",
+    "finisher",
+    "report_section",
+    "command",
+    "page",
+    "player",
+    "viewer",
+    "name",
+    "scene",
+)
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -154,6 +167,9 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "mot": "mcaptrack.tables.box_files:MotFile",
         },
         "judge": {},
+        # What is made of the results of stages at the end of a run.
+        "finisher": {"events": "mcaptrack.pipeline.events:Watch"},
+        "report_section": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         "page": {"tables": "mcaptrack.api.viewing:tables_page"},
@@ -258,7 +274,8 @@ def _owner(kind: Kind, point: Point) -> str:
     is_extension = any(own.is_own and own.name == point.name for own in entry_points(_group(kind)))
     if point.name in BUILT_IN[kind] or (is_extension and not point.is_own):
         return f"a built-in {titled(kind, point.name)}"
-    return f"a {titled('command', point.name)}" if kind == "stage" and point.name in names("command") else ""
+    taken = names("command") if kind == "stage" else BUILT_IN["command"] if kind == "finisher" else ()
+    return f"a {titled('command', point.name)}" if point.name in taken else ""
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, others, own_names
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, names, others, own_names
 from mcaptrack.schema import (
     APPEARANCE,
     CAMERA_MOTION,
@@ -35,10 +35,8 @@ StepBefore = Literal["memory", "planes", "scale", "corrections", "scene", "log-b
 StepAfter = Literal["one-class", "log-before", "video-rate", "pictures", "seen"]
 #: Suffix of the topic of tracks at the video's rate (the step "video-rate").
 FULL: Final = "/full"
-#: Last parts of topics that outputs can't have: these are made of the results of stages.
-RESERVED: Final = frozenset({"full", "view", "events", "counts", "errors", "scores", "zones"})
-#: What a run makes of the results of its stages, in the provenance.
-FINISHING: Final = ("events", "zones")
+#: Last parts of topics that outputs can't have, beside names of finishers: these are made of the results of stages.
+RESERVED: Final = frozenset({"full", "view", "counts", "errors", "scores"})
 #: The field for the file that a name may end with, as in ``onnx:FILE``.
 _FILE: Final = "file"
 
@@ -283,7 +281,7 @@ def _check_suffixes(entry: Entry, outputs: Mapping[Any, object]) -> None:
                 f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
                 "writes = {'': TRACKS, 'debug': DETECTIONS}"
             )
-        if suffix in RESERVED:
+        if suffix in RESERVED or suffix in names("finisher"):
             raise McaptrackError(f"{entry} has an output {suffix!r}, which is a name of what is made of results")
 
 

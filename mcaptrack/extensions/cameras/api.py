@@ -355,9 +355,7 @@ def calibrate(
             stale = sorted(
                 topic for topic in opened.channels if topic not in before and pipeline.is_stale(opened, topic)
             )
-            named = {topic: pipeline.camera_to_name(opened, topic) for topic in stale}
-        for topic in stale:
-            warn_stale(topic, done.log, named)
+            warn_stale(opened, stale)
     return replace(
         result,
         log=done.log,

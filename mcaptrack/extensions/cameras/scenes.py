@@ -14,9 +14,9 @@ from mcaptrack.transforms import Stage, Transform
 
 
 class FusedScenes(SceneMaker):
-    """Fuses cameras; ``fuse`` and ``fuser`` as for ``run``. Modules are imported when they are used."""
+    """Fuses cameras, unless ``fuse`` is false, by a fuser. Modules are imported when they are used."""
 
-    def __init__(self, fuse: bool = True, fuser: str | Transform | None = None) -> None:
+    def __init__(self, fuse: bool, fuser: str | Transform | None) -> None:
         self.off = "" if fuse else "`fuse=False` was given"
         self._fuser = None if fuser is None else transform_of(FUSION, fuser, {})
 

@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.extensions.zones.shapes import Shape, Zone
 from mcaptrack.foxglove.annotations import Annotations
 from mcaptrack.foxglove.views.ground import Instants
 from mcaptrack.foxglove.views.image import PictureTimes, View
@@ -18,7 +19,6 @@ from mcaptrack.foxglove.views.people import by_plane
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
-from mcaptrack.geometry.zones import Shape, Zone
 from mcaptrack.schema import ZONE_COUNTS, Frame
 from mcaptrack.schema.framing import frame_times, joined_parts
 

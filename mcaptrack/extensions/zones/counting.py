@@ -17,10 +17,14 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, ClassVar, Final, NamedTuple
 
 from mcaptrack import foxglove, log
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.contracts import Finished
+from mcaptrack.errors import McaptrackError, call, command
 from mcaptrack.evaluation.event_text import SUFFIX
 from mcaptrack.evaluation.world_tracks import smoothed_places
-from mcaptrack.evaluation.zones import (
+from mcaptrack.extensions.zones import drawing as drawn_zones
+from mcaptrack.extensions.zones.geojson import zones_from_json, zones_to_json
+from mcaptrack.extensions.zones.shapes import Zone
+from mcaptrack.extensions.zones.visits import (
     PlacedZone,
     TrackPositions,
     ZoneInWorlds,
@@ -35,10 +39,8 @@ from mcaptrack.evaluation.zones import (
     zones_in_worlds,
 )
 from mcaptrack.foxglove import views
-from mcaptrack.foxglove.views import zones as drawn_zones
 from mcaptrack.foxglove.views.image import PictureTimes
 from mcaptrack.geometry.plane import Planes, moved_planes, scene_planes
-from mcaptrack.geometry.zones import Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import may_add
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
@@ -49,7 +51,6 @@ from mcaptrack.schema import TRACKS, WORLDS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_V
 from mcaptrack.schema.framing import filtered_rows, frame_times, join_frames
 from mcaptrack.schema.provenance import VIEW, Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, provenance_of
-from mcaptrack.sources.zones import zones_from_json, zones_to_json
 from mcaptrack.transforms import FULL
 
 #: The name of the stage, in reports and in the provenance.
@@ -80,6 +81,22 @@ class ZoneWatch:
     def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
         """Count them (see ``make_zones``)."""
         return make_zones(state, planes, self, stamps)
+
+    def report(self, opened: log.Log, prefixes: Sequence[str]) -> Finished | None:
+        """Return the totals by the topic of the tracks, of all channels that were counted, now or before."""
+        counted = [channel for prefix in prefixes for channel in counted_zones(opened, prefix, with_worlds=True)]
+        if not counted:
+            return None
+        totals = {channel.topic: channel.totals for channel in counted}
+        data = {topic: [total.to_json() for total in some] for topic, some in totals.items()}
+        return Finished(totals, data, f"{zones_in_short(totals)}; {command('zones', opened.path)} prints them")
+
+
+def zones_in_short(totals: Mapping[str, Sequence[ZoneTotals]]) -> str:
+    """Return the number of zones and lines that were counted, and of channels of tracks, as text."""
+    zones = len({total.zone for some in totals.values() for total in some})
+    kinds = "zone or line" if zones == 1 else "zones and lines"
+    return f"{zones} {kinds}, of {len(totals)} channel{'' if len(totals) == 1 else 's'} of tracks"
 
 
 class CountedZones(NamedTuple):

@@ -17,7 +17,8 @@ from mcaptrack.location import local_name
 if TYPE_CHECKING:
     from mcaptrack import log as logs
     from mcaptrack import pipeline
-    from mcaptrack.geometry.zones import Zone
+    from mcaptrack.extensions.zones.counting import ZoneWatch
+    from mcaptrack.extensions.zones.shapes import Zone
 
 #: Heading in the help, and the zones that are counted by default.
 _COUNT: Final = "Counting"
@@ -30,7 +31,7 @@ ZonesLike = PathLike | Mapping[str, Any]
 
 def zones_of(source: ZonesLike | None) -> tuple[Zone, ...]:
     """Return the zones of a file, or of GeoJSON; none of None. Raises McaptrackError if they can't be read."""
-    from mcaptrack.sources.zones import parse_zones, read_zones
+    from mcaptrack.extensions.zones.geojson import parse_zones, read_zones
 
     if source is None:
         return ()
@@ -42,8 +43,34 @@ def zones_of(source: ZonesLike | None) -> tuple[Zone, ...]:
     return read_zones(as_path(source))
 
 
+@declared(most_used=("zones",))
+def count(
+    *,
+    zones: Annotated[
+        ZonesLike | None,
+        Option(
+            "After the stages",
+            metavar="FILE",
+            shown=_BEFORE,
+            help="Count visits of zones and crossings of lines, as `mcaptrack zones` does.\n\n"
+            "Of a file of GeoJSON, or of its content, also in later runs. By default those that the log was counted "
+            "with before, if any.",
+        ),
+    ] = None,
+    force: Force = False,
+) -> ZoneWatch:
+    """Count zones at the end of a run."""
+    from mcaptrack.extensions.zones.counting import ZoneWatch
+    from mcaptrack.extensions.zones.visits import ZoneOptions
+
+    wanted = zones_of(zones)
+    return ZoneWatch(wanted, options=ZoneOptions() if wanted else None, force=force)
+
+
 @declared(
-    most_used=("zones", "topic", "camera", "output", "force"), heading="Results", printed_by="mcaptrack.cli.zones:Zones"
+    most_used=("zones", "topic", "camera", "output", "force"),
+    heading="Results",
+    printed_by="mcaptrack.extensions.zones.command:Zones",
 )
 def zones(
     log: EachLog,
@@ -113,9 +140,9 @@ def zones(
     ['zone 1']
 
     """
-    from mcaptrack import pipeline
     from mcaptrack.api.running import Where, work
-    from mcaptrack.evaluation.zones import ZoneOptions
+    from mcaptrack.extensions.zones.counting import ZoneWatch, counted_zones
+    from mcaptrack.extensions.zones.visits import ZoneOptions
 
     wanted, usual = zones_of(zones), ZoneOptions()
     options = None
@@ -128,11 +155,11 @@ def zones(
         options = usual
 
     def plan(opened: logs.Log, prefix: str, *_: object) -> list[pipeline.Job]:
-        if not wanted and not pipeline.counted_zones(opened, prefix):
+        if not wanted and not counted_zones(opened, prefix):
             raise McaptrackError(f"{opened.path} was not counted yet; give a file of GeoJSON with `zones=`")
         return []
 
-    watch = pipeline.ZoneWatch(wanted, names_of(topic), options, force)
+    watch = ZoneWatch(wanted, names_of(topic), options, force)
     return work(Where(log, camera, None, output, sidecar, force), plan, progress, finishing=(watch,), views=True)
 
 
@@ -175,7 +202,7 @@ def draw_zones(
     """
     from mcaptrack import log as logs
     from mcaptrack import pipeline
-    from mcaptrack.viewing.zones_page import zones_page
+    from mcaptrack.extensions.zones.page import zones_page
 
     path = log_location(log)
     page = optional_path(output) or local_name(path, _PAGE)

@@ -16,12 +16,12 @@ from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
 from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
+from mcaptrack.extensions.zones.shapes import Paths, Shape, Units, Zone, crossings, visits
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import PERSON_HEIGHT_M, GroundPlane, Planes
-from mcaptrack.geometry.zones import Paths, Shape, Units, Zone, crossings, visits
 from mcaptrack.schema import TRACKS, ZONE_COUNTS, ZONE_CROSSINGS, ZONE_VISITS, Frame, Rows
 from mcaptrack.schema.classes import class_name, is_person
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns

@@ -12,8 +12,9 @@ import numpy as np
 
 from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.extensions.zones.counting import counted_zones
+from mcaptrack.extensions.zones.shapes import Units, Zone
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.geometry.zones import Units, Zone
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.motion import moves
 from mcaptrack.pipeline.write import RunState
@@ -60,10 +61,10 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
         width, height = _WIDTH_PX, max(1, round(float(extent[1]) * scale))
         middle = (least + most) / 2
         low = (float(middle[0] - extent[0] / 2), float(middle[1] + extent[1] / 2))
-    counted = pipeline.counted_zones(opened, prefix)
-    counted_zones = counted[0].zones if counted else ()
-    zones = [zone for zone in counted_zones if zone.units == units and _is_simple(zone)]
-    left_out = [zone.name for zone in counted_zones if zone not in zones]
+    counted = counted_zones(opened, prefix)
+    before = counted[0].zones if counted else ()
+    zones = [zone for zone in before if zone.units == units and _is_simple(zone)]
+    left_out = [zone.name for zone in before if zone not in zones]
     if left_out:
         names = ", ".join(left_out)
         warn(
@@ -77,6 +78,7 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
     }  # fmt: skip
     return render(
         "draw_zones.html",
+        __package__ or "",
         title=opened.path.name,
         log=opened.path.name,
         file=file,

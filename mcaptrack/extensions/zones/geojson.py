@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.zones.shapes import Shape, Units, Zone, first_crossing
 from mcaptrack.files import read_json
-from mcaptrack.geometry.zones import Shape, Units, Zone, first_crossing
 from mcaptrack.notices import warn
 
 _UNITS: Final[Mapping[str, Units]] = {

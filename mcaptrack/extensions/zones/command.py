@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import mcaptrack
 from mcaptrack.cli import common
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import counted, print_table, say, show, show_left_out
+from mcaptrack.cli.text import print_table, say, show, show_left_out
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from mcaptrack import RunResult
-    from mcaptrack.evaluation.zones import ZoneInWorlds
+    from mcaptrack.extensions.zones.visits import ZoneInWorlds
 
 #: The word before a log that is drawn on.
 _DRAW: Final = "draw"
@@ -55,7 +55,9 @@ class Zones(EachLog["RunResult"]):
 
     def line(self, done: RunResult) -> str:
         """Return the number of zones and lines that were counted."""
-        return zones_in_short(done)
+        from mcaptrack.extensions.zones.counting import zones_in_short
+
+        return zones_in_short(done.zones)
 
     def data(self, done: RunResult) -> dict[str, Any]:
         """Return the totals as values of JSON."""
@@ -66,14 +68,6 @@ class Zones(EachLog["RunResult"]):
             "written_to": str(done.written_to) if done.written_to else None,
             "seconds": done.seconds,
         }
-
-
-def zones_in_short(result: RunResult) -> str:
-    """The number of zones and lines that were counted, and of channels of tracks, in words."""
-    zones = len({total.zone for totals in result.zones.values() for total in totals})
-    topics = len(result.zones)
-    named = "zone or line" if zones == 1 else "zones and lines"
-    return f"{zones} {named}, of {counted(topics, 'channel')} of tracks"
 
 
 def print_zones(result: RunResult) -> None:
