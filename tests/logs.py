@@ -20,7 +20,6 @@ from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.tables import TablePieces, messages
-from tests.commands import zones_file
 from tests.extension_cases import of_extensions
 from tests.worlds import boxes_at, ns, tracks_at
 
@@ -169,7 +168,6 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "ingest": lambda log, out: [log, "-o", out / "ingested.mcap"],
     "query": lambda log, out: [log, "select count(*) from tracks"],
     "recover": lambda log, out: [log, "-o", out / "recovered.mcap"],
-    "zones": lambda log, out: [log, "--zones", zones_file(out), "-o", out / "other.mcap"],
     "view": lambda log, out: [log, "--layout", "no such layout"],
     **{
         name: lambda log, out: [log, "-o", out / "other.mcap"]

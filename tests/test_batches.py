@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import GROUP, call, zones_file
+from tests.commands import GROUP, call
+from tests.extension_cases import of_extensions
 from tests.logs import READING
 from tests.tiers import one_in
 
@@ -48,8 +49,7 @@ def inputs(command: str, *names: str) -> list[str]:
 def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")
-    words = ["--zones", zones_file(folder)] if command == "zones" else []
-    outcome = call(command, *bad, good, *words, "--json")
+    outcome = call(command, *bad, good, *of_extensions("NEEDS").get(command, ()), "--json")
     assert outcome.code == 3, outcome.err
     data = json.loads(outcome.out)
     assert [Path(one["log"]).name for one in data["results"]] == ["a.mcap"]

@@ -13,7 +13,6 @@ import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,15 +24,13 @@ import mcaptrack
 from mcaptrack import fleet
 from mcaptrack.api.upkeep import LogCheck, LogRecovery
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import WorldInterval
-from mcaptrack.extensions.zones.visits import ZoneInWorlds, ZoneTotals
 from mcaptrack.fleet import FleetResult, LogOutcome
 from mcaptrack.log.check import CheckResult
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.several import CameraResult
 from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores
-from tests.commands import call, run_result, zones_file
+from tests.commands import call, run_result
 from tests.extension_cases import EXTENSIONS, of_extensions
 from tests.worlds import write_clip
 
@@ -98,7 +95,6 @@ def write_labels() -> None:
     seen = [one for one in places if one[:2] != (40, 0)]
     Path("boxes.txt").write_text("".join(f"{f + 1},-1,{x + 0.5},24,8,8,0.9,-1,-1,-1\n" for f, p, x in seen))
     Path("plane.txt").write_text("0.1,0,0\n0,0.1,0\n0,0,1\n")
-    zones_file(Path())
 
 
 def of_a_log(to: Transcript) -> None:
@@ -110,7 +106,6 @@ def of_a_log(to: Transcript) -> None:
     to.run("drop a.mcap '/camera/retracks/*' -o b.mcap")
     to.run("track b.mcap --min-hits-s 2")
     to.run("events a.mcap")
-    to.run("zones a.mcap --zones zones.geojson")
     to.run("export a.mcap -o tables -v")
     to.run("export a.mcap -o tables -v")
     to.run("info b.mcap")
@@ -174,24 +169,6 @@ def of_runs(to: Transcript) -> None:
     for more in ("", "-v", "-q", "--json"):
         to.run(f"events x.mcap {more}".strip(), events=stages)
     to.run("events x.mcap", events=run_result(stages=("events",), written_because="why", written_to=None))
-
-
-def of_zones(to: Transcript) -> None:
-    room = ZoneTotals("room", False, 3, 4, 2, 1, 50.0, 12.54, 11.0, 2, 1.5)
-    door = ZoneTotals("door", True, 7, forward=5, backward=6)
-    counted = {"/a/tracks": [door, room], "/b/tracks": [ZoneTotals("room", False, 0)]}
-    to.run("zones x.mcap --zones z", zones=run_result(zones=counted, stages=("zones",), written_because="ROS reads it"))
-    to.run("zones x.mcap --zones z", zones=run_result(zones={"/a": [door]}, written_to=None, written_because="why"))
-    to.run("zones x.mcap --zones z --json -q", zones=run_result(zones={"/a": [room]}, stages=("zones",)))
-    ways = {"hall": WorldInterval(2.5, 1.0, 4.0), "roof": WorldInterval(0.0, 0.0, 0.0)}
-    sure = replace(
-        room, in_worlds=ZoneInWorlds(50, WorldInterval(3.0, 2.0, 5.0), WorldInterval(12.54, 9.0, 17.26), ways)
-    )
-    alone = replace(room, zone="hall", in_worlds=ZoneInWorlds(50, WorldInterval(3.0, None, None), None, {}))
-    counted = run_result(zones={"/a": [sure, alone, door]}, stages=("zones",))
-    for more in ("", "--json"):
-        to.run(f"zones x.mcap --zones z -q {more}".strip(), zones=counted)
-    to.run("run x.mcap", run=run_result(zones={"/a": [room]}, summary=Summary()))
 
 
 def channel(topic: str, messages: int, rate_hz: float | None = None, **more: Any) -> dict[str, Any]:
@@ -337,7 +314,7 @@ def of_mistakes(to: Transcript) -> None:
 
 
 PARTS: Sequence[tuple[str, Callable[[Transcript], None]]] = (
-    ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Zones", of_zones), ("Contents", of_contents),
+    ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Contents", of_contents),
     ("Check and recover", of_upkeep), ("Query", of_answers),
     ("Many logs", of_many_logs), ("Mistakes", of_mistakes),
 )  # fmt: skip

@@ -22,7 +22,7 @@ from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import serving
 from tests.bags import bag1
-from tests.commands import GROUP, call, done, zones_file
+from tests.commands import GROUP, call, done
 from tests.extension_cases import of_extensions
 from tests.interrupted import interrupt
 from tests.models import stocked
@@ -200,21 +200,12 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG"
     ),
     "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
-    "pipeline/zones.py:make_zones:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
-        "zones", "LOG", "--zones", str(zones_file(Path()))
-    ),
-    "cli/running.py:_lines_of_run:zones": lambda s: s.says(
-        "run", "LOG", "--no-tables", "--zones", str(zones_file(Path()))
-    ),
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
-    "viewing/zones_page.py:zones_page:run": lambda s: s.ingested("truth.txt", "--as", "detections", "--fps", "10").says(
-        "zones", "draw", "LOG"
-    ),
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(
         "evaluate", "tracks.csv", "--truth", "truth.txt"
     ),

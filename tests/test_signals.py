@@ -52,7 +52,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def folder(template, tmp_path_factory) -> Path:
     """A folder with inputs of all commands. An interrupted command must not change it."""
     folder = tmp_path_factory.mktemp("ended")
-    for name in ("a.mcap", "clip.mp4", "plane.txt", "truth.txt", "zones.geojson"):
+    for name in ("a.mcap", "clip.mp4", "plane.txt", "truth.txt"):
         shutil.copy(template.with_name(name), folder)
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
     return folder

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -58,10 +57,6 @@ FUNCTIONS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     "stage": ("detections", _of_copy(lambda p, t, o: mcaptrack.stage("track", p, topic=t, output=o))),
     "run": ("detections", _of_copy(lambda p, t, o: mcaptrack.run(p, topic=t, output=o, force=True))),
     "events": ("tracks", _of_copy(lambda p, t, o: mcaptrack.events(p, topic=t, output=o))),
-    "zones": (
-        "tracks",
-        _of_copy(lambda p, t, o: mcaptrack.zones(p, zones=_zone(o.parent), topic=t, output=o)),
-    ),
     "drop": ("decisions", _of_copy(lambda p, t, o: mcaptrack.drop(p, t, output=o))),
     "cut": ("tracks", lambda p, t, o: mcaptrack.cut(p, o / "copy.mcap", topic=t).messages),
     "export": ("tracks", lambda p, t, f: dict(mcaptrack.export(p, f / "a.txt", form="mot", topic=t).rows)),
@@ -77,14 +72,6 @@ METHODS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
 }
 #: A topic that these make, and that need not be there.
 MAKES = {"write"}
-
-
-def _zone(folder: Path) -> Path:
-    ring = [[-50, -50], [50, -50], [50, 50], [-50, 50], [-50, -50]]
-    square = {"type": "Feature", "properties": {"name": "a"}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-    path = folder / "zones.json"
-    path.write_text(json.dumps({"type": "FeatureCollection", "units": "metres", "features": [square]}))
-    return path
 
 
 def _taking(where: object) -> set[str]:

@@ -83,6 +83,10 @@ def _usual() -> Iterator[tuple[Entry, SceneMaker]]:
             yield entry, maker
 
 
+def _joinable(maker: SceneMaker, opened: log.Log, cameras: Sequence[str]) -> tuple[list[str], str]:
+    return ([], maker.off) if maker.off else maker.joinable(opened, cameras)
+
+
 class Scenes:
     """All that makes scenes, with the options of a run, or without any. Each is asked in turn."""
 
@@ -104,7 +108,7 @@ class Scenes:
     def joinable(self, opened: log.Log, cameras: Sequence[str]) -> tuple[list[str], str]:
         """Return the names of those of these cameras that can be joined; and why others, or all, can't be."""
         reasons = []
-        for joined, why in self._answers(lambda maker: maker.joinable(opened, cameras)):
+        for joined, why in self._answers(lambda maker: _joinable(maker, opened, cameras)):
             if joined:
                 return joined, why
             reasons.append(why)
@@ -114,7 +118,7 @@ class Scenes:
         """Return the channels of a scene of cameras that can be joined, by topic."""
 
         def join(maker: SceneMaker) -> Mapping[str, Made]:
-            return maker.join(opened, cameras, prefix, progress) if maker.joinable(opened, cameras)[0] else {}
+            return maker.join(opened, cameras, prefix, progress) if _joinable(maker, opened, cameras)[0] else {}
 
         return next(filter(None, self._answers(join)))
 

@@ -41,9 +41,7 @@ def compute(log: str) -> mcaptrack.RunResult:
         mcaptrack.predict(log, predictor="social"),
         mcaptrack.retrack(log, retracker=Retrack(), mode="offline"),
         mcaptrack.events(log, similarity="metres", gate_m=1.0),
-        mcaptrack.zones(log, zones={"type": "FeatureCollection", "features": []}, max_gap_s=1.0),
     ]
-    print(mcaptrack.draw_zones(log).name)
     whole: mcaptrack.RunResult = mcaptrack.run(log, tracker=ByteTrack(), class_limits=None, tables=True, progress=say)
     people = 0 if whole.summary is None else whole.summary.tracks
     said: tuple[mcaptrack.Notice, ...] = tuple(notice for step in (*steps, whole) for notice in step.warnings)

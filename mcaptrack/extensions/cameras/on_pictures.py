@@ -27,6 +27,7 @@ from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import BOX_PX, DETECTIONS, SIGHTINGS, TRACKS, Frame, Schema
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, frame_numbers, frame_times, joined_parts
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import camera_at, detections_of, detections_topic
 
@@ -138,11 +139,9 @@ def _standing(view: CameraView, xy_m: Floats, t_ns: Ints) -> Floats:
     return box
 
 
-def members_of(state: RunState) -> list[Member]:
-    """Return the cameras of the scene of a run that have pictures, and what draws it on them."""
+def members_of(state: RunState, how: Provenance) -> list[Member]:
+    """Return the cameras with pictures of the scene of a run, which was fused so, and what draws it on them."""
     opened, target = state.opened, detections_topic(state.prefix)
-    how = state.provenance(target)
-    assert how is not None
     scene_cameras = []
     offsets = dict(zip(how.parameters["cameras"], how.parameters["clock_offset_s"], strict=True))
     for number, (name, late_s) in enumerate(offsets.items()):

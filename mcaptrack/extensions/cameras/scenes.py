@@ -10,6 +10,7 @@ from mcaptrack.extensions.cameras.fusers import FUSION, fuser_of
 from mcaptrack.pipeline.scenes import Member, Progress, Say, SceneMaker
 from mcaptrack.pipeline.write import Made, RunState
 from mcaptrack.schema.provenance import Provenance
+from mcaptrack.sources.cameras import detections_topic
 from mcaptrack.transforms import Stage, Transform
 
 
@@ -43,11 +44,12 @@ class FusedScenes(SceneMaker):
 
     def maker_of(self, how: Provenance) -> tuple[Stage, Transform] | None:
         """Return the fuser that made a scene."""
-        fuser, _ = fuser_of(how)
+        fuser = fuser_of(how)[0] if FUSION.kind in how.parameters else None
         return None if fuser is None else (FUSION, fuser)
 
     def members(self, state: RunState) -> Sequence[Member]:
         """Return the cameras with pictures and a ground plane."""
         from mcaptrack.extensions.cameras.on_pictures import members_of
 
-        return members_of(state)
+        how = state.provenance(detections_topic(state.prefix))
+        return members_of(state, how) if how is not None and FUSION.kind in how.parameters else ()

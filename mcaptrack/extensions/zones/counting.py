@@ -41,6 +41,7 @@ from mcaptrack.extensions.zones.visits import (
 from mcaptrack.foxglove import views
 from mcaptrack.foxglove.views.image import PictureTimes
 from mcaptrack.geometry.plane import Planes, moved_planes, scene_planes
+from mcaptrack.location import Location
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import may_add
 from mcaptrack.pipeline.motion import ground_truth_with, path_with
@@ -85,11 +86,7 @@ class ZoneWatch:
     def report(self, opened: log.Log, prefixes: Sequence[str]) -> Finished | None:
         """Return the totals by the topic of the tracks, of all channels that were counted, now or before."""
         counted = [channel for prefix in prefixes for channel in counted_zones(opened, prefix, with_worlds=True)]
-        if not counted:
-            return None
-        totals = {channel.topic: channel.totals for channel in counted}
-        data = {topic: [total.to_json() for total in some] for topic, some in totals.items()}
-        return Finished(totals, data, f"{zones_in_short(totals)}; {command('zones', opened.path)} prints them")
+        return finished({channel.topic: channel.totals for channel in counted}, opened.path) if counted else None
 
 
 def zones_in_short(totals: Mapping[str, Sequence[ZoneTotals]]) -> str:
@@ -97,6 +94,12 @@ def zones_in_short(totals: Mapping[str, Sequence[ZoneTotals]]) -> str:
     zones = len({total.zone for some in totals.values() for total in some})
     kinds = "zone or line" if zones == 1 else "zones and lines"
     return f"{zones} {kinds}, of {len(totals)} channel{'' if len(totals) == 1 else 's'} of tracks"
+
+
+def finished(totals: Mapping[str, Sequence[ZoneTotals]], path: Location) -> Finished:
+    """Return what a run says of a log with these totals."""
+    data = {topic: [total.to_json() for total in some] for topic, some in totals.items()}
+    return Finished(totals, data, f"{zones_in_short(totals)}; {command('zones', path)} prints them")
 
 
 class CountedZones(NamedTuple):

@@ -39,6 +39,10 @@ EFFECTS = {
         },
     ),
 }
+OPTIONS_OF_RUN = {
+    "fuse": ("run two.mcap --no-tables", "--no-fuse"),
+    "fuser": ("run two.mcap --no-tables", "--fuser grid"),
+}
 
 
 def _printed(to: Any) -> None:
