@@ -167,3 +167,5 @@ SCHEMA_VERSION: int
 # exporter cvat: mcaptrack.extensions.exchange
 # exporter kitti: mcaptrack.extensions.exchange
 # exporter rerun: mcaptrack.extensions.rerun
+# finisher zones: mcaptrack.extensions.zones
+# report_section zones: mcaptrack.extensions.zones
