@@ -1,6 +1,8 @@
 import collections.abc
 import typing
 
+import mcaptrack.extensions.zones.api
+import mcaptrack.extensions.zones.visits
 from mcaptrack.api.calibrating import CalibrateResult as CalibrateResult
 from mcaptrack.api.calibrating import CameraCorrection as CameraCorrection
 from mcaptrack.api.calibrating import calibrate as calibrate
@@ -66,10 +68,8 @@ from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
 from mcaptrack.extensions.tuning.api import tune as tune
-from mcaptrack.extensions.zones.api import ZonesLike as _ZonesLike
 from mcaptrack.extensions.zones.api import draw_zones as draw_zones
 from mcaptrack.extensions.zones.api import zones as zones
-from mcaptrack.extensions.zones.visits import ZoneTotals as _ZoneTotals
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
 
@@ -80,12 +80,12 @@ def _lazily(package: str, modules: collections.abc.Mapping[str, str]) -> collect
 class _RunOptions(typing.TypedDict, total=False):
     """Options of ``run`` that finishers of extensions have."""
 
-    zones: _ZonesLike | None
+    zones: mcaptrack.extensions.zones.api.ZonesLike | None
 
 class _OfFinishers:
     """Attributes of ``RunResult`` that are of finishers of extensions."""
 
-    zones: collections.abc.Mapping[str, list[_ZoneTotals]]
+    zones: collections.abc.Mapping[str, list[mcaptrack.extensions.zones.visits.ZoneTotals]]
 
 __all__ = [
     "CalibrateResult",
