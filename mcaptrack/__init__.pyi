@@ -1,6 +1,9 @@
 import collections.abc
 import typing
 
+import mcaptrack.extensions.zones.api
+import mcaptrack.extensions.zones.visits
+import mcaptrack.transforms
 from mcaptrack.api.catalogue import Model as Model
 from mcaptrack.api.catalogue import get_model as get_model
 from mcaptrack.api.catalogue import models as models
@@ -66,13 +69,10 @@ from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
 from mcaptrack.extensions.tuning.api import tune as tune
-from mcaptrack.extensions.zones.api import ZonesLike as _ZonesLike
 from mcaptrack.extensions.zones.api import draw_zones as draw_zones
 from mcaptrack.extensions.zones.api import zones as zones
-from mcaptrack.extensions.zones.visits import ZoneTotals as _ZoneTotals
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
-from mcaptrack.transforms import Transform as _Transform
 
 _MODULES: dict[str, str]
 
@@ -82,13 +82,13 @@ class _RunOptions(typing.TypedDict, total=False):
     """Options of ``run`` that are of extensions."""
 
     fuse: bool
-    fuser: str | _Transform | None
-    zones: _ZonesLike | None
+    fuser: str | mcaptrack.transforms.Transform | None
+    zones: mcaptrack.extensions.zones.api.ZonesLike | None
 
 class _OfFinishers:
     """Attributes of ``RunResult`` that are of finishers of extensions."""
 
-    zones: collections.abc.Mapping[str, list[_ZoneTotals]]
+    zones: collections.abc.Mapping[str, list[mcaptrack.extensions.zones.visits.ZoneTotals]]
 
 __all__ = [
     "CalibrateResult",
@@ -170,5 +170,7 @@ SCHEMA_VERSION: int
 # exporter cvat: mcaptrack.extensions.exchange
 # exporter kitti: mcaptrack.extensions.exchange
 # exporter rerun: mcaptrack.extensions.rerun
+# finisher zones: mcaptrack.extensions.zones
 # fuser feet: mcaptrack.extensions.cameras
+# report_section zones: mcaptrack.extensions.zones
 # scene fused: mcaptrack.extensions.cameras

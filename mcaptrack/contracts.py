@@ -151,7 +151,7 @@ class Exporter(Protocol):
 
 
 class Finished(NamedTuple):
-    """What a finisher says of a log after a run.
+    """The report of a finisher on a log, after a run.
 
     ``value`` is the attribute of ``RunResult`` that has the finisher's name, by topic; ``data`` is the same as values
     of JSON, and ``text`` in a line.

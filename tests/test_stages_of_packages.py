@@ -121,7 +121,7 @@ def test_a_stage_reads_channels_beside_its_input_and_is_outdated_by_them(site, p
 )
 def test_a_stage_reads_any_rows(site, path, schema, topic):  # noqa: F811
     code = COUNTS.replace("reads: ClassVar = TRACKS", f"reads: ClassVar = {schema}").replace('"tracks"', f'"{topic}"')
-    add(site, "stage", "visits", code.replace("import TRACKS", f"import {schema}"))
+    add(site, "stage", "visits", code.replace("import DETECTIONS, TRACKS", f"import DETECTIONS, {schema}"))
     done("visits", path)
     with mcaptrack.open(path) as recording:
         assert len(recording.array("/camera/tracks/visits"))
@@ -136,7 +136,7 @@ def test_a_stage_reads_any_rows(site, path, schema, topic):  # noqa: F811
         (('{"": COUNT}', '{"": COUNT, "view": COUNT}'), "has an output 'view', which is a name of what is made"),
         (('input_topic: ClassVar = "tracks"', "input_topic: ClassVar = 3"), "has input_topic = 3; it is a topic below"),
         (('"tracks/visits"', '"/camera/visits"'), "has output_topic = '/camera/visits'; it is a topic below"),
-        (("    marks: ", "    mark: "), "has also_reads = zones without a field of that name"),
+        (("    marks: ", "    mark: "), "has also_reads = marks without a field of that name"),
         (("    marks: ", "    force: bool = False\n    marks: "), "can't have a parameter force"),
         (('    output_topic: ClassVar = "tracks/visits"\n', ""), "has output_topic = None; it is a topic below"),
         (("    also_reads", "    before = ('shake',)\n    also_reads"), "has before = shake; there are memory, planes"),

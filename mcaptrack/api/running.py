@@ -367,7 +367,7 @@ def warn_stale(opened: logs.Log, topics: Sequence[str]) -> None:
         again = call("run", opened.path, camera=camera) if camera else call("run", opened.path)
         warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
     for name, (first, *rest) in lost.items():
-        why = missing_extension(name) or f"no installed package has the finisher {name}"
+        why = missing_extension(name, "finisher") or f"no installed package has the finisher {name}"
         those = f"{first} and {len(rest)} more are" if rest else f"{first} is"
         warn(f"{those} out of date, because the input was replaced: {why}", "out-of-date")
 

@@ -280,10 +280,8 @@ def run(
         provenances = {topic: channel.provenance for topic, channel in results.items()}
         warn_findings(state, provenances, own_planes, is_all=bool(finishing) or not jobs)
     late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
-    if finishing:  # what is missing now may have been so when its input was replaced
-        own = sorted(camera_at(opened, prefix).topics - {*late})
-        late += [topic for topic in own if missing_finisher(opened, topic) and is_stale(opened, topic)]
-    report.stale = [topic for topic in late if topic not in state.gone]
+    late += _left_by_finishers(state) if finishing else []
+    report.stale = [topic for topic in dict.fromkeys(late) if topic not in state.gone]
     report.warnings = list(dict.fromkeys(warnings))
     return report
 
@@ -325,15 +323,22 @@ def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> 
     return gone - {*results}
 
 
+def _left_by_finishers(state: RunState) -> list[str]:
+    """Return channels that are out of date since an earlier run, and were made by a finisher that isn't installed."""
+    topics = sorted(camera_at(state.opened, state.prefix).topics)
+    return [topic for topic in topics if missing_finisher(state.opened, topic) and is_stale(state.opened, topic)]
+
+
 def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     """Return the other channels that stages made from earlier contents of these topics, or compared with them."""
     outdated = []
     for topic, channel in sorted(opened.channels.items()):
-        provenance = Provenance.from_metadata(channel.metadata)
-        is_result = provenance and (provenance.transform in (*STAGES, FUSE) or is_finished(topic, provenance))
-        if topic not in digests and provenance and is_result:
-            is_late = any(digests.get(name, then) != then for name, then in provenance.made_from().items())
-            outdated += [topic] if is_late else []
+        how = Provenance.from_metadata(channel.metadata)
+        if topic in digests or how is None:
+            continue
+        is_result = how.transform in STAGES or how.transform == FUSE or is_finished(topic, how)
+        if is_result and any(digests.get(name, then) != then for name, then in how.made_from().items()):
+            outdated.append(topic)
     return outdated
 
 

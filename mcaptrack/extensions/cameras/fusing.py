@@ -46,13 +46,12 @@ def fuse_again(
     adds: bool = False,
     fuser: Transform | None = None,
 ) -> dict[str, Made] | None:
-    """Make the scene below ``prefix`` again if it is out of date, or with ``force``; {} if it isn't, None if it has no
-    fuser.
+    """Make the scene below ``prefix`` again if it is out of date, or with ``force``.
 
-    The cameras and parameters are those that it was made with; so are offsets of clocks that were given. With ``adds``
-    it is also made again if cameras can be fused now that it lacks, unless its cameras were chosen; so it is by
-    ``fuser``, if that is another one than before. Raises McaptrackError as ``fuse_cameras`` does, and if the fuser that
-    made it is not installed.
+    Returns {} if there is nothing to do, and None if no fuser made it. The cameras and parameters are those that it was
+    made with; so are offsets of clocks that were given. With ``adds`` it is also made again if cameras can be fused now
+    that it lacks, unless its cameras were chosen; so it is by ``fuser``, if that is another one than before. Raises
+    McaptrackError as ``fuse_cameras`` does, and if the fuser that made it is not installed.
     """
     target = next(iter(_topics(prefix)))
     provenance = provenance_of(opened, target)

@@ -28,26 +28,8 @@ from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call, done
+from tests.extensions.zones.shapes import HOLED, LINE, SQUARE, ZONES, collection, feature
 from tests.worlds import ns, walk
-
-SQUARE = [[-2.0, 9.0], [2.0, 9.0], [2.0, 13.0], [-2.0, 13.0], [-2.0, 9.0]]
-LINE = [[0.0, 5.0], [0.0, 20.0]]
-HOLED = [[[-4, 8], [4, 8], [4, 15], [-4, 15], [-4, 8]], [[-1, 10], [1, 10], [1, 12], [-1, 12], [-1, 10]]]
-
-
-def feature(name: str | None, kind: str, coordinates: object, **own: object) -> dict:
-    properties = ({"name": name} if name is not None else {}) | own
-    return {"type": "Feature", "properties": properties, "geometry": {"type": kind, "coordinates": coordinates}}
-
-
-def collection(*features: dict, **top: object) -> dict:
-    return {"type": "FeatureCollection", "units": "metres", "features": list(features)} | top
-
-
-ZONES = collection(
-    feature("square", "Polygon", [SQUARE]), feature("ring", "Polygon", HOLED), feature("gate", "LineString", LINE)
-)
-
 
 # A slow implementation, one person at a time
 
