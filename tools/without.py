@@ -2,10 +2,12 @@
 
 .venv/bin/python tools/without.py NAME[,NAME ...] [WORD ...]      WORDs are for pytest, by default all tests
 .venv/bin/python tools/without.py all                             without all extensions
+.venv/bin/python tools/without.py --list                          print the names, as JSON
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -50,6 +52,9 @@ def install(folder: Path) -> None:
 
 def main() -> int:
     names, *words = sys.argv[1:]
+    if names == "--list":
+        print(json.dumps([*EXTENSIONS, "all"]))
+        return 0
     extensions = EXTENSIONS if names == "all" else names.split(",")
     if unknown := {*extensions} - {*EXTENSIONS}:
         sys.exit(f"there is no extension {', '.join(sorted(unknown))}; there are {', '.join(EXTENSIONS)}, or all")
