@@ -10,7 +10,7 @@ READING = {"report": lambda log, out: [log, "-o", out / "report.html"]}
 EFFECTS = {
     "report": (
         "report a.mcap",
-        {"camera": "--camera other", "output": "-o b.html", "force": ("report a.mcap -o clip.mp4", "--force")},
+        {"camera": "--camera other", "output": "-o b.html", "force": ("report a.mcap -o old.html", "--force")},
     )
 }
 WRITTEN = {"a.html": lambda path, output: mcaptrack.report(path, output=output)}

@@ -30,7 +30,7 @@ EFFECTS = {
             "topic": "--topic /none",
             "camera": "--camera other",
             "output": "-o b.toml",
-            "force": ("tune a.mcap --trials 1 -o query.sql", "--force"),
+            "force": ("tune a.mcap --trials 1 --study query.sql", "--force"),
         },
     )
 }

@@ -61,7 +61,7 @@ def _of_topic(path: Path, topic: str, folder: Path) -> Any:
         return {name: tuple(opened.times(name).tolist()) for name in opened.channels}
 
 
-# What docs/zones.md asks for
+# What docs/extensions/zones.md asks for
 
 DOCUMENTED_RUN = {"zones": ZONES}
 
@@ -91,7 +91,7 @@ def _most_inside(seven: Any) -> list[list[Any]]:
     return [[*key, count] for key, count in sorted(most.items())]
 
 
-QUERIES = {("docs/zones.md", "zone_visits"): _visits, ("docs/zones.md", "zone_counts"): _most_inside}
+QUERIES = {("docs/extensions/zones.md", "zone_visits"): _visits, ("docs/zones.md", "zone_counts"): _most_inside}
 TOPICS = {"zones": ("tracks", _of_topic)}
 PROPOSALS = {
     "extensions/zones/counting.py:make_zones:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
