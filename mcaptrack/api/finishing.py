@@ -1,4 +1,4 @@
-"""What installed packages add to runs, finishers and makers of scenes: their options, and what they make of these."""
+"""Finishers and makers of scenes of installed packages: their options, which ``run`` has, too, and their objects."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class Member(NamedTuple):
 
 
 class SceneMaker:
-    """What makes scenes: an object that the function of an entry point in ``mcaptrack.scenes`` returns.
+    """A maker of scenes: the object that the function of an entry point in ``mcaptrack.scenes`` returns.
 
     The function is ``declared``; its parameters are options of ``run``. ``off`` says why it does nothing, if it does.
     """
@@ -88,7 +88,7 @@ def _joinable(maker: SceneMaker, opened: log.Log, cameras: Sequence[str]) -> tup
 
 
 class Scenes:
-    """All that makes scenes, with the options of a run, or without any. Each is asked in turn."""
+    """All makers of scenes, with the options of a run, or without any. Each is asked in turn."""
 
     def __init__(self, makers: Sequence[tuple[Entry, SceneMaker]] | None = None) -> None:
         self._makers = makers if makers is not None else [*_usual()]
