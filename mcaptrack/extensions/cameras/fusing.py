@@ -14,7 +14,7 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.extensions.cameras.feet import CameraView, FootFuser, Joined, Offset, Shared, compare
+from mcaptrack.extensions.cameras.feet import LEAST_COMPARED, CameraView, FootFuser, Joined, Offset, Shared, compare
 from mcaptrack.extensions.cameras.fusers import FUSION, fuser_of
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
@@ -108,8 +108,6 @@ _PACE_M_PER_S: Final = 1.0
 _COMPARED: Final = 3000
 #: Offsets of a camera that are named: in metres, and in seconds.
 _FAR_M, _LATE_S = 0.25, 0.12
-#: Fewer comparisons say nothing about a camera.
-_LEAST: Final = 50
 
 
 class Source(NamedTuple):
@@ -302,7 +300,7 @@ def warn_disagreeing(
     farther = f"; {call('calibrate', path, dry_run=True)} finds planes that are farther off" if len(views) > 2 else ""
     for view, offset in zip(views, offsets, strict=True):
         name, taken_s = view.name, offset_s[view.name]
-        if offset.compared >= _LEAST and offset.distance_m > _FAR_M:
+        if offset.compared >= LEAST_COMPARED and offset.distance_m > _FAR_M:
             warn(
                 f"{name}: feet stand {offset.distance_m:.2f} m from where the other cameras see them (median of "
                 f"{offset.compared}); its ground plane, or theirs, is not right; {correct} corrects it",
@@ -320,7 +318,7 @@ def warn_disagreeing(
                 "people who walk show",
                 "clock",
             )
-        if len(views) > 1 and offset.compared < _LEAST:
+        if len(views) > 1 and offset.compared < LEAST_COMPARED:
             warn(
                 f"{name}: only {offset.compared} of its boxes are near people seen by two other cameras, too few to "
                 f"compare it with the others{farther}",
