@@ -103,7 +103,7 @@ def one_line(*words: str, code: int = 1) -> str:
 def test_every_kind_stands_on_the_page_with_an_example_of_at_most_40_lines():
     text = (pages.ROOT / "docs" / "extend.md").read_text()
     assert all(f"`mcaptrack.{kind}s`" in text for kind in KINDS)
-    assert all(len(code.splitlines()) <= 40 for code in FILES.values())
+    assert all(len(code.splitlines()) <= 40 for name, code in FILES.items() if name.endswith(".py"))
     assert {
         f"check_{name}" for name in ("transform", "predictor", "label_format", "message_reader", "exporter", "command")
     } == {name for name in testing.__all__ if name.startswith("check_")}

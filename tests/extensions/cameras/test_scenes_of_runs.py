@@ -5,13 +5,15 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import RunResult
+from mcaptrack import RunResult, log
 from mcaptrack.notices import collected
+from mcaptrack.schema import TRACKS
 from tests.commands import done
-from tests.places import CAMERAS, PEOPLE, said, write_log
+from tests.places import CAMERAS, NS, PEOPLE, said, walk, write_log, write_parts
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +80,25 @@ def test_cameras_of_different_places_are_not_fused(tmp_path: Path) -> None:
     assert "people that two cameras should see, two see" in result.not_fused
     assert not [topic for topic in topics(path) if topic.startswith("/world")]
     assert "ground planes may be of different places" in said(mcaptrack.fuse(path), "cameras-disagree")[0]
+
+
+def test_ids_of_a_scene_of_several_cameras_go_on(tmp_path: Path) -> None:
+    """Each of five people has one id over both parts, in the tracks of the scene and in all that is made of them."""
+    several = write_parts(tmp_path)
+    with collected():
+        mcaptrack.run(several[0], follows=several, tables=False, predictor="cv", events=False)
+        result = mcaptrack.run(several[1], follows=several, tables=False, predictor="cv", events=False)
+    assert result.continued is not None
+    assert result.continued.kept["/world/tracks"] == result.continued.kept["/world/retracks"] == PEOPLE
+    for name in ("tracks", "retracks", "retracks/online", "retracks/full"):
+        ids: dict[int, set[int]] = {}
+        for path in several:
+            with log.read(path) as opened:
+                for frame in opened.frames(f"/world/{name}", TRACKS):
+                    rows = frame.rows[frame.rows["observed"]]
+                    at = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
+                    away = np.linalg.norm(walk(frame.t_ns / NS - 1)[:, None] - at, axis=-1)
+                    for person, row in zip(away.argmin(axis=0), rows, strict=True):
+                        ids.setdefault(int(person), set()).add(int(row["track_id"]))
+        assert sorted(map(len, ids.values())) == [1] * PEOPLE, name
+        assert len(set.union(*ids.values())) == PEOPLE
