@@ -1,8 +1,9 @@
 import collections.abc
+import typing
 
-from mcaptrack.api.calibrating import CalibrateResult as CalibrateResult
-from mcaptrack.api.calibrating import CameraCorrection as CameraCorrection
-from mcaptrack.api.calibrating import calibrate as calibrate
+import mcaptrack.extensions.zones.api
+import mcaptrack.extensions.zones.visits
+import mcaptrack.transforms
 from mcaptrack.api.catalogue import Model as Model
 from mcaptrack.api.catalogue import get_model as get_model
 from mcaptrack.api.catalogue import models as models
@@ -17,7 +18,6 @@ from mcaptrack.api.demonstration import demo as demo
 from mcaptrack.api.events import events as events
 from mcaptrack.api.exporting import ExportResult as ExportResult
 from mcaptrack.api.exporting import export as export
-from mcaptrack.api.fusing import fuse as fuse
 from mcaptrack.api.health import DoctorResult as DoctorResult
 from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
@@ -52,9 +52,11 @@ from mcaptrack.api.upkeep import drop as drop
 from mcaptrack.api.upkeep import recover as recover
 from mcaptrack.api.viewing import LogServer as LogServer
 from mcaptrack.api.viewing import view as view
-from mcaptrack.api.zones import draw_zones as draw_zones
-from mcaptrack.api.zones import zones as zones
 from mcaptrack.errors import McaptrackError as McaptrackError
+from mcaptrack.extensions.cameras.api import CalibrateResult as CalibrateResult
+from mcaptrack.extensions.cameras.api import CameraCorrection as CameraCorrection
+from mcaptrack.extensions.cameras.api import calibrate as calibrate
+from mcaptrack.extensions.cameras.api import fuse as fuse
 from mcaptrack.extensions.notebook.api import Player as Player
 from mcaptrack.extensions.render.api import RenderResult as RenderResult
 from mcaptrack.extensions.render.api import render as render
@@ -67,12 +69,26 @@ from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
 from mcaptrack.extensions.tuning.api import tune as tune
+from mcaptrack.extensions.zones.api import draw_zones as draw_zones
+from mcaptrack.extensions.zones.api import zones as zones
 from mcaptrack.notices import McaptrackWarning as McaptrackWarning
 from mcaptrack.notices import Notice as Notice
 
 _MODULES: dict[str, str]
 
 def _lazily(package: str, modules: collections.abc.Mapping[str, str]) -> collections.abc.Callable[[str], object]: ...
+
+class _RunOptions(typing.TypedDict, total=False):
+    """Options of ``run`` that are of extensions."""
+
+    fuse: bool
+    fuser: str | mcaptrack.transforms.Transform | None
+    zones: mcaptrack.extensions.zones.api.ZonesLike | None
+
+class _OfFinishers:
+    """Attributes of ``RunResult`` that are of finishers of extensions."""
+
+    zones: collections.abc.Mapping[str, list[mcaptrack.extensions.zones.visits.ZoneTotals]]
 
 __version__: str
 SCHEMA_VERSION: int
@@ -83,3 +99,7 @@ SCHEMA_VERSION: int
 # exporter cvat: mcaptrack.extensions.exchange
 # exporter kitti: mcaptrack.extensions.exchange
 # exporter rerun: mcaptrack.extensions.rerun
+# finisher zones: mcaptrack.extensions.zones
+# fuser feet: mcaptrack.extensions.cameras
+# report_section zones: mcaptrack.extensions.zones
+# scene fused: mcaptrack.extensions.cameras

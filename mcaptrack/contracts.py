@@ -1,7 +1,8 @@
 """Contracts of label formats, readers of messages and exporters of other packages, and the types that they give.
 
-Each is a class that is made without arguments. Detectors, trackers and so on are in ``mcaptrack.transforms.protocol``,
-predictors in ``mcaptrack.predictors.forecast``; a command is a function that ``mcaptrack.api.declared`` declares.
+Each is a class that is made without arguments; finishers and sections of the report are functions. Detectors, trackers
+and so on are in ``mcaptrack.transforms.protocol``, predictors in ``mcaptrack.predictors.forecast``; a command is a
+function that ``mcaptrack.api.declared`` declares.
 
 Letters: N boxes, F frames.
 """
@@ -147,3 +148,43 @@ class Exporter(Protocol):
         steps that are done and all.
         """
         ...
+
+
+class Finished(NamedTuple):
+    """The report of a finisher on a log, after a run.
+
+    ``value`` is the attribute of ``RunResult`` that has the finisher's name, by topic; ``data`` is the same as values
+    of JSON, and ``text`` in a line.
+    """
+
+    value: Mapping[str, Any]
+    data: Any
+    text: str
+
+
+class SectionTable(NamedTuple):
+    """A table of a section: groups of rows, each with a heading and (role, name, topic, cells) of channels of tracks.
+
+    ``columns`` are the heads of the cells. The role gives the colour: "tracks", "samples", "online", "offline" or
+    "truth".
+    """
+
+    caption: str
+    columns: Sequence[str]
+    groups: Sequence[tuple[str, Sequence[tuple[str, str, str, Sequence[str]]]]]
+
+
+class ReportSection(NamedTuple):
+    """A section of the report on a log, by a function that is called with the open log, the prefix of the camera, and
+    the names of tracks by their role; it returns None if there is nothing to say.
+
+    ``short`` is its link at the top. ``figures`` are made by ``figure`` of ``mcaptrack.viewing.charts``. ``data``
+    stands in the JSON below the name of the section.
+    """
+
+    short: str
+    title: str
+    tables: Sequence[SectionTable] = ()
+    figures: Sequence[Mapping[str, Any]] = ()
+    note: str = ""
+    data: Any = None

@@ -17,6 +17,7 @@ from typer.main import get_command
 import mcaptrack
 from mcaptrack.api.running import RunResult
 from mcaptrack.cli import app
+from tests.extension_cases import of_extensions
 from tests.worlds import write_clip
 
 GROUP = get_command(app)
@@ -105,23 +106,6 @@ def toml_value(value: object) -> str:
     )
 
 
-#: A zone that both people of ``made_log`` walk through, and a line that one of them crosses.
-ZONES = (
-    '{"type": "FeatureCollection", "units": "metres", "features": ['
-    '{"type": "Feature", "properties": {"name": "room"}, "geometry": '
-    '{"type": "Polygon", "coordinates": [[[1, 2], [3, 2], [3, 5], [1, 5], [1, 2]]]}}, '
-    '{"type": "Feature", "properties": {"name": "door"}, "geometry": '
-    '{"type": "LineString", "coordinates": [[4, 0], [4, 9]]}}]}'
-)
-
-
-def zones_file(folder: Path) -> Path:
-    """A file of zones."""
-    path = folder / "zones.geojson"
-    path.write_text(ZONES)
-    return path
-
-
 def made_log(folder: Path, frames: int = 30) -> Path:
     """A log of two people who walk beside each other, found, tracked, predicted and re-tracked."""
     write_clip(folder / "clip.mp4", frames)
@@ -130,7 +114,8 @@ def made_log(folder: Path, frames: int = 30) -> Path:
     ]
     (folder / "truth.txt").write_text("\n".join(rows) + "\n")
     (folder / "plane.txt").write_text("0.1,0,0\n0,0.1,0\n0,0,1\n")
-    zones_file(folder)
+    for name, text in of_extensions("FILES").items():
+        (folder / name).write_text(text)
     path = folder / "a.mcap"
     labels = ["--truth", folder / "truth.txt", "--ground-plane", folder / "plane.txt"]
     done("ingest", folder / "clip.mp4", *labels, "-o", path)
@@ -140,7 +125,7 @@ def made_log(folder: Path, frames: int = 30) -> Path:
 
 def run_result(**changed: Any) -> RunResult:
     """The result of a run that did nothing in 1.26 s, but for what is given."""
-    names = ("frames", "rows", "tracks", "events", "zones", "tables", "seconds_by_part")
+    names = ("frames", "rows", "tracks", "events", "finished", "tables", "seconds_by_part")
     plain = dict.fromkeys(("stages", "stale", "layouts", "warnings", "notes"), ()) | {name: {} for name in names}
     plain |= {"log": Path("a b.mcap"), "written_to": Path("a b.mcap"), "written_because": "", "seconds": 1.26}
     return RunResult(**{"summary": None} | plain | changed)

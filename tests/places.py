@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import mcaptrack
+from mcaptrack.schema import Frame
 
 PEOPLE, SECONDS = 5, 16
 WIDTH, HEIGHT, FOCAL = 960, 540, 600.0
@@ -98,6 +100,26 @@ def write_log(
                 )
             log.write(f"/{camera.name}/detections", frames, replace=True)
     return path
+
+
+def write_parts(folder: Path) -> list[Path]:
+    """Two recordings of three cameras, one after the other, made of one."""
+    whole = write_log(folder / "whole.mcap", CAMERAS[:3])
+    paths = []
+    for number, (begin_s, end_s) in enumerate([(0.0, 9.2), (9.2, 99.0)]):
+        paths.append(Path(shutil.copy(whole, folder / f"{number}.mcap")))
+        with mcaptrack.open(paths[-1]) as opened:
+            for camera in CAMERAS[:3]:
+                topic = f"/{camera.name}/detections"
+                rows = opened.array("detections", topic)
+                times = [t_ns for t_ns in np.unique(rows["t_ns"]) if begin_s <= t_ns / NS < end_s]
+                opened.write(topic, [_boxes_of(rows[rows["t_ns"] == t_ns], int(t_ns)) for t_ns in times], replace=True)
+    return paths
+
+
+def _boxes_of(rows: np.ndarray, t_ns: int) -> Frame:
+    boxes = np.stack([rows[name] for name in ("x_px", "y_px", "w_px", "h_px")], axis=-1)
+    return mcaptrack.detections(boxes, rows["score"], rows["class_id"], t_ns, box_format="xywh")
 
 
 def fused(path: Path, topic: str = "/world/detections") -> dict[int, np.ndarray]:

@@ -9,14 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import GROUP, LACKS, call, zones_file
+from tests.commands import GROUP, call
+from tests.extension_cases import of_extensions
+from tests.logs import READING
 from tests.tiers import one_in
 
-#: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
-COMBINING = {"cut", "report", "query", "evaluate", "tune", "train"}
-SEVERAL = {name for name, command in GROUP.commands.items() if any(one.nargs == -1 for one in command.params)} - {
-    "drop"
+SEVERAL = {
+    name
+    for name, command in GROUP.commands.items()
+    if any(one.nargs == -1 for one in command.params) and "output" in command.settings and name != "drop"
 }
+#: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
+COMBINING = {name for name in SEVERAL if "jobs" not in GROUP.commands[name].settings}
 WORDS = {"query": ["select 1"]}
 
 
@@ -41,13 +45,11 @@ def inputs(command: str, *names: str) -> list[str]:
     return list(names)
 
 
-# All but calibrate, which needs a log of several cameras.
-@pytest.mark.parametrize("command", one_in(6, sorted(SEVERAL - COMBINING - {"calibrate"})))
+@pytest.mark.parametrize("command", one_in(6, sorted(SEVERAL & READING.keys() - COMBINING)))
 def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")
-    words = ["--zones", zones_file(folder)] if command == "zones" else []
-    outcome = call(command, *bad, good, *words, "--json")
+    outcome = call(command, *bad, good, *of_extensions("NEEDS").get(command, ()), "--json")
     assert outcome.code == 3, outcome.err
     data = json.loads(outcome.out)
     assert [Path(one["log"]).name for one in data["results"]] == ["a.mcap"]
@@ -68,17 +70,9 @@ def test_a_missing_input_is_one_line(folder):
 
 def test_a_command_that_combines_inputs_needs_all_of_them(folder):
     before = sorted(folder.rglob("*"))
-    for command in sorted(COMBINING - {"train"} - LACKS):  # which needs torch
-        more = [] if command == "tune" else ["--json"]
-        outcome = call(
-            command,
-            "a.mcap",
-            "broken.mcap",
-            *WORDS.get(command, []),
-            "-o",
-            "out.mcap" if command == "cut" else "out.html",
-            *more,
-        )
+    for command in sorted(COMBINING & READING.keys()):
+        name = {"cut": "out.mcap", "tune": "out.toml"}.get(command, "out.html")
+        outcome = call(command, "a.mcap", "broken.mcap", *WORDS.get(command, []), "-o", name)
         assert (outcome.code, outcome.out) == (1, "")
         assert "broken.mcap" in outcome.err
         assert sorted(folder.rglob("*")) == before

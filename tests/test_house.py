@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -14,7 +15,8 @@ import yaml
 
 from mcaptrack.installed import declared
 
-ROOT = Path(__file__).parent.parent
+TESTS = Path(__file__).parent
+ROOT = TESTS.parent
 POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 EXTENSIONS = sorted(path.parent.name for path in (ROOT / "mcaptrack" / "extensions").glob("*/__init__.py"))
 #: Groups of what users choose by name, beside commands and names in Python.
@@ -139,6 +141,13 @@ def test_every_extension_has_a_folder_of_tests_and_every_entry_point_a_folder():
     assert set(EXTENSIONS) == tested == {room_of(value) for points in POINTS.values() for value in points.values()}
 
 
+def test_every_table_of_cases_is_one_that_a_test_of_the_core_gathers():
+    asked = {name for path in TESTS.rglob("*.py") for name in re.findall(r'of_extensions\("(\w+)"\)', path.read_text())}
+    for path in (TESTS / "extensions").glob("*/cases.py"):
+        tables = set(re.findall(r"^([A-Z]\w*)(?:: .*)? = ", path.read_text(), re.M))
+        assert tables <= asked, path
+
+
 def test_the_installed_entry_points_are_those_of_the_project():
     points = {(point.group, point.name, point.value) for point in declared().points if point.is_own}
     wanted = {(group, name, value) for group, own in POINTS.items() for name, value in own.items()}
@@ -147,7 +156,10 @@ def test_the_installed_entry_points_are_those_of_the_project():
 
 def test_the_workflow_takes_each_extension_away():
     jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
-    assert sorted(jobs["without"]["strategy"]["matrix"]["extension"]) == EXTENSIONS
+    (command,) = re.findall(r"names=\$\(python3 (.+)\)", jobs["extensions"]["steps"][-1]["run"])
+    listed = subprocess.run([sys.executable, *command.split()], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert json.loads(listed.stdout) == [*EXTENSIONS, "all"]
+    assert jobs["without"]["strategy"]["matrix"]["extension"] == "${{ fromJSON(needs.extensions.outputs.names) }}"
 
 
 def test_the_core_names_no_extension():

@@ -13,9 +13,9 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.pipeline import with_views
+from mcaptrack.pipeline.staleness import is_finished
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import VIEW, Provenance
-from mcaptrack.transforms.stages import FINISHING
 from tests.logs import our_messages
 
 
@@ -25,7 +25,7 @@ def without_views(template, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("stages") / "walk.mcap"
     with log.read(template) as opened:
         hows = {topic: Provenance.from_metadata(channel.metadata) for topic, channel in opened.channels.items()}
-    finished = [topic for topic, how in hows.items() if how and how.transform in (*FINISHING, VIEW)]
+    finished = [topic for topic, how in hows.items() if how and (how.transform == VIEW or is_finished(topic, how))]
     assert finished
     mcaptrack.drop(template, finished, output=path)
     return path

@@ -20,7 +20,7 @@ import pytest
 from mcaptrack import log
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.write import ATTACHMENTS
-from mcaptrack.registry import Entry, find
+from mcaptrack.registry import Entry, find, names
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.testing import LawError, check_predictor, check_transform, sample_frames
@@ -178,7 +178,7 @@ def test_reserved_names_are_those_of_what_is_made_of_results(logs):
     with log.read(logs["full"]) as opened:
         made = {topic.removeprefix("/camera/").split("/")[1] for topic in opened.channels if topic.count("/") > 2}
     own = {"online", "predictions", "decisions", "appearance", "worlds", "tf"}
-    assert made - own - {"image", "scene"} <= RESERVED
+    assert made - own - {"image", "scene"} <= RESERVED | {*names("finisher")}
     assert FULL.strip("/") in RESERVED
 
 

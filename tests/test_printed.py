@@ -1,4 +1,5 @@
-"""What commands print, as a whole: each command line and its lines are those in tests/printed.txt.
+"""What commands print, as a whole: each command line and its lines are those in tests/printed.txt,
+those of extensions in tests/extensions/NAME/printed.txt.
 
 A text that was changed on purpose is written anew by ``PRINTED=write pytest tests/test_printed.py``; the difference of
 the file is what changes for users. What varies between systems is replaced by #: times, bytes and versions.
@@ -12,7 +13,6 @@ import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,18 +24,16 @@ import mcaptrack
 from mcaptrack import fleet
 from mcaptrack.api.upkeep import LogCheck, LogRecovery
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import WorldInterval
-from mcaptrack.evaluation.zones import ZoneInWorlds, ZoneTotals
 from mcaptrack.fleet import FleetResult, LogOutcome
 from mcaptrack.log.check import CheckResult
 from mcaptrack.log.check_summary import Finding
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.several import CameraResult
 from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores
-from tests.commands import call, run_result, zones_file
+from tests.commands import call, run_result
+from tests.extension_cases import EXTENSIONS, of_extensions
 from tests.worlds import write_clip
 
-SNAPSHOT = Path(__file__).parent / "printed.txt"
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
 #: What differs from system to system or from release to release, and isn't what a text is about.
@@ -97,7 +95,6 @@ def write_labels() -> None:
     seen = [one for one in places if one[:2] != (40, 0)]
     Path("boxes.txt").write_text("".join(f"{f + 1},-1,{x + 0.5},24,8,8,0.9,-1,-1,-1\n" for f, p, x in seen))
     Path("plane.txt").write_text("0.1,0,0\n0,0.1,0\n0,0,1\n")
-    zones_file(Path())
 
 
 def of_a_log(to: Transcript) -> None:
@@ -109,7 +106,6 @@ def of_a_log(to: Transcript) -> None:
     to.run("drop a.mcap '/camera/retracks/*' -o b.mcap")
     to.run("track b.mcap --min-hits-s 2")
     to.run("events a.mcap")
-    to.run("zones a.mcap --zones zones.geojson")
     to.run("export a.mcap -o tables -v")
     to.run("export a.mcap -o tables -v")
     to.run("info b.mcap")
@@ -173,25 +169,6 @@ def of_runs(to: Transcript) -> None:
     for more in ("", "-v", "-q", "--json"):
         to.run(f"events x.mcap {more}".strip(), events=stages)
     to.run("events x.mcap", events=run_result(stages=("events",), written_because="why", written_to=None))
-    to.run("fuse x.mcap", fuse=run_result(stages=("fuse",), frames={"/yard/detections": 4, "/other/x": 2}))
-
-
-def of_zones(to: Transcript) -> None:
-    room = ZoneTotals("room", False, 3, 4, 2, 1, 50.0, 12.54, 11.0, 2, 1.5)
-    door = ZoneTotals("door", True, 7, forward=5, backward=6)
-    counted = {"/a/tracks": [door, room], "/b/tracks": [ZoneTotals("room", False, 0)]}
-    to.run("zones x.mcap --zones z", zones=run_result(zones=counted, stages=("zones",), written_because="ROS reads it"))
-    to.run("zones x.mcap --zones z", zones=run_result(zones={"/a": [door]}, written_to=None, written_because="why"))
-    to.run("zones x.mcap --zones z --json -q", zones=run_result(zones={"/a": [room]}, stages=("zones",)))
-    ways = {"hall": WorldInterval(2.5, 1.0, 4.0), "roof": WorldInterval(0.0, 0.0, 0.0)}
-    sure = replace(
-        room, in_worlds=ZoneInWorlds(50, WorldInterval(3.0, 2.0, 5.0), WorldInterval(12.54, 9.0, 17.26), ways)
-    )
-    alone = replace(room, zone="hall", in_worlds=ZoneInWorlds(50, WorldInterval(3.0, None, None), None, {}))
-    counted = run_result(zones={"/a": [sure, alone, door]}, stages=("zones",))
-    for more in ("", "--json"):
-        to.run(f"zones x.mcap --zones z -q {more}".strip(), zones=counted)
-    to.run("run x.mcap", run=run_result(zones={"/a": [room]}, summary=Summary()))
 
 
 def channel(topic: str, messages: int, rate_hz: float | None = None, **more: Any) -> dict[str, Any]:
@@ -251,54 +228,6 @@ def of_upkeep(to: Transcript) -> None:
         lost = tuple(f"byte {n}" for n in range(count))
         saved = LogRecovery(Path("a.mcap"), Path("saved.mcap"), 12, 3, lost, ())
         to.run(f"recover x.mcap -o saved.mcap {more}".strip(), recover=saved)
-
-
-def of_calibration(to: Transcript) -> None:
-    line = "people walk on one line"
-    cameras = {
-        "few": ("", 0.0, 0, None, None, None, None, "too few pairs", "", 0.0),
-        "agrees": ("", 0.0, 1200, 0.1, 0.3, None, None, "it agrees with the others", "", -0.5),
-        "off": ("rigid", 2.5, 90, 1.0, 2.0, 0.1, 0.2, "", line, 0.25),
-        "before": ("full", 2.5, 90, None, 2.0, 0.1, None, "", "", 0.0),
-    }
-    found = {name: mcaptrack.CameraCorrection(*one, homography=None) for name, one in cameras.items()}
-    given = Path("a.mcap"), found, {"off": "/off/plane", "before": "/before/plane"}, ("before",), ("/agrees/plane",)
-    for is_dry_run in (False, True):
-        result = mcaptrack.CalibrateResult(
-            *given, is_dry_run, (), None if is_dry_run else Path("b.mcap"), "why", (), 1.26
-        )
-        to.run("calibrate x.mcap", calibrate=result)
-
-
-SCORES = {"IDF1": 0.75, "MOTA": 0.5, "HOTA": 0.25, "IDSW": 1, "FP": 2, "FN": 3}
-
-
-def tuned(best: int = 3, similarity: str = "iou", **changed: Any) -> mcaptrack.TuneResult:
-    given = {"stage": "track", "metric": "IDF1", "settings": {"max_age_s": 2.5}, "scores": SCORES, "trials": 7}
-    return mcaptrack.TuneResult(
-        **given | changed,
-        default_scores=SCORES | {"IDF1": 0.5},
-        best=best,
-        similarity=similarity,
-        notes=(),
-        warnings=(),
-    )
-
-
-def of_tuning(to: Transcript) -> None:
-    to.run("tune x.mcap", tune=tuned())
-    to.run("tune x.mcap -o b.toml --metric mota --stage sample", tune=tuned(metric="MOTA", stage="sample"))
-    to.lines += Path("mcaptrack.toml").read_text().splitlines() + Path("b.toml").read_text().splitlines()
-    to.run("tune x.mcap -o c.toml --json", tune=tuned(best=0))
-    for words, similarity in (
-        ("--gate-m 1 --min-iou 0.4", "iou"),
-        ("--gate-m 1 --min-iou 0.4", "metres"),
-        ("--tracker sort --stage sample", "iou"),
-        ("--fps 5 --camera c", "iou"),
-        ("--truth t.txt --fps 5 --camera c --topic /t", "iou"),
-        ("--truth t.txt --ground-plane p.txt", "iou"),
-    ):
-        to.run(f"tune x.mcap -o c.toml -q {words}", shows_answer=False, tune=tuned(best=0, similarity=similarity))
 
 
 def of_answers(to: Transcript) -> None:
@@ -363,14 +292,12 @@ def of_many_logs(to: Transcript) -> None:
 
 
 def of_mistakes(to: Transcript) -> None:
-    for command in ("detect", "track", "sample", "predict", "retrack", "run", "events", "render", "recover", "ingest"):
+    for command in ("detect", "track", "sample", "predict", "retrack", "run", "events", "recover", "ingest"):
         to.run(f"{command} x.mcap y.mcap -o z.mcap")
     for gates in ("0", "1,-1", "inf", "nan", "1,", "''"):
         to.run(f"evaluate x.mcap --gate-m {gates}")
     for limit in ("idf1", "idf1=", "luck=1"):
         to.run(f"evaluate x.mcap --fail-under {limit}")
-    for search in ("min-iou=0.1", "min-iou=1:2:3", "min-iou=", "min-iou=a:b"):
-        to.run(f"tune x.mcap --search {search}")
     for words in ("alpha", "alhpa=1", "alpha=x", "min_hits=1.5", "trim_ends=maybe", "alpha=1 --set alpha=2",
                   "link_s=1 --link-s 2", "alpha=2 --profile paper"):  # fmt: skip
         to.run(f"retrack a.mcap --set {words}")
@@ -387,22 +314,29 @@ def of_mistakes(to: Transcript) -> None:
 
 
 PARTS: Sequence[tuple[str, Callable[[Transcript], None]]] = (
-    ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Zones", of_zones), ("Contents", of_contents),
-    ("Check and recover", of_upkeep), ("Calibrate", of_calibration), ("Tune", of_tuning), ("Query", of_answers),
+    ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Contents", of_contents),
+    ("Check and recover", of_upkeep), ("Query", of_answers),
     ("Many logs", of_many_logs), ("Mistakes", of_mistakes),
 )  # fmt: skip
 
 
-def test_commands_print_what_the_snapshot_has(tmp_path, monkeypatch):
+#: By the file with what they print: the parts of the core, and those of extensions.
+SNAPSHOTS = {Path(__file__).with_name("printed.txt"): PARTS} | {
+    EXTENSIONS / name / "printed.txt": [(name, part)] for name, part in of_extensions("PRINTED").items()
+}
+
+
+@pytest.mark.parametrize("snapshot", SNAPSHOTS, ids=lambda path: path.parent.name)
+def test_commands_print_what_the_snapshot_has(snapshot, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("x.mcap", "y.mcap", "z.mcap", "bad.sql"):
         Path(name).write_bytes(b"\xff")
     Path("q.sql").write_text("select 2")
     to = Transcript()
-    for title, part in PARTS:
+    for title, part in SNAPSHOTS[snapshot]:
         to.head(title)
         part(to)
     found = [*to.lines[1:], ""]
     if os.environ.get("PRINTED") == "write":
-        SNAPSHOT.write_text("\n".join(found), encoding="utf-8")
-    assert found == SNAPSHOT.read_text(encoding="utf-8").split("\n")
+        snapshot.write_text("\n".join(found), encoding="utf-8")
+    assert found == snapshot.read_text(encoding="utf-8").split("\n")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import html
-import json
 import re
 import shutil
 import subprocess
@@ -23,9 +21,9 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import serving
-from tests import places
 from tests.bags import bag1
-from tests.commands import GROUP, call, done, zones_file
+from tests.commands import GROUP, call, done
+from tests.extension_cases import of_extensions
 from tests.interrupted import interrupt
 from tests.models import stocked
 from tests.robots import write_log
@@ -76,17 +74,6 @@ class Scene:
         Path("cubes.csv").write_text("t,id,x_m,y_m\n0,1,2,3\n1,1,2,3\n")
         return self
 
-    def reviewed(self) -> str:
-        """Answer the first question."""
-        (name, *_) = mcaptrack.review(self.path, questions=1).questions
-        Path("answers.json").write_text(json.dumps({name: "yes"}))
-        return self.says("review", "LOG", "--answers", "answers.json")
-
-    def page(self) -> str:
-        """Return the text of a report."""
-        done("report", f"./{NAME}", "-o", "page.html")
-        return html.unescape(re.sub(r"<[^>]*>", "", re.sub(r"</?code>", "`", Path("page.html").read_text())))
-
     def damaged(self) -> str:
         """Change a byte of each chunk except the last."""
         data = bytearray(self.path.read_bytes())
@@ -120,12 +107,6 @@ class Scene:
         rows = [f"{n},-1,{n * 2},{20 + k % 2},20,60,1,-1,-1,-1" for n in range(1, 60) for k in (0, 1)]
         Path("boxes.txt").write_text("\n".join(rows))
         return self.ingested("boxes.txt", "--as", "detections", "--fps", "10").says("run", "LOG", "--no-tables")
-
-    def with_a_plane_off(self) -> str:
-        """Replace the log by one of three cameras, one of them with a ground plane that is 3 m off."""
-        self.path.unlink()
-        places.write_log(self.path.resolve(), places.CAMERAS[:3], moved_m={"east": 3.0})
-        return self.says("fuse", "LOG")
 
     def of_a_later_version(self) -> str:
         Path("mcaptrack.toml").write_text("[track]\nmax-age-s = 7.0\n")
@@ -165,13 +146,6 @@ class Scene:
         path.write_bytes(b"damaged")
         return self.says("detect", "LOG", "--detector", "yolox-nano")
 
-    def to_train_on(self) -> str:
-        from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
-
-        with pytest.raises(McaptrackError) as refused:
-            read_scenes([self.path], SourceOptions(), 0.4)
-        return with_flags(str(refused.value))
-
     def followed(self) -> str:
         """A log without tracks, and one that follows it."""
         shutil.copy(self.path, "next.mcap")
@@ -196,19 +170,12 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says(
         "evaluate", "LOG", "--set", "smoothed=true"
     ),
-    "cli/running.py:_next:run": lambda s: s.says("fuse", "LOG"),
     "pipeline/following.py:_check_camera:run": Scene.followed,
-    "pipeline/fusing.py:warn_disagreeing:calibrate": Scene.with_a_plane_off,
-    "pipeline/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:products:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
-    "extensions/training/command.py:show:predict": lambda s: s.says(
-        "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
-    ),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
-    "extensions/report/figures.py:identity_events:view": Scene.page,
     "api/viewing.py:_note_trouble:ingest": lambda s: s.says("view", "LOG", "--links"),
     "api/viewing.py:view:run": lambda s: s.ingested("clip.mp4", "--truth", "truth.txt").says("view", "LOG", "--links"),
     "pipeline/views.py:with_views:run": Scene.without_temporary_folder,
@@ -233,31 +200,12 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG"
     ),
     "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
-    "pipeline/zones.py:make_zones:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
-        "zones", "LOG", "--zones", str(zones_file(Path()))
-    ),
-    "cli/running.py:_lines_of_run:zones": lambda s: s.says(
-        "run", "LOG", "--no-tables", "--zones", str(zones_file(Path()))
-    ),
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
-    "pipeline/drawing.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
-    "extensions/render/blur/recording.py:blurrable:run": lambda s: s.ingested("clip.mp4").says(
-        "render", "LOG", "--blur", "people", "-o", "c.mcap"
-    ),
-    "extensions/render/comparing.py:find_panels:run": lambda s: s.untracked().says("render", "LOG", "--compare"),
-    "extensions/render/heat_map.py:_channel:run": lambda s: s.ingested("clip.mp4").says("render", "LOG", "--heatmap"),
-    "viewing/zones_page.py:zones_page:run": lambda s: s.ingested("truth.txt", "--as", "detections", "--fps", "10").says(
-        "zones", "draw", "LOG"
-    ),
-    "extensions/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
-    "extensions/report/page.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
-    "extensions/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
-    "extensions/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(
         "evaluate", "tracks.csv", "--truth", "truth.txt"
     ),
@@ -266,13 +214,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "sources/ingest/job.py:read:ingest": lambda s: (
         s.without("/camera/truth*").cubes().says("ingest", "clip.mp4", "--truth", "cubes.csv")
     ),
-    "extensions/review/questions.py:solve:run": lambda s: s.untracked().says("review", "LOG"),
-    "extensions/review/command.py:show:review": Scene.reviewed,
-    "extensions/training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
-}
-
-
-SCENES = {where: scene for where, scene in SCENES.items() if (PACKAGE / where.partition(":")[0]).exists()}
+} | of_extensions("PROPOSALS")
 
 
 def functions(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:
@@ -339,8 +281,6 @@ def words_of(line: str) -> list[str]:
 
 @pytest.mark.parametrize("where", one_in(6, SCENES))
 def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, request):
-    if where.startswith("cli/train"):
-        pytest.importorskip("torch", reason="training needs torch")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     verb = where.rpartition(":")[2]

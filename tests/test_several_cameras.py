@@ -1,4 +1,4 @@
-"""All cameras of a log in one run: each as if it were alone, then the scene that they see together."""
+"""All cameras of a log in one run: each as if it were alone; and a scene that nothing installed can make again."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ import pytest
 
 import mcaptrack
 from mcaptrack import McaptrackError, RunResult, log, pipeline
+from mcaptrack.api.finishing import Finishers
 from mcaptrack.notices import collected
+from mcaptrack.pipeline import scenes
+from mcaptrack.pipeline.write import Made, RunState, write
+from mcaptrack.schema import DETECTIONS, Frame
+from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
-from tests.places import CAMERAS, HEIGHT, PEOPLE, WIDTH, said, write_log
+from tests.places import CAMERAS, HEIGHT, WIDTH, said, write_log
 
 
 @pytest.fixture(scope="module")
@@ -42,15 +47,10 @@ def topics(path: Path) -> set[str]:
 
 
 class TestAllCameras:
-    def test_each_camera_and_the_scene_are_tracked(self, ran: tuple[Path, RunResult]) -> None:
+    def test_each_camera_is_tracked(self, ran: tuple[Path, RunResult]) -> None:
         path, result = ran
-        assert list(result.cameras) == ["east", "north", "south", "world"]
-        assert [one.is_scene for one in result.cameras.values()] == [False, False, False, True]
+        assert [name for name, camera in result.cameras.items() if not camera.is_scene] == ["east", "north", "south"]
         assert {f"/{name}/retracks" for name in result.cameras} <= topics(path)
-        assert result.summary == result.cameras["world"].summary
-        assert result.summary is not None
-        assert result.summary.tracks == PEOPLE
-        assert result.not_fused == ""
 
     def test_info_shows_the_channels_of_each_camera_together(
         self, ran: tuple[Path, RunResult], boxes: Path, tmp_path: Path
@@ -59,7 +59,7 @@ class TestAllCameras:
         owners = {channel.topic: channel.camera for channel in mcaptrack.info(path).channels}
         assert all(topic.startswith(f"/{name}/") for topic, name in owners.items())
         lines = [line.strip() for line in call("info", path, environment={"COLUMNS": "200"}).out.splitlines()]
-        first = [lines.index(f"/{name}") for name in ("east", "labelled", "north", "south", "world")]
+        first = [lines.index(f"/{name}") for name in sorted({"labelled", *ran[1].cameras})]
         ends = [*first[1:], lines.index("lineage")]
         assert first == sorted(first)
         for begin, end in zip(first, ends, strict=True):
@@ -97,21 +97,9 @@ class TestAllCameras:
         lines = {line.split()[0]: line for line in told.splitlines() if line.startswith("  ")}
         assert "tracks" in lines["south"]
         assert "left out: it has neither pictures nor boxes" in lines["labelled"]
-        assert lines["fused"].split(maxsplit=1)[1] == "world, the scene"
 
 
 class TestChoice:
-    def test_named_cameras_are_run_and_fused_alone_and_others_join_later(self, path: Path) -> None:
-        with collected():
-            result = mcaptrack.run(path, camera=["east", "south"], tables=False, predictor="cv")
-            assert list(result.cameras) == ["east", "south", "world"]
-            assert "/north/tracks" not in topics(path)
-            later = mcaptrack.run(path, tables=False)
-        assert "/world/detections was made without north: fusing east, north, south again, as before" in later.notes
-        (channel,) = (one for one in mcaptrack.info(path).channels if one.topic == "/world/detections")
-        assert channel.parameters is not None
-        assert channel.parameters["cameras"] == ["east", "north", "south"]
-
     @pytest.mark.parametrize(
         ("camera", "words"),
         [
@@ -130,13 +118,6 @@ class TestChoice:
         told = call("run", path, "--camera", "east,north", "--topic", "/east/detections")
         words = "--topic /east/detections is of one camera, and --camera names 2; leave one out"
         assert (told.code, told.err) == (1, f"mcaptrack: {words}\n")
-
-    def test_a_tracker_of_boxes_is_for_the_cameras(self, path: Path) -> None:
-        with collected():
-            result = mcaptrack.run(path, camera="east,south", tracker="ocsort", predictor="cv", tables=False)
-        assert "world is not tracked by ocsort, which is for other boxes" in result.notes
-        made = {channel.topic: channel.parameters for channel in mcaptrack.info(path).channels}
-        assert [(made[f"/{name}/tracks"] or {})["tracker"] for name in ("east", "world")] == ["ocsort", "ground"]
 
 
 def fake_runs(monkeypatch: pytest.MonkeyPatch, bad: str, error: BaseException) -> list[str]:
@@ -171,11 +152,36 @@ class TestFailures:
             mcaptrack.run(path, output=path.with_name("new.mcap"), tables=False)
         assert {one.name for one in path.parent.iterdir()} == there
 
-    def test_cameras_of_different_places_are_not_fused(self, tmp_path: Path) -> None:
-        path = write_log(tmp_path / "rooms.mcap", CAMERAS[:2], moved_m={"east": 2.0})
+
+class TestWithoutScenes:
+    """Nothing that makes scenes is installed."""
+
+    @pytest.fixture(autouse=True)
+    def alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(scenes, "names", lambda _: ())
+        monkeypatch.setattr("mcaptrack.api.run._FINISHERS", Finishers())
+
+    def test_each_camera_is_run_and_a_line_says_why_there_is_no_scene(self, path: Path) -> None:
+        with collected():
+            result = mcaptrack.run(path, tables=False, predictor="cv", camera="east,south")
+        assert list(result.cameras) == ["east", "south"]
+        assert result.not_fused.startswith("fuse is an extension that isn't installed; install mcaptrack again, with ")
+        assert f"no scene is made of the cameras: {result.not_fused}" in result.notes
+
+    def test_a_scene_is_tracked_and_is_said_to_be_out_of_date(self, path: Path) -> None:
+        rows = DETECTIONS.rows(x_m=[1.0, 5.0], y_m=[2.0, 2.0], score=[0.9, 0.9], class_id=[1, 1])
+        frames = [Frame(10**9 + number * 5 * 10**8, number, rows) for number in range(12)]
+        of_earlier = {"/east/detections": "0" * 64}
+        how = Provenance("fuse", {"cameras": ["east", "south"], "clock_offset_s": [0.0, 0.0]}, references=of_earlier)
+        with log.read(path) as opened:
+            write(RunState(opened, "/world", {"/world/detections": Made.of(DETECTIONS, frames, how)}), None, None)
+        with log.read(path) as opened:
+            before = [message.payload for message in opened.messages("/world/detections")]
         with collected():
             result = mcaptrack.run(path, tables=False, predictor="cv")
-        assert list(result.cameras) == ["north", "east"][::-1]
-        assert "people that two cameras should see, two see" in result.not_fused
-        assert not [topic for topic in topics(path) if topic.startswith("/world")]
-        assert "ground planes may be of different places" in said(mcaptrack.fuse(path), "cameras-disagree")[0]
+        assert list(result.cameras) == ["east", "north", "south", "world"]
+        assert result.cameras["world"].summary.tracks == 2
+        (line,) = said(result, "out-of-date")
+        assert line.startswith("/world/detections is out of date, and stays as it is: fuse is an extension that isn't")
+        with log.read(path) as opened:
+            assert [message.payload for message in opened.messages("/world/detections")] == before

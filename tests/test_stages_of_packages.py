@@ -17,30 +17,36 @@ from tests.commands import call, done
 from tests.logs import provenance_of
 from tests.test_extensions import add, one_line, site  # noqa: F401  # a fixture
 
-#: A stage that counts the zone visits and the tracks of the first frame.
+#: A stage that counts the marks and the tracks of the first frame.
 COUNTS = """
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 from mcaptrack import schema_of
-from mcaptrack.schema import TRACKS, ZONE_VISITS
+from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.transforms.protocol import context
 COUNT = schema_of("Count", [("visits", "i4")])
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    zones: Any = context(tuple, is_recorded=False)
+    marks: Any = context(tuple, is_recorded=False)
     reads: ClassVar = TRACKS
     writes: ClassVar = {"": COUNT}
     latency_s: ClassVar = {"": float("inf")}
     input_topic: ClassVar = "tracks"
     output_topic: ClassVar = "tracks/visits"
-    also_reads: ClassVar = {"zones": ("tracks/zones/visits", ZONE_VISITS)}
+    also_reads: ClassVar = {"marks": ("marks", DETECTIONS)}
     def __call__(self, frames):
-        visits = sum(len(frame.rows) for frame in self.zones)
+        visits = sum(len(frame.rows) for frame in self.marks)
         for frame in frames:
             yield (frame._replace(rows=COUNT.rows(visits=[visits])),)
 """
-ZONE = {"type": "Polygon", "coordinates": [[[-99, -99], [99, -99], [99, 99], [-99, 99], [-99, -99]]], "units": "m"}
+
+
+def mark(path: Path, count: int) -> None:
+    """Write so many marks into a log."""
+    boxes = mcaptrack.detections([[10, 20, 30, 40]] * count, [0.9] * count, [1] * count, 10**9, box_format="xyxy")
+    with mcaptrack.open(path) as recording:
+        recording.write("/camera/marks", [boxes], replace=True)
 
 
 @pytest.fixture
@@ -100,14 +106,12 @@ def test_a_stage_reads_channels_beside_its_input_and_is_outdated_by_them(site, p
     done("visits", path)
     with mcaptrack.open(path) as recording:
         assert set(recording.array("/camera/tracks/visits")["visits"].tolist()) == {0}
-    mcaptrack.zones(path, zones=ZONE)
+    mark(path, 3)
     done("visits", path)
     with mcaptrack.open(path) as recording:
-        visits = len(recording.array("zone_visits", "/camera/tracks/zones/visits"))
-        assert visits > 0
-        assert set(recording.array("/camera/tracks/visits")["visits"].tolist()) == {visits}
-    assert [*provenance_of(path, "/camera/tracks/visits").references] == ["/camera/tracks/zones/visits"]
-    mcaptrack.zones(path, zones=ZONE | {"coordinates": [[[-99, -99], [-90, -99], [-90, -90], [-99, -99]]]})
+        assert set(recording.array("/camera/tracks/visits")["visits"].tolist()) == {3}
+    assert [*provenance_of(path, "/camera/tracks/visits").references] == ["/camera/marks"]
+    mark(path, 2)
     assert json.loads(done("info", path, "--json").out)
     assert "visits" in mcaptrack.run(path, tables=False).stages
 
@@ -117,7 +121,7 @@ def test_a_stage_reads_channels_beside_its_input_and_is_outdated_by_them(site, p
 )
 def test_a_stage_reads_any_rows(site, path, schema, topic):  # noqa: F811
     code = COUNTS.replace("reads: ClassVar = TRACKS", f"reads: ClassVar = {schema}").replace('"tracks"', f'"{topic}"')
-    add(site, "stage", "visits", code.replace("import TRACKS", f"import {schema}"))
+    add(site, "stage", "visits", code.replace("import DETECTIONS, TRACKS", f"import DETECTIONS, {schema}"))
     done("visits", path)
     with mcaptrack.open(path) as recording:
         assert len(recording.array("/camera/tracks/visits"))
@@ -132,8 +136,8 @@ def test_a_stage_reads_any_rows(site, path, schema, topic):  # noqa: F811
         (('{"": COUNT}', '{"": COUNT, "view": COUNT}'), "has an output 'view', which is a name of what is made"),
         (('input_topic: ClassVar = "tracks"', "input_topic: ClassVar = 3"), "has input_topic = 3; it is a topic below"),
         (('"tracks/visits"', '"/camera/visits"'), "has output_topic = '/camera/visits'; it is a topic below"),
-        (("    zones: ", "    zone: "), "has also_reads = zones without a field of that name"),
-        (("    zones: ", "    force: bool = False\n    zones: "), "can't have a parameter force"),
+        (("    marks: ", "    mark: "), "has also_reads = marks without a field of that name"),
+        (("    marks: ", "    force: bool = False\n    marks: "), "can't have a parameter force"),
         (('    output_topic: ClassVar = "tracks/visits"\n', ""), "has output_topic = None; it is a topic below"),
         (("    also_reads", "    before = ('shake',)\n    also_reads"), "has before = shake; there are memory, planes"),
         (("def __call__", "def call"), "can't be called with frames"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import find_topic
-from tests.commands import LACKS
+from tests.extension_cases import of_extensions
 
 
 def _results(path: Path) -> dict[str, tuple[int, ...]]:
@@ -58,29 +57,11 @@ FUNCTIONS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     "stage": ("detections", _of_copy(lambda p, t, o: mcaptrack.stage("track", p, topic=t, output=o))),
     "run": ("detections", _of_copy(lambda p, t, o: mcaptrack.run(p, topic=t, output=o, force=True))),
     "events": ("tracks", _of_copy(lambda p, t, o: mcaptrack.events(p, topic=t, output=o))),
-    "zones": (
-        "tracks",
-        _of_copy(lambda p, t, o: mcaptrack.zones(p, zones=_zone(o.parent), topic=t, output=o)),
-    ),
     "drop": ("decisions", _of_copy(lambda p, t, o: mcaptrack.drop(p, t, output=o))),
     "cut": ("tracks", lambda p, t, o: mcaptrack.cut(p, o / "copy.mcap", topic=t).messages),
     "export": ("tracks", lambda p, t, f: dict(mcaptrack.export(p, f / "a.txt", form="mot", topic=t).rows)),
-    "render": ("tracks", lambda p, t, f: mcaptrack.render(p, f / "a.mp4", topic=t, end_s=0.3).views),
     "evaluate": ("tracks", lambda p, t, _: repr(mcaptrack.evaluate(p, topic=t).rows)),
-    "tune": (
-        "detections",
-        lambda p, t, f: mcaptrack.tune(p, stage="track", topic=t, trials=1, study=f / "a.jsonl").scores,
-    ),
-    "train": ("tracks", lambda p, t, _: _scenes(p, t)),
-}
-
-
-def _scenes(path: Path, topic: str) -> list[bytes]:
-    from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
-
-    return [scene.xy_m.tobytes() for scene in read_scenes([path], SourceOptions(topic=topic), 0.4)]
-
-
+} | of_extensions("TOPICS")
 METHODS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     "table": ("tracks", _reads(lambda r, t: r.table("tracks", t).num_rows)),
     "array": ("tracks", _reads(lambda r, t: len(r.array("tracks", t)))),
@@ -93,14 +74,6 @@ METHODS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
 MAKES = {"write"}
 
 
-def _zone(folder: Path) -> Path:
-    ring = [[-50, -50], [50, -50], [50, 50], [-50, 50], [-50, -50]]
-    square = {"type": "Feature", "properties": {"name": "a"}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-    path = folder / "zones.json"
-    path.write_text(json.dumps({"type": "FeatureCollection", "units": "metres", "features": [square]}))
-    return path
-
-
 def _taking(where: object) -> set[str]:
     public = {name: thing for name, thing in inspect.getmembers(where) if not name.startswith("_")}
     functions = {name: thing for name, thing in public.items() if inspect.isfunction(thing)}
@@ -108,7 +81,7 @@ def _taking(where: object) -> set[str]:
 
 
 def test_all_that_takes_a_topic_is_tried():
-    assert _taking(mcaptrack) == set(FUNCTIONS) - LACKS
+    assert _taking(mcaptrack) == set(FUNCTIONS)
     assert _taking(mcaptrack.Recording) == set(METHODS) | MAKES
 
 

@@ -16,7 +16,6 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.testing import LAWS, sample_frames
 from mcaptrack.transforms import (
-    FUSION,
     PROFILES,
     STAGES,
     TRACKERS,
@@ -138,7 +137,7 @@ def test_each_output_has_a_latency_and_what_is_online_has_none():
         assert profile.latency_s == {name: wanted[name] for name in profile.writes}
 
 
-@pytest.mark.parametrize("stage", [*STAGES.values(), FUSION], ids=lambda stage: stage.name)
+@pytest.mark.parametrize("stage", STAGES.values(), ids=lambda stage: stage.name)
 def test_the_transforms_of_a_stage_read_and_write_what_it_declares(stage):
     for kind in stage.built_in().values():
         assert kind.reads is stage.reads

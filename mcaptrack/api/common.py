@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
@@ -18,8 +18,6 @@ from mcaptrack.notices import Notice
 
 #: Where routine notes go ("/camera/tracks is missing: running track"): INFO, and DEBUG for details.
 _LOGGER: Final = logging.getLogger("mcaptrack")
-#: The largest offset of a clock, a day: more is no offset, but another recording.
-_MOST_OFFSET_S: Final = 86_400.0
 
 
 def as_path(path: PathLike) -> Path:
@@ -97,18 +95,6 @@ def split_names(parameter: str, value: str | Sequence[str] | None) -> tuple[str,
     if not names or not all(name.strip("/") for name in names):
         raise McaptrackError(f"`{parameter}=` has an empty name, in {value!r:.40}")
     return names
-
-
-def clock_offsets(seconds_by_camera: Mapping[str, float] | None) -> dict[str, float]:
-    """Return the offsets of clocks in seconds, by the bare names of cameras.
-
-    Raises McaptrackError for more than a day, and for NaN.
-    """
-    offsets = {name.strip("/"): float(value) for name, value in (seconds_by_camera or {}).items()}
-    for name, value in offsets.items():
-        if not abs(value) <= _MOST_OFFSET_S:
-            raise McaptrackError(f"`clock_offset_s=` has {value:g} s for {name}; a clock is late by a day at most")
-    return offsets
 
 
 def log_output(path: PathLike, source: Location | None = None) -> Path:

@@ -17,7 +17,7 @@ import os
 import re
 import textwrap
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cache, wraps
 from numbers import Integral, Real
@@ -37,9 +37,11 @@ from typing import (
 )
 
 from mcaptrack.errors import McaptrackError, offer
+from mcaptrack.installed import missing_extension
 
 P = ParamSpec("P")
 T = TypeVar("T")
+_More = Callable[[Collection[str]], Mapping[str, inspect.Parameter]]
 
 
 @dataclass(frozen=True)
@@ -292,8 +294,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         for name in () if has_more else kwargs:
             if name not in signature.parameters:
-                every = offer(name, signature.parameters, "there are")
-                raise TypeError(f"{function.__name__}() has no parameter {name}; {every}")
+                raise TypeError(f"{function.__name__}() has no parameter {name}; {_others(name, signature.parameters)}")
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if value is signature.parameters[name].default:
                 continue
@@ -317,16 +318,19 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def declared(
-    *, most_used: tuple[str, ...] = (), heading: str = "", printed_by: str = ""
+    *, most_used: tuple[str, ...] = (), heading: str = "", printed_by: str = "", more: _More | None = None
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help.
 
     What the annotations say of parameters that the docstring leaves out is added to it. ``heading`` is that of the
     command in ``mcaptrack --help``, which reads it from the source, and ``printed_by`` the class that prints the
-    result, as MODULE:CLASS (of the kind ``mcaptrack.cli.declared.Once``, or ``mcaptrack.cli.many.EachLog``).
+    result, as MODULE:CLASS (of the kind ``mcaptrack.cli.declared.Once``, or ``mcaptrack.cli.many.EachLog``). ``more``
+    returns the parameters that take the place of the function's ``**more``; it gets the names of the others.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        if more is not None:
+            _take_more(function, more)
         if function.__doc__:  # there is none with python -OO
             function.__doc__ = _completed(function)
         call = checked(function)
@@ -334,6 +338,16 @@ def declared(
         return call
 
     return decorate
+
+
+def _take_more(function: Callable[..., Any], more: _More) -> None:
+    """Put parameters in the place of the ``**more`` of a function."""
+    signature = inspect.signature(function)
+    own = dict(signature.parameters)
+    del own["more"], function.__annotations__["more"]
+    added = more(own)
+    function.__annotations__ |= {name: parameter.annotation for name, parameter in added.items()}
+    vars(function)["__signature__"] = signature.replace(parameters=[*own.values(), *added.values()])
 
 
 def _completed(function: Callable[..., Any]) -> str:
@@ -411,6 +425,11 @@ def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     """The ranges that the annotations of a function declare."""
     options = {name: option_of(hint) for name, hint in hints_of(function).items()}
     return {name: (option.least, option.most) for name, option in options.items() if option.is_bounded}
+
+
+def _others(name: str, every: Iterable[str]) -> str:
+    """The advice about a parameter that doesn't exist."""
+    return missing_extension(name) or offer(name, every, "there are")
 
 
 def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, PythonOnly
@@ -83,15 +83,6 @@ GroundPlane = Annotated[
 PointOfBox = Annotated[Point, Option(LABELS, tuning=True, help="Which point of a box touches the ground.")]
 #: What files in the working folder may give for a detector, tracker or so on: built-in or installed ones.
 PLUGIN: Final = r"[A-Za-z0-9_-]+"
-Cameras = Annotated[str | Sequence[str] | None, Option(metavar="A,B", commas=True, shown="all with a ground plane")]
-ClockOffsets = Annotated[
-    Mapping[str, float] | None,
-    Option(
-        metavar="CAMERA=SECONDS",
-        shown="estimated from people who walk",
-        help="How many seconds the times of a camera are late, as in front=0.3; 0 for none.",
-    ),
-]
 #: The value of a transform's option.
 Value = float | int | bool | str | None
 
@@ -129,10 +120,10 @@ def min_iou(shown: str | None = None) -> Option:
 
 def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | None = None) -> Option:
     """The option that chooses a detector, tracker or so on of the registry by name; ``shown`` is its default."""
-    from mcaptrack.registry import BUILT_IN, names
+    from mcaptrack.registry import names, own_names
 
     text = (
-        f"{intro.format(kind=kind)}: {', '.join(BUILT_IN[kind])}, one of an installed package, or module:Class.\n\n"
+        f"{intro.format(kind=kind)}: {', '.join(own_names(kind))}, one of an installed package, or module:Class.\n\n"
         "Or a transform."
     )
     return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Sequence
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Unpack
 
 import mcaptrack
 from mcaptrack.api.common import as_location, split_names
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
+from mcaptrack.api.finishing import Finishers
 from mcaptrack.api.options import (
     FILES,
     ClassNames,
@@ -26,11 +27,10 @@ from mcaptrack.api.options import (
     no_progress,
 )
 from mcaptrack.api.stages import Stages
-from mcaptrack.api.zones import ZonesLike, zones_of
 from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
-from mcaptrack.transforms import FUSION, STAGES, Transform
+from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
 
 if TYPE_CHECKING:
@@ -41,14 +41,18 @@ if TYPE_CHECKING:
 #: Headings in the help.
 _AFTER: Final = "After the stages"
 _CLASSES: Final = "Classes of objects"
-_SEVERAL: Final = "Several cameras"
 _AGAIN: Final = "The {kind}, also where another one was used before"
+_FINISHERS: Final = Finishers()
 
 
 @declared(
-    most_used=("output", "topic", "camera", "detector", "tracker", "retracker", "predictor", "zones", "force"),
+    most_used=(
+        *("output", "topic", "camera", "detector", "tracker", "retracker", "predictor"),
+        *(*_FINISHERS.most_used, "force"),
+    ),
     heading="Start here",
     printed_by="mcaptrack.cli.running:Run",
+    more=_FINISHERS.options,
 )
 def run(
     log: EachLog,
@@ -63,10 +67,7 @@ def run(
     sidecar: Sidecar = None,
     events: Annotated[bool | EventOptions, Option(_AFTER)] = True,
     tables: Annotated[bool, Option(_AFTER)] = True,
-    zones: Annotated[ZonesLike | None, Option(_AFTER, metavar="FILE", shown="those that were counted before")] = None,
-    fuse: Annotated[bool, Option(_SEVERAL, tuning=True)] = True,
     force: Force = False,
-    fuser: Annotated[str | Transform | None, chooser("fuser", _AGAIN, _SEVERAL, shown="as before, or feet")] = None,
     detector: Annotated[str | Transform | None, chooser("detector", _AGAIN, shown="as before, or median")] = None,
     tracker: Annotated[
         str | Transform | None, chooser("tracker", _AGAIN, shown="as before, or one that suits the detections")
@@ -84,6 +85,7 @@ def run(
     stages: Stages = None,
     follows: Annotated[PathLike | Sequence[PathLike] | None, PYTHON_ONLY] = None,
     progress: Reports = no_progress,
+    **more: Unpack[mcaptrack._RunOptions],
 ) -> mcaptrack.RunResult:
     """Detect, track, re-track and predict: do what a log still lacks.
 
@@ -94,10 +96,10 @@ def run(
 
     Channels that are up to date are kept; those that are out of date are made again with the options that they had.
     ``force`` makes all again; on the command line with the parameters that environment and config files set now,
-    otherwise with those they had. Zones of ``zones`` are counted in later runs, too.
+    otherwise with those they had.
 
-    All cameras of a log are run, one after the other. Those with a measured ground plane are fused to /world, as
-    `mcaptrack fuse` does, and this scene is run, too.
+    All cameras of a log are run, one after the other. Where the extension is installed, those with a measured ground
+    plane are fused to /world, as `mcaptrack fuse` does, and this scene is run, too.
 
     Parameters
     ----------
@@ -113,14 +115,6 @@ def run(
         Or how tracks are matched with the ground truth for them.
     tables : bool, default True
         Write Parquet tables beside the log.
-    zones : path or mapping, optional
-        Count visits of zones and crossings of lines, as `mcaptrack zones` does.
-
-        Of a file of GeoJSON, or of its content. By default those that the log was counted with before, if any.
-    fuse : bool, default True
-        Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.
-
-        Scenes that were made before are brought up to date.
     force : bool, default False
         Run everything again, and replace the output file if it exists.
     camera_motion : {"auto", "on", "off"}, optional
@@ -179,8 +173,8 @@ def run(
 
     """
     from mcaptrack.api.running import Fusing, Where, transform_of, transforms_of, work
-    from mcaptrack.evaluation.zones import ZoneOptions
-    from mcaptrack.pipeline import PlaneChoice, Watch, ZoneWatch, plan_all
+    from mcaptrack.pipeline import PlaneChoice, Watch, plan_all
+    from mcaptrack.pipeline.scenes import Scenes
     from mcaptrack.pipeline.several import unfitting
     from mcaptrack.sources.foreign.boxes import choosing
     from mcaptrack.sources.foreign.definitions import definitions_of
@@ -193,7 +187,7 @@ def run(
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
 
-    joins = None if fuser is None else transform_of(FUSION.name, fuser, {})
+    fuses = Fusing(names, Scenes(_FINISHERS.parts("scene", more)))
 
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
     settings = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
@@ -212,13 +206,9 @@ def run(
         return plan_all(opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed, renewed)
 
     options = events if isinstance(events, EventOptions) else EventOptions()
-    watch = Watch(options, force=force) if events else None
-    given_zones = zones_of(zones)
-    counted = ZoneWatch(given_zones, options=ZoneOptions() if given_zones else None, force=force)
+    finishing = [*([Watch(options, force=force)] if events else []), *_FINISHERS.steps(more, force)]
     where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
     earlier = _log_before(as_location(log), follows)
-    finishing = (watch, counted) if watch else (counted,)
-    fuses = Fusing(names, fuse, joins)
     with definitions_of(definitions), choosing(topic, map, class_map):
         return work(
             where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier

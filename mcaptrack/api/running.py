@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -20,23 +20,31 @@ from mcaptrack.api.products import Products, refuse_foreign_products, write_prod
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call, did_you_mean
 from mcaptrack.files import refuse_overwrite
+from mcaptrack.installed import missing_extension
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice
 from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say, refuse_failed, together
+from mcaptrack.registry import others
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.foreign.boxes import choosing
 from mcaptrack.sources.foreign.definitions import definitions_of
 from mcaptrack.sources.sidecar import SidecarChoice
-from mcaptrack.transforms import FUSION, STAGES, Transform
+from mcaptrack.transforms import STAGES, Stage, Transform
 
 if TYPE_CHECKING:
-    from mcaptrack.evaluation.zones import ZoneTotals
-    from mcaptrack.pipeline import Summary, Watch, ZoneWatch
+    from mcaptrack import _OfFinishers
+    from mcaptrack.contracts import Finished
+    from mcaptrack.pipeline import Summary
+    from mcaptrack.pipeline.runner import Finish
+    from mcaptrack.pipeline.scenes import Scenes
+    from mcaptrack.pipeline.write import Made
+else:
+    _OfFinishers = object
 
 
 @dataclass(frozen=True)
-class RunResult:
+class RunResult(_OfFinishers):
     """The result of running stages on a log.
 
     Attributes
@@ -49,8 +57,8 @@ class RunResult:
         Number of frames, rows and track ids by topic, of the channels that were made.
     events : dict of str to dict of str to int
         Number of events of each kind by the topic of the tracks.
-    zones : dict of str to list of ZoneTotals
-        Totals of zones and lines by the topic of the tracks, of all channels that were counted, now or before.
+    finished : dict of str to Finished
+        What finishers say of the log, by their names; ``RESULT.NAME`` is the value of one, {} without it.
     stale : tuple of str
         Topics that are out of date now, because what they were made from was replaced.
     layouts : tuple of pathlib.Path
@@ -94,7 +102,7 @@ class RunResult:
     rows: Mapping[str, int]
     tracks: Mapping[str, int]
     events: Mapping[str, Mapping[str, int]]
-    zones: Mapping[str, list[ZoneTotals]]
+    finished: Mapping[str, Finished]
     stale: tuple[str, ...]
     layouts: tuple[Path, ...]
     tables: Mapping[str, int]
@@ -117,6 +125,16 @@ class RunResult:
         counts = "" if summary is None or summary.tracks is None else f"; {summary.tracks} tracks"
         counts += f", {summary.repair.tracks} after re-tracking" if counts and summary and summary.repair else ""
         return f"RunResult({str(self.log)!r}: {did}{counts}; {self.seconds:.1f} s, {len(self.warnings)} warnings)"
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> object:
+            """Return what a finisher says; nothing if it was not asked."""
+            if name in others("finisher"):
+                report = self.finished.get(name)
+                return report.value if report else {}
+            text = missing_extension(name) or f"{type(self).__name__!r} object has no attribute {name!r}"
+            raise AttributeError(text)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -160,11 +178,10 @@ class Where:
 
 
 class Fusing(NamedTuple):
-    """The cameras to run, all without names; whether they are fused to a scene; and by which fuser, if it is named."""
+    """The cameras to run, all without names, and what makes scenes of them."""
 
-    names: tuple[str, ...] = ()
-    is_on: bool = True
-    fuser: Transform | None = None
+    names: tuple[str, ...]
+    joins: Scenes
 
 
 def work(
@@ -173,7 +190,7 @@ def work(
     progress: Progress,
     tables: bool | None = None,
     *,
-    finishing: Sequence[Watch | ZoneWatch] = (),
+    finishing: Sequence[Finish] = (),
     views: bool = False,
     plane: PlaneChoice = AS_BEFORE,
     fuses: Fusing | None = None,
@@ -186,16 +203,16 @@ def work(
     ``follows``.
     """
     continued: list[pipeline.Continued] = []
-    topics = next((step.topics for step in finishing if step.topics), ())
+    topics = next((topics for step in finishing if (topics := getattr(step, "topics", ()))), ())
 
     def run_at(prefix: str, progress: Progress) -> Act:
         """Run a camera; without a prefix the only one."""
 
         def act(opened: logs.Log, output: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
             at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
-            fused = {}
+            fused: Mapping[str, Made] = {}
             if fuses is not None:
-                fused = pipeline.fuse_again(opened, at, where.force, say, progress, not fuses.names, fuses.fuser)
+                fused = fuses.joins.join_again(opened, at, where.force, not fuses.names, say, progress)
             run = partial(pipeline.run, opened, at, output=output, progress=progress, plane=plane, boxes=boxes)
             run = partial(run, finishing=finishing, views=views, fused=fused)
             if follows is None:
@@ -213,25 +230,25 @@ def work(
 
         return act
 
-    def fuse_to(scene: str, names: Sequence[str], progress: Progress) -> Act:
-        def act(opened: logs.Log, output: Path | None, say: Say, _: BoxesRead) -> tuple[str, pipeline.Report]:
-            say(f"fusing {', '.join(names)} to /{scene}")
-            fuser = (fuses.fuser if fuses is not None else None) or FUSION.make()
-            return pipeline.fuse_cameras(opened, names, scene, fuser, {}, output, progress, is_asked=False)
-
-        return act
-
     each = None
     if fuses is not None and where.topic is None and (where.camera is None or len(fuses.names) > 1):
-        each = EveryCamera(fuses.names, fuses.is_on, run_at, fuse_to)
-    result = change(where, run_at("", progress), progress, tables, each)
+        each = EveryCamera(*fuses, run_at)
+    result = change(where, run_at("", progress), progress, tables, each, finishing)
     return replace(result, continued=pipeline.Continued.joined(continued)) if continued else result
 
 
 def change(
-    where: Where, act: Act, progress: Progress, tables: bool | None, each: EveryCamera | None = None
+    where: Where,
+    act: Act,
+    progress: Progress,
+    tables: bool | None,
+    each: EveryCamera | None = None,
+    finishing: Sequence[Finish] = (),
 ) -> RunResult:
-    """Change one log; ``tables`` as for ``work``. With ``each`` all its cameras are run, if it has several."""
+    """Change one log; ``tables`` and ``finishing`` as for ``work``.
+
+    With ``each`` all its cameras are run, if it has several.
+    """
     began, work = monotonic(), _Change(where, *where.places())
     with warnings_about(work.target) as warnings:
         done, several = work.act(act, progress, each, bool(tables))
@@ -240,7 +257,7 @@ def change(
         with report.watch.part("tables") if tables else nullcontext():
             products = work.products(report, bool(tables), progress)
         refuse_failed(work.target, done)
-        zones = _zones_counted(work.target, done) if "zones" in report.finished else {}
+        finished = _finished(work.target, done, finishing)
         summaries: dict[str, Summary] = {}
         if tables is not None:
             with report.watch.part("summary"):
@@ -253,7 +270,7 @@ def change(
         rows=report.rows,
         tracks=report.tracks,
         events=report.events,
-        zones=zones,
+        finished=finished,
         stale=tuple(report.stale),
         layouts=tuple(products.layouts),
         tables=products.rows,
@@ -318,17 +335,15 @@ def _say_stale(target: Location, report: pipeline.Report, is_open: bool) -> None
     with logs.read(target) as opened:
         if is_open:
             report.stale = [topic for topic in report.stale if pipeline.is_stale(opened, topic)]
-        for topic in report.stale:
-            warn_stale(topic, target, {topic: pipeline.camera_to_name(opened, topic)})
+        warn_stale(opened, report.stale)
 
 
-def _zones_counted(target: Location, done: Sequence[Done]) -> dict[str, list[ZoneTotals]]:
-    """Return the totals of zones in a log by the topic of the tracks."""
-    with logs.read(target) as opened:
-        counted = (
-            channel for camera in done for channel in pipeline.counted_zones(opened, camera.prefix, with_worlds=True)
-        )
-        return {channel.topic: channel.totals for channel in counted}
+def _finished(target: Location, done: Sequence[Done], finishing: Sequence[Any]) -> dict[str, Finished]:
+    """Return what finishers say of a log, by their names."""
+    reports = {step.name: step.report for step in finishing if hasattr(step, "report")}
+    with logs.read(target) if reports else nullcontext() as opened:
+        finished = {name: report(opened, [camera.prefix for camera in done]) for name, report in reports.items()}
+    return {name: report for name, report in finished.items() if report is not None}
 
 
 def _summaries(target: Location, done: Sequence[Done], boxes: BoxesRead) -> dict[str, Summary]:
@@ -341,20 +356,30 @@ def _summaries(target: Location, done: Sequence[Done], boxes: BoxesRead) -> dict
     return summaries
 
 
-def warn_stale(topic: str, log: Location, cameras: Mapping[str, str] = {}) -> None:
-    """Warn of a channel that is out of date now; ``cameras`` are those to name, by topic."""
-    again = call("run", log, camera=cameras[topic]) if cameras.get(topic) else call("run", log)
-    warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
+def warn_stale(opened: logs.Log, topics: Sequence[str]) -> None:
+    """Warn of channels that are out of date now: those that ``run`` brings up to date, and those that it can't."""
+    lost: dict[str, list[str]] = {}
+    for topic in topics:
+        if name := pipeline.missing_finisher(opened, topic):
+            lost.setdefault(name, []).append(topic)
+            continue
+        camera = pipeline.camera_to_name(opened, topic)
+        again = call("run", opened.path, camera=camera) if camera else call("run", opened.path)
+        warn(f"{topic} is out of date, because its input was replaced; {again} brings it up to date", "out-of-date")
+    for name, (first, *rest) in lost.items():
+        why = missing_extension(name, "finisher") or f"no installed package has the finisher {name}"
+        those = f"{first} and {len(rest)} more are" if rest else f"{first} is"
+        warn(f"{those} out of date, because the input was replaced: {why}", "out-of-date")
 
 
-def transform_of(stage: str, chosen: str | Transform | None, options: Mapping[str, Value]) -> Transform:
+def transform_of(stage: str | Stage, chosen: str | Transform | None, options: Mapping[str, Value]) -> Transform:
     """Return the transform of a stage: the one of this name, or this one; with these options.
 
     Raises McaptrackError for a name or an option that does not exist, and for what is no transform.
     """
     options = {name: value.item() if isinstance(value, np.generic) else value for name, value in options.items()}
     if chosen is None or isinstance(chosen, str):
-        step = FUSION if stage == FUSION.name else STAGES[stage]
+        step = STAGES[stage] if isinstance(stage, str) else stage
         if chosen and step.parameter:
             return step.make(**{step.parameter: chosen, **options})
         return step.make(chosen or "", **options)

@@ -81,9 +81,7 @@ def write_rows(
         channel = Made.of(schema, frames, how)
         state = RunState(opened, prefix, {name: channel})
         write(state, None, make_views(state, planes) if schema in WITH_VIEWS else None)
-        stale = pipeline.outdated_by(opened, {name: channel.provenance.digest})
-        for topic_of_stage in stale:
-            warn_stale(topic_of_stage, path, {topic_of_stage: pipeline.camera_to_name(opened, topic_of_stage)})
+        warn_stale(opened, pipeline.outdated_by(opened, {name: channel.provenance.digest}))
     write_products(path, is_new=True, progress=no_progress)
     return len(frames)
 

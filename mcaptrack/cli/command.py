@@ -17,6 +17,7 @@ from mcaptrack.cli.help import ALL, HELP, LAST_PANELS, write_page
 from mcaptrack.cli.settings import SWITCH, Given, Setting, declared_settings, found_of, gather, nearest
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.errors import similar
+from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 
 #: The exception of Typer for a command line that it can't parse.
@@ -65,6 +66,9 @@ def _unknown_option(error: Any) -> str:
     if context is None or context.parent is None:
         return f"{text}{nearest(name, error.possibilities or ())}"
     theirs = {command: _options_of(command_class) for command, command_class in context.parent.command.commands.items()}
+    word = name.strip("-").removeprefix("no-")
+    if word not in theirs and (missing := missing_extension(word)):
+        return f"{text}: {missing}"
     if having := [command for command, options in theirs.items() if name in options]:
         text += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
     own_options = theirs.get(context.info_name, [])

@@ -1,8 +1,7 @@
-"""Commands that run stages on logs, and what they print: ``run``, ``events``, ``fuse`` (``stages`` has the others)."""
+"""Commands that run stages on logs, and what they print: ``run``, ``events`` (``stages`` has the others)."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,6 @@ from mcaptrack.cli.command import settings_of
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import counted, stdout_to_stderr
-from mcaptrack.cli.zones import zones_in_short
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.location import Location
 
@@ -37,7 +35,7 @@ class RunsStages(EachLog["RunResult"]):
 
     def show(self, log: Location, done: RunResult, talk: common.Talk) -> None:
         """Print what was made, and commands to run next."""
-        _print(done, self.shows_events, talk)
+        _print(done, self.shows_events, self.next_commands(done), talk)
 
     def line(self, done: RunResult) -> str:
         """Return the result for one of many logs in one line."""
@@ -50,22 +48,17 @@ class RunsStages(EachLog["RunResult"]):
 
     def data(self, done: RunResult) -> dict[str, Any]:
         """Return the result of one log as values of JSON."""
-        return _as_json(done)
+        return _as_json(done) | {"next": self.next_commands(done)}
+
+    def next_commands(self, done: RunResult) -> list[str]:
+        """Return commands to run next."""
+        return _next(done)
 
 
 class Events(RunsStages):
     """Write events of tracks."""
 
     shows_events = True
-
-
-class Fuse(RunsStages):
-    """Fuse the detections of several cameras."""
-
-    def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
-        """Return the arguments of the function."""
-        arguments = super().arguments(names)
-        return arguments | {"clock_offset_s": offsets_of(arguments["clock_offset_s"])}
 
 
 class Run(RunsStages):
@@ -122,23 +115,6 @@ class Run(RunsStages):
         return logs
 
 
-def offsets_of(texts: Sequence[str] | None) -> dict[str, float]:
-    """Return the offsets of clocks by camera. Raises McaptrackError for others than CAMERA=SECONDS."""
-    out: dict[str, float] = {}
-    for text in texts or ():
-        name, equals, value = text.partition("=")
-        try:
-            seconds = float(value)
-        except ValueError:
-            seconds = math.nan
-        if not equals or not name or not math.isfinite(seconds):
-            raise McaptrackError(f"--clock-offset-s {text} is no CAMERA=SECONDS, as in front=0.3")
-        if name in out:
-            raise McaptrackError(f"--clock-offset-s is given twice for {name}")
-        out[name] = seconds
-    return out
-
-
 def _as_json(result: RunResult) -> dict[str, Any]:
     """Return the result of one log as values of JSON."""
     data: dict[str, Any] = {
@@ -146,11 +122,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
         "stages": list(result.stages),
         "frames": result.frames,
         "events": result.events,
-        **(
-            {"zones": {topic: [total.to_json() for total in some] for topic, some in result.zones.items()}}
-            if result.zones
-            else {}
-        ),
+        **{name: report.data for name, report in result.finished.items()},
         "written_to": str(result.written_to) if result.written_to else None,
         "written_there_because": with_flags(result.written_because) or None,
     }
@@ -168,7 +140,7 @@ def _as_json(result: RunResult) -> dict[str, Any]:
     data |= {"seconds": result.seconds, "seconds_by_part": dict(result.seconds_by_part)}
     if result.cameras or result.left_out:
         data |= {"left_out": dict(result.left_out), "not_fused": with_flags(result.not_fused) or None}
-    return data | {"next": _next(result)}
+    return data
 
 
 def _camera_as_json(camera: CameraResult) -> dict[str, Any]:
@@ -181,9 +153,6 @@ def _next(result: RunResult) -> list[str]:
     """Return commands to run next."""
     show = "view" if isinstance(result.log, Path) else "report"  # viewers open files
     if result.summary is None and not result.cameras:
-        if result.stages == ("fuse",):
-            scene = next(iter(result.frames)).split("/")[1]
-            return [command("run", result.log, "--camera", scene).strip("`")]
         steps = [show] if result.stages == ("events",) else ["run"]
     elif result.summary is None:
         steps = [show if show == "view" else "info"]  # a report is on one camera
@@ -194,7 +163,7 @@ def _next(result: RunResult) -> list[str]:
     return [command(step, result.log).strip("`") for step in steps]
 
 
-def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
+def _print(result: RunResult, shows_events: bool, commands: Sequence[str], talk: common.Talk) -> None:
     for topic, count in result.frames.items():
         talk.detail(f"{result.log}: {topic} {count} frames")
     for topic, kinds in result.events.items():
@@ -209,7 +178,7 @@ def _print(result: RunResult, shows_events: bool, talk: common.Talk) -> None:
         lines.append(("time", slow))
     if result.written_because and result.written_to:
         lines.append(("written", f"results are in {result.written_to}: {result.written_because}"))
-    lines.append(("next", "    ".join(_next(result))))
+    lines.append(("next", "    ".join(commands)))
     width = max(len(name) for name, _ in lines)
     for name, text in lines:
         talk.say(f"  {name:<{width}}  {text}")
@@ -261,8 +230,8 @@ def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:
         yield "fused", ", ".join(scenes) or f"no: {with_flags(result.not_fused)}"
     if result.summary is not None:
         yield from _lines_of_summary(result.summary)
-    if result.zones:
-        yield "zones", f"{zones_in_short(result)}; {command('zones', result.log)} prints them"
+    for name, report in result.finished.items():
+        yield name, report.text
     for line in result.continued.words() if result.continued else ():
         yield "goes on", line
     codes = [notice.code for notice in result.warnings]

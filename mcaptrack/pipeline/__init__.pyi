@@ -12,9 +12,6 @@ from mcaptrack.pipeline.events import Watch as Watch
 from mcaptrack.pipeline.following import Before as Before
 from mcaptrack.pipeline.following import Continued as Continued
 from mcaptrack.pipeline.following import begins_here as begins_here
-from mcaptrack.pipeline.fusing import fusable as fusable
-from mcaptrack.pipeline.fusing import fuse_again as fuse_again
-from mcaptrack.pipeline.fusing import fuse_cameras as fuse_cameras
 from mcaptrack.pipeline.plan import plan_all as plan_all
 from mcaptrack.pipeline.plan import plan_stage as plan_stage
 from mcaptrack.pipeline.planes import AS_BEFORE as AS_BEFORE
@@ -24,6 +21,7 @@ from mcaptrack.pipeline.runner import input_of as input_of
 from mcaptrack.pipeline.runner import outdated_by as outdated_by
 from mcaptrack.pipeline.runner import run as run
 from mcaptrack.pipeline.staleness import is_stale as is_stale
+from mcaptrack.pipeline.staleness import missing_finisher as missing_finisher
 from mcaptrack.pipeline.staleness import read_planes as read_planes
 from mcaptrack.pipeline.staleness import warn_clock_jumps as warn_clock_jumps
 from mcaptrack.pipeline.summary import Summary as Summary
@@ -32,8 +30,6 @@ from mcaptrack.pipeline.views import with_views as with_views
 from mcaptrack.pipeline.write import LAYOUTS as LAYOUTS
 from mcaptrack.pipeline.write import attachment_of as attachment_of
 from mcaptrack.pipeline.write import layout_path as layout_path
-from mcaptrack.pipeline.zones import ZoneWatch as ZoneWatch
-from mcaptrack.pipeline.zones import counted_zones as counted_zones
 from mcaptrack.sources.cameras import Camera as Camera
 from mcaptrack.sources.cameras import camera_at as camera_at
 from mcaptrack.sources.cameras import camera_to_name as camera_to_name

@@ -10,7 +10,15 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.pipeline.checks import cameras_named
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import Camera, camera_at, cameras, has_own_channels, provenance_of, scenes_of
+from mcaptrack.sources.cameras import (
+    Camera,
+    camera_at,
+    cameras,
+    detections_topic,
+    has_own_channels,
+    provenance_of,
+    scenes_of,
+)
 from mcaptrack.sources.pictures import size_of_pictures
 from mcaptrack.transforms import STAGES
 
@@ -113,7 +121,7 @@ def _unfit(opened: log.Log, camera: Camera) -> str:
 
 def begins_with(opened: log.Log, prefix: str) -> str:
     """Describe the input of the run of one of several cameras; "" for the usual one, pictures alone."""
-    camera, detections = camera_at(opened, prefix), f"{prefix}/{STAGES['detect'].output_topic}"
+    camera, detections = camera_at(opened, prefix), detections_topic(prefix)
     provenance = provenance_of(opened, detections)
     if detections in opened.channels and (provenance is None or provenance.transform not in STAGES):
         return f"{prefix[1:]} has detections in {detections} already: it is tracked from these, nothing is detected"

@@ -19,7 +19,7 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.transform_tree import TransformTree
 from mcaptrack.notices import warn
-from mcaptrack.pipeline.scene_views import SceneOnPictures
+from mcaptrack.pipeline.scenes import Member
 from mcaptrack.pipeline.write import View
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.framing import frame_times, has_any
@@ -111,7 +111,8 @@ def _best(opened: log.Log, prefix: str, suffix: str) -> list[str]:
     """Return the views with a suffix that layouts show by default."""
     topics = [topic for topic in opened.channels if topic.startswith(prefix + "/") and topic.endswith(suffix)]
     names = {topic.removeprefix(prefix + "/").removesuffix(suffix) for topic in topics}
-    return [f"{prefix}/{name}{suffix}" for name in layouts.best_channels(names)]
+    channels = {topic.removeprefix(prefix + "/") for topic in opened.channels}
+    return [f"{prefix}/{name}{suffix}" for name in layouts.best_channels(names, channels)]
 
 
 def _calibrated(opened: log.Log, prefix: str) -> list[str]:
@@ -205,8 +206,8 @@ class ViewFactory:
     """Draws the channels of a camera: in its pictures, and in the frame of their metres.
 
     ``frames`` are the coordinate frames that no transform of the log names, ``robot`` is that of the robot, or "".
-    ``cameras`` are calibrated ones by the topics of their pictures, for tracks with 3D boxes; ``scene`` has the cameras
-    that a scene was fused of.
+    ``cameras`` are calibrated ones by the topics of their pictures, for tracks with 3D boxes; ``members`` those of a
+    scene.
     """
 
     prefix: str
@@ -217,7 +218,7 @@ class ViewFactory:
     frames: Sequence[str]
     robot: str
     cameras: Mapping[str, MovingCamera]
-    scene: SceneOnPictures
+    members: Sequence[Member]
 
     def views(self, shown: Mapping[str, ChannelToDraw], start_ns: int) -> Iterator[View]:
         """Yield the views of these channels, and, once, that of the robot and the transforms that no other names."""
@@ -261,11 +262,11 @@ class ViewFactory:
             for pictures, camera in self.cameras.items() if is_solid else ():
                 messages = drawing.on_camera(camera, channel.bodies)
                 yield self._view(topic, channel, views.SUFFIX + pictures, foxglove.ANNOTATIONS, messages)
-            for member in self.scene.cameras:
-                rows, planes = self.scene.on_camera(member, schema, frames, is_true=not channel.made_by)
+            for clock, drawn in self.members:
+                rows, planes = drawn(schema, frames, not channel.made_by)
                 on_picture = views.Drawing(topic, schema, rows, planes, is_retracked, names)
-                messages = on_picture.on_pictures(member.clock.t_ns, member.clock.stamp_ns)
-                yield self._view(topic, channel, views.SUFFIX + member.pictures, foxglove.ANNOTATIONS, messages)
+                messages = on_picture.on_pictures(clock.t_ns, clock.stamp_ns)
+                yield self._view(topic, channel, f"{views.SUFFIX}{clock.topic}", foxglove.ANNOTATIONS, messages)
         if channel.is_on_ground():
             t_ns = self.picture_ns if on_pictures else frame_times(frames)
             scene = drawing.on_ground(t_ns, frame_of(self.prefix, channel), channel.bodies)

@@ -7,7 +7,7 @@ Pictures that take more than ``MAX_BYTES`` together, or more room than there is,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextvars import copy_context
 from dataclasses import replace
 from functools import partial
@@ -27,9 +27,10 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import frame_times, has_any, nearest_times
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources import foreign
-from mcaptrack.sources.cameras import camera_at
+from mcaptrack.sources.cameras import VIDEO, camera_at
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import Transform
@@ -300,3 +301,32 @@ def _described(
             values[clear] = describe(picture.rows, boxes[clear])
             yield Descriptors(np.full(len(ids), frame.t_ns), ids, values, clear, at_border(boxes, width, height))
             at += 1
+
+
+class PictureClock(NamedTuple):
+    """The topic of a camera's pictures, None without any; their times, rising, and their stamps (M,) in ns."""
+
+    topic: str | None
+    t_ns: Ints
+    stamp_ns: Ints
+
+
+def picture_clock(opened: log.Log, prefix: str, stamps: Mapping[str, Sequence[int]]) -> PictureClock:
+    """Return the times of a camera's pictures; ``stamps`` as for ``write``."""
+    usual = f"{prefix}/{VIDEO}"
+    video = usual if usual in opened.channels else next(iter(stamps), None) or camera_at(opened, prefix).pictures
+    picture_ns = opened.times(video) if video else np.empty(0, np.int64)
+    video = video if len(picture_ns) else None
+    stamp_ns = _stamps(opened, video, stamps.get(video, ())) if video else picture_ns
+    return PictureClock(video, picture_ns, stamp_ns)
+
+
+def _stamps(opened: log.Log, topic: str, read_before: Sequence[int]) -> Ints:
+    """Return the capture times of a channel's pictures in ns, (M,) for M pictures.
+
+    ``read_before`` are the times if they were read before. Pictures that were ingested have their capture time as log
+    time; in other recordings the messages contain it.
+    """
+    if Provenance.from_metadata(opened.channel(topic).metadata):
+        return opened.times(topic)
+    return np.array(read_before, np.int64) if read_before else foreign.stamps(opened, topic)

@@ -19,9 +19,10 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, warn_unused
-from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, fuser_of, rebuild
+from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, rebuild
+from mcaptrack.pipeline.scenes import Scenes
 from mcaptrack.pipeline.staleness import is_of_corrections, is_stale, read_planes
-from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO
+from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
 from mcaptrack.sources import foreign
@@ -30,7 +31,7 @@ from mcaptrack.sources.camera_motion import motion_topic
 from mcaptrack.sources.cameras import USUAL, camera_at, is_made_by_stage, provenance_of
 from mcaptrack.sources.foreign import holds_boxes, reading_of, uncertain_boxes
 from mcaptrack.sources.foreign.boxes import is_chosen_otherwise
-from mcaptrack.transforms import FUSION, STAGES, Stage, Transform
+from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import Space, traits_of
 
 Say = Callable[[str], None]
@@ -318,13 +319,12 @@ class _Planner:
 
     def _suited(self, stage: str, source: str) -> Transform | None:
         """Create the transform that the maker of a stage's input recommends for the stage; None if it names none."""
-        option, maker = STAGES[stage].option, self._maker_of(source)
+        option = STAGES[stage].option
+        made_by, maker = self._maker_of(source) or (None, None)
         suited = traits_of(maker).suited(option)
-        if maker is None or suited is None:
+        if made_by is None or maker is None or suited is None:
             name = self.suited_tracker(stage, source)
             return STAGES[stage].make(name) if name else None
-        made_by = next(producer for producer in STAGES.values() if f"{self.prefix}/{producer.output_topic}" == source)
-        made_by = FUSION if maker.reads is SIGHTINGS else made_by
         named = f"{made_by.option} {made_by.choice(maker)}"
         parameters, planes = dict(suited.parameters), read_planes(self.opened, self.prefix)
         if planes and not is_assumed(planes):
@@ -340,15 +340,16 @@ class _Planner:
         self._notes.append(f"{stage} by {by}, which suits the {named}; `{option}=` chooses")
         return transform
 
-    def _maker_of(self, topic: str) -> Transform | None:
-        """Return the transform that makes a channel now, or that made it; None if no stage of the camera does."""
+    def _maker_of(self, topic: str) -> tuple[Stage, Transform] | None:
+        """Return the stage and the transform that make a channel now, or made it; None if they aren't known."""
         for job in self.jobs:
             if topic in job.outputs():
-                return job.transform
+                return STAGES[job.stage], job.transform
         how = provenance_of(self.opened, topic)
         if how and how.transform == FUSE:
-            return fuser_of(how)[0]
-        return self._before(how.transform, how)[0] if how and how.transform in STAGES else None
+            return Scenes().maker_of(how)
+        maker = self._before(how.transform, how)[0] if how and how.transform in STAGES else None
+        return (STAGES[how.transform], maker) if how and maker else None
 
     def _is_made_by_another(self, topic: str) -> bool:
         """Return whether this run makes a channel by another class of transforms than before."""

@@ -7,7 +7,7 @@ the user, too: a log must not be able to run code.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any, Final, get_type_hints
 
 from mcaptrack.errors import McaptrackError
@@ -16,14 +16,11 @@ from mcaptrack.predictors import entry_of as predictor_entry
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.registry import Entry, find, is_installed
 from mcaptrack.schema.provenance import Plugin, Provenance
-from mcaptrack.transforms import FUSION, Stage, Transform
+from mcaptrack.transforms import Stage, Transform
 from mcaptrack.transforms.protocol import member_type
 
 #: The maximum number of differing parameters in a message.
 _NAMED: Final = 3
-
-#: Entries of the provenance of a scene beside the parameters of its fuser.
-_FINDINGS: Final = ("cameras", "clock_offset_s", "clock_offsets_given", "cameras_given", "detects", "false_share")
 
 
 class MissingPluginError(McaptrackError):
@@ -99,21 +96,6 @@ def _check_weights(stage: Stage, transform: Transform, sha256: str) -> None:
         raise McaptrackError(f"{predictor} holds other weights than those it was made with")
     if hasattr(transform, "weights_sha256") and transform.weights_sha256() not in (None, sha256):
         raise McaptrackError(f"{stage.choice(transform)} holds other weights than those it was made with")
-
-
-def fuser_of(
-    provenance: Provenance, named_by_user: Transform | None = None
-) -> tuple[Transform | None, McaptrackError | None]:
-    """Return the fuser that made a scene, with the same parameters; or None, and the reason why not.
-
-    ``named_by_user`` is the one that the user names, if any.
-    """
-    parameters = {name: value for name, value in provenance.parameters.items() if name not in _FINDINGS}
-    named = {} if named_by_user is None else {FUSION.name: named_by_user}
-    try:
-        return rebuild(FUSION, replace(provenance, parameters=parameters), named), None
-    except McaptrackError as error:
-        return None, error
 
 
 def _is_of_a_module(predictor: str) -> bool:

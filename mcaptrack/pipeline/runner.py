@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import count
 from pathlib import Path
 from time import perf_counter
-from typing import Any, ClassVar, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,14 @@ from mcaptrack.pipeline.following import Before
 from mcaptrack.pipeline.pictures import pictures_of
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, plane_in_words, recorded_planes
 from mcaptrack.pipeline.rebuild import plugins_of
-from mcaptrack.pipeline.staleness import digest_of, read_planes, warn_clock_jumps
+from mcaptrack.pipeline.staleness import (
+    digest_of,
+    is_finished,
+    is_stale,
+    missing_finisher,
+    read_planes,
+    warn_clock_jumps,
+)
 from mcaptrack.pipeline.steps import BEFORE, LATE_BEGINNING, Input, Progress, Work
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.predictors import weights_sha256
@@ -38,7 +45,6 @@ from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import ModelCard, traits_of
-from mcaptrack.transforms.stages import FINISHING
 
 # Measure the time that each part of a run takes.
 
@@ -99,8 +105,7 @@ class Report:
 
     ``stale`` are the channels that are out of date, because this run replaced their input. ``events`` are the numbers
     of events of each kind by channel of tracks. ``warnings`` report what was assumed, left out or looks unusual.
-    ``finished`` names what was done at the end, or was up to date. ``watch`` has the seconds of each stage, and of
-    reading, waiting for pictures ("decode") and writing.
+    ``watch`` has the seconds of each stage, and of reading, waiting for pictures ("decode") and writing.
     """
 
     stages: list[str] = field(default_factory=list)
@@ -111,7 +116,6 @@ class Report:
     stale: list[str] = field(default_factory=list)
     events: dict[str, dict[str, int]] = field(default_factory=dict)
     warnings: list[Notice] = field(default_factory=list)
-    finished: set[str] = field(default_factory=set)
     watch: Stopwatch = field(default_factory=Stopwatch)
 
     @classmethod
@@ -133,7 +137,6 @@ class Report:
         self.frames |= {topic: channel.size() for topic, channel in made.items()}
         self.stages += [name] if made else []
         self.events |= tally(made)
-        self.finished.add(name)
 
 
 def tally(results: Mapping[str, Made]) -> dict[str, dict[str, int]]:
@@ -207,12 +210,18 @@ def _warn_held_back(opened: log.Log, parameters: Sequence[Mapping[str, Any]]) ->
 
 
 class Finish(Protocol):
-    """A step at the end of a run with what it made, such as finding events; ``name`` stands in reports."""
+    """A finisher: a step at the end of a run with what it made, such as finding events.
 
-    name: ClassVar[str]
+    ``name`` stands in reports, and is the ``transform`` in the provenance of channels. It may have ``topics``, channels
+    that say which camera is meant, and a method ``report(opened, prefixes)``, which returns a ``Finished`` for the
+    cameras of a run, or None.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
 
     def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
-        """Return new channels by topic; ``stamps`` are the capture times in ns of pictures, by topic."""
+        """Return new channels by topic, below their inputs; ``stamps`` are the times in ns of pictures, by topic."""
         ...
 
 
@@ -271,7 +280,8 @@ def run(
         provenances = {topic: channel.provenance for topic, channel in results.items()}
         warn_findings(state, provenances, own_planes, is_all=bool(finishing) or not jobs)
     late = outdated_by(opened, {topic: how.digest for topic, how in provenances.items()})
-    report.stale = [topic for topic in late if topic not in state.gone]
+    late += _left_by_finishers(state) if finishing else []
+    report.stale = [topic for topic in dict.fromkeys(late) if topic not in state.gone]
     report.warnings = list(dict.fromkeys(warnings))
     return report
 
@@ -308,20 +318,27 @@ def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> 
     gone -= {*results}
     for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
         provenance = Provenance.from_metadata(opened.channels[topic].metadata)
-        if provenance and provenance.transform in (*FINISHING, VIEW) and provenance.input in gone:
+        if provenance and (provenance.transform == VIEW or is_finished(topic, provenance)) and provenance.input in gone:
             gone.add(topic)
     return gone - {*results}
+
+
+def _left_by_finishers(state: RunState) -> list[str]:
+    """Return channels that are out of date since an earlier run, and were made by a finisher that isn't installed."""
+    topics = sorted(camera_at(state.opened, state.prefix).topics)
+    return [topic for topic in topics if missing_finisher(state.opened, topic) and is_stale(state.opened, topic)]
 
 
 def outdated_by(opened: log.Log, digests: Mapping[str, str]) -> list[str]:
     """Return the other channels that stages made from earlier contents of these topics, or compared with them."""
     outdated = []
     for topic, channel in sorted(opened.channels.items()):
-        provenance = Provenance.from_metadata(channel.metadata)
-        is_result = provenance and (provenance.transform in STAGES or provenance.transform in (*FINISHING, FUSE))
-        if topic not in digests and provenance and is_result:
-            is_late = any(digests.get(name, then) != then for name, then in provenance.made_from().items())
-            outdated += [topic] if is_late else []
+        how = Provenance.from_metadata(channel.metadata)
+        if topic in digests or how is None:
+            continue
+        is_result = how.transform in STAGES or how.transform == FUSE or is_finished(topic, how)
+        if is_result and any(digests.get(name, then) != then for name, then in how.made_from().items()):
+            outdated.append(topic)
     return outdated
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ from mcaptrack.files import publish
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.runner import Report
+from mcaptrack.pipeline.scenes import Scenes
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.sidecar import SidecarChoice
@@ -78,14 +81,13 @@ class CameraResult:
 class EveryCamera:
     """Runs all cameras of a log that has several, or those of these names.
 
-    ``run_at`` returns what runs a camera, by its prefix, and ``fuse_to`` what fuses cameras, by their names.
-    ``left_out`` and ``not_fused`` are the reasons why cameras are left out, by name, and why no scene is made.
+    ``run_at`` returns what runs a camera, by its prefix, and ``joins`` makes scenes of several. ``left_out`` and
+    ``not_fused`` are the reasons why cameras are left out, by name, and why no scene is made.
     """
 
     names: Sequence[str]
-    is_fused: bool
+    joins: Scenes
     run_at: Callable[[str, Progress], Act]
-    fuse_to: Callable[[str, Sequence[str], Progress], Act]
     left_out: dict[str, str] = field(default_factory=dict)
     not_fused: str = ""
     prefixes: tuple[str, ...] = ()
@@ -126,25 +128,58 @@ class EveryCamera:
     def _run_scenes(self, steps: _Steps) -> None:
         """Make the scenes again that are out of date, or a new one, and run them."""
         with steps.opened() as opened:
-            scenes = self.scenes or (pipeline.scenes_of(opened) if self.is_fused else ())
+            off = self.joins.off
+            scenes = self.scenes or (() if off else pipeline.scenes_of(opened))
             joined: list[str] = []
-            if self.is_fused and not scenes:
-                names = [prefix[1:] for prefix in self.prefixes]
-                joined, why = pipeline.fusable(opened, names)
+            if not off and not scenes:
+                joined, why = self.joins.joinable(opened, [prefix[1:] for prefix in self.prefixes])
                 self.not_fused = "" if joined else why
                 if joined and why:
                     steps.say(f"not in the scene: {why}")
         if joined:
             scenes, name = (pipeline.SCENE,), pipeline.SCENE[1:]
-            if not steps.take(name, self.fuse_to(name, joined, _named(steps.progress, name)), is_scene=True):
+            if not steps.take(name, self._join(joined, _named(steps.progress, name)), is_scene=True):
                 self.not_fused = steps.done.pop().failure
                 scenes = ()
-        if not self.is_fused and not self.scenes:
-            self.not_fused = "`fuse=False` was given"
+        if off and not self.scenes:
+            self.not_fused = off
         elif self.not_fused:
             steps.say(f"no scene is made of the cameras: {self.not_fused}")
         for scene in scenes:
             steps.take(scene[1:], self.run_at(scene, _named(steps.progress, scene[1:])), is_scene=True)
+
+    def _join(self, names: Sequence[str], progress: Progress) -> Act:
+        def act(opened: logs.Log, output: Path | None, say: Say, _: BoxesRead) -> tuple[str, Report]:
+            say(f"fusing {', '.join(names)} to {pipeline.SCENE}")
+            return write_scene(opened, pipeline.SCENE, partial(self.joins.join, opened, names), progress, output)
+
+        return act
+
+
+def write_scene(
+    opened: logs.Log,
+    prefix: str,
+    join: Callable[[str, Progress], Mapping[str, Made]],
+    progress: Progress,
+    output: Path | None = None,
+    views: bool = False,
+) -> tuple[str, Report]:
+    """Write the channels of a scene, which ``join`` makes by its prefix; with ``views`` they are drawn for viewers.
+
+    Returns the prefix and the report. ``output`` is the copy to write instead, if any.
+    """
+    with notices.collected() as warnings:
+        channels = dict(join(prefix, progress))
+    state, drawn = RunState(opened, prefix, channels), None
+    if views:
+        from mcaptrack.pipeline.views import make_views
+
+        drawn = make_views(state, ())
+    write(state, output, drawn)
+    report = Report.begun_with(channels)
+    report.is_written, report.warnings = True, list(warnings)
+    report.stale = pipeline.outdated_by(opened, {topic: made.provenance.digest for topic, made in channels.items()})
+    return prefix, report
 
 
 def _named(progress: Progress, name: str) -> Progress:
@@ -224,7 +259,6 @@ def together(reports: Sequence[Report]) -> Report:
         out.is_written |= report.is_written
         out.stale = [*dict.fromkeys([*out.stale, *report.stale])]
         out.warnings += report.warnings
-        out.finished |= report.finished
         for name, seconds in report.watch.seconds.items():
             out.watch.seconds[name] = out.watch.seconds.get(name, 0.0) + seconds
     return out

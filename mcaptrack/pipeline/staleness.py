@@ -12,7 +12,8 @@ from weakref import WeakKeyDictionary
 from mcaptrack import log
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
-from mcaptrack.schema.provenance import FUSE, Provenance, digest
+from mcaptrack.registry import names
+from mcaptrack.schema.provenance import FUSE, VIEW, Provenance, digest
 from mcaptrack.sources.camera_motion import motion_topic, planes_in
 from mcaptrack.sources.cameras import camera_at, chain_of, is_plane, name_above, provenance_of
 from mcaptrack.sources.corrections import ANSWERS, CORRECTED, corrections_of
@@ -42,6 +43,19 @@ def is_stale(opened: log.Log, topic: str) -> bool:
         return True
     now = {name: how for name in provenance.made_from() if (how := provenance_of(opened, name)) and how.digest}
     return any(how.digest != provenance.made_from()[name] for name, how in now.items())
+
+
+def is_finished(topic: str, how: Provenance) -> bool:
+    """Return whether a finisher, installed or not, made a channel: below its input, and neither a stage nor a view."""
+    is_stage = how.transform in STAGES or bool(how.plugins)
+    return not is_stage and how.transform != VIEW and bool(how.input) and topic.startswith(f"{how.input}/")
+
+
+def missing_finisher(opened: log.Log, topic: str) -> str:
+    """Return the name of the finisher that made a channel, if it isn't installed now; otherwise ""."""
+    how = provenance_of(opened, topic)
+    is_missing = how and is_finished(topic, how) and how.transform not in names("finisher")
+    return how.transform if how and is_missing else ""
 
 
 def _is_plane_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:

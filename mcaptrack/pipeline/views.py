@@ -41,7 +41,8 @@ from mcaptrack.pipeline.drawing import (
     robot_topic,
 )
 from mcaptrack.pipeline.motion import path_with
-from mcaptrack.pipeline.scene_views import PictureClock, picture_clock, scene_on_pictures
+from mcaptrack.pipeline.pictures import PictureClock, picture_clock
+from mcaptrack.pipeline.scenes import Scenes
 from mcaptrack.pipeline.staleness import digest_of, read_planes
 from mcaptrack.pipeline.write import RunState, View, Views, add_views, write_by_time
 from mcaptrack.schema import (
@@ -145,11 +146,11 @@ class _Work:
         self.tree = transforms_of(opened) if is_framed else None
         solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
         self.calibrated = calibrated_cameras(opened, solid_in) if solid_in and self.tree else {}
-        self.scene = scene_on_pictures(state)
+        self.members = Scenes().members(state)
         self.frames = new_frames(prefix, shown, self.tree.frames() if self.tree else ())
         self.sources = self._sources()
         self.robot = robot_frame(opened, self.sources, self.tree, self.frame_id) if self.tree else ""
-        self.seen_on = (*self.calibrated, *(seen.pictures for seen in self.scene.cameras))
+        self.seen_on = (*self.calibrated, *(member.clock.topic or "" for member in self.members))
         self.start_ns = _start_ns(opened, camera, shown, self.clock)
         of_shown = self._outdated()
         self._recorded = {topic for topic in of_shown if not may_replace(opened, topic, VIEW)}
@@ -178,7 +179,7 @@ class _Work:
         """
         factory = ViewFactory(
             self.state.prefix, self.clock.t_ns, self.clock.stamp_ns, self.planes, self.path, self.frames, self.robot,
-            self.calibrated, self.scene,
+            self.calibrated, self.members,
         )  # fmt: skip
         first, last = (
             {topic: channel for topic, channel in self.shown.items() if (topic in self.state.results) is is_new}

@@ -50,11 +50,14 @@ Kind = Literal[
     "message_reader",
     "exporter",
     "judge",
+    "finisher",
+    "report_section",
     "command",
     "page",
     "player",
     "viewer",
     "name",
+    "scene",
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
@@ -66,11 +69,22 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
-    "demo ingest run view info detect motion track sample predict retrack fuse models query export cut "
-    "evaluate events zones calibrate check recover drop doctor"
+    "demo ingest run view info detect motion track sample predict retrack models query export cut "
+    "evaluate events check recover drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "viewer", "name")
+_BY_ENTRY_POINT: Final = (
+    "stage",
+    "message_reader",
+    "finisher",
+    "report_section",
+    "command",
+    "page",
+    "player",
+    "viewer",
+    "name",
+    "scene",
+)
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -102,9 +116,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "likelihood": "mcaptrack.transforms.retrack:Retrack",
             "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
         },
-        "fuser": {
-            "feet": "mcaptrack.transforms.fuse:FootFuser",
-        },
+        "fuser": {},
         # The default transform of each; mcaptrack.transforms.stages says the rest.
         "stage": {
             "detect": "mcaptrack.transforms.detect.median:MedianDetector",
@@ -155,12 +167,17 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "mot": "mcaptrack.tables.box_files:MotFile",
         },
         "judge": {},
+        # What is made of the results of stages at the end of a run.
+        "finisher": {"events": "mcaptrack.pipeline.events:Watch"},
+        "report_section": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         "page": {"tables": "mcaptrack.api.viewing:tables_page"},
         "player": {},
         # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
         "name": {},
+        # What makes a scene of several cameras (mcaptrack.pipeline.scenes).
+        "scene": {},
         # Viewers on the web that `mcaptrack view` links, besides Lichtblick and Foxglove.
         "viewer": {},
     }
@@ -236,6 +253,11 @@ def names(kind: Kind) -> tuple[str, ...]:
     return (*BUILT_IN[kind], *sorted({point.name for point in points(kind)}))
 
 
+def own_names(kind: Kind) -> tuple[str, ...]:
+    """The names of a kind in mcaptrack: built-in ones, the default first, then those of extensions. Imports nothing."""
+    return (*BUILT_IN[kind], *sorted({point.name for point in points(kind) if point.is_own}))
+
+
 def points(kind: Kind) -> list[Point]:
     """The entry points of a kind; those with a name that is taken don't count."""
     return [point for point in entry_points(_group(kind)) if not _owner(kind, point)]
@@ -252,7 +274,8 @@ def _owner(kind: Kind, point: Point) -> str:
     is_extension = any(own.is_own and own.name == point.name for own in entry_points(_group(kind)))
     if point.name in BUILT_IN[kind] or (is_extension and not point.is_own):
         return f"a built-in {titled(kind, point.name)}"
-    return f"a {titled('command', point.name)}" if kind == "stage" and point.name in names("command") else ""
+    taken = names("command") if kind == "stage" else BUILT_IN["command"] if kind == "finisher" else ()
+    return f"a {titled('command', point.name)}" if point.name in taken else ""
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:

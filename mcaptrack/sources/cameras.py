@@ -135,9 +135,14 @@ def has_own_channels(opened: log.Log, camera: Camera) -> bool:
     return any(Provenance.from_metadata(opened.channels[topic].metadata) for topic in camera.topics)
 
 
+def detections_topic(prefix: str) -> str:
+    """Return the usual topic of the detections of a camera, by its prefix."""
+    return f"{prefix}/{STAGES['detect'].output_topic}"
+
+
 def detections_of(opened: log.Log, camera: Camera) -> str | None:
     """Return the topic of a camera's detections; None if it has none, or no unique one."""
-    usual = f"{camera.prefix}/{STAGES['detect'].output_topic}"
+    usual = detections_topic(camera.prefix)
     return usual if usual in opened.channels else camera.boxes
 
 
@@ -158,14 +163,13 @@ def corrected_plane(topic: str) -> str:
 
 def scenes_of(opened: log.Log) -> tuple[str, ...]:
     """Return the prefixes of the scenes that several cameras were fused to."""
-    target = STAGES["detect"].output_topic
-    fused = ((camera.prefix, provenance_of(opened, f"{camera.prefix}/{target}")) for camera in cameras(opened))
+    fused = ((camera.prefix, provenance_of(opened, detections_topic(camera.prefix))) for camera in cameras(opened))
     return tuple(prefix for prefix, how in fused if how is not None and how.transform == FUSE)
 
 
 def members_of(opened: log.Log, scene: str) -> list[str]:
     """Return the prefixes of the cameras that were fused to a scene."""
-    how = provenance_of(opened, f"{scene}/{STAGES['detect'].output_topic}")
+    how = provenance_of(opened, detections_topic(scene))
     return [f"/{name}" for name in how.parameters["cameras"]] if how else []
 
 

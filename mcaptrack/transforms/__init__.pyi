@@ -15,7 +15,6 @@ from mcaptrack.transforms.sort import ByteTrack as ByteTrack
 from mcaptrack.transforms.sort import OcSort as OcSort
 from mcaptrack.transforms.sort import Sort as Sort
 from mcaptrack.transforms.stages import FULL as FULL
-from mcaptrack.transforms.stages import FUSION as FUSION
 from mcaptrack.transforms.stages import STAGES as STAGES
 from mcaptrack.transforms.stages import Stage as Stage
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, others
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, names, others, own_names
 from mcaptrack.schema import (
     APPEARANCE,
     CAMERA_MOTION,
@@ -23,7 +23,6 @@ from mcaptrack.schema import (
     DETECTIONS,
     PREDICTIONS,
     SCHEMAS,
-    SIGHTINGS,
     TRACKS,
     VIDEO,
     WORLDS,
@@ -36,10 +35,8 @@ StepBefore = Literal["memory", "planes", "scale", "corrections", "scene", "log-b
 StepAfter = Literal["one-class", "log-before", "video-rate", "pictures", "seen"]
 #: Suffix of the topic of tracks at the video's rate (the step "video-rate").
 FULL: Final = "/full"
-#: Last parts of topics that outputs can't have: these are made of the results of stages.
-RESERVED: Final = frozenset({"full", "view", "events", "counts", "errors", "scores", "zones"})
-#: What a run makes of the results of its stages, in the provenance.
-FINISHING: Final = ("events", "zones")
+#: Last parts of topics that outputs can't have, beside names of finishers: these are made of the results of stages.
+RESERVED: Final = frozenset({"full", "view", "counts", "errors", "scores"})
 #: The field for the file that a name may end with, as in ``onnx:FILE``.
 _FILE: Final = "file"
 
@@ -113,7 +110,7 @@ class Stage:
     @cached_property
     def default(self) -> type[Transform]:
         """Its default transform."""
-        entry = find(self.kind, next(iter(BUILT_IN[self.kind]))) if self.kind else find("stage", self.name)
+        entry = find(self.kind, own_names(self.kind)[0]) if self.kind else find("stage", self.name)
         cls: type[Transform] = entry.cls
         return cls
 
@@ -132,7 +129,7 @@ class Stage:
         """Its built-in transforms by name, the default first."""
         if self.kind is None:
             return {self.name: self.default}
-        return {name: find(self.kind, name).cls for name in BUILT_IN[self.kind]}
+        return {name: find(self.kind, name).cls for name in own_names(self.kind)}
 
     def find(self, name: str, distribution: str = "") -> Entry:
         """Find a transform of this stage by name (see ``mcaptrack.registry``).
@@ -146,7 +143,7 @@ class Stage:
         own, file = self.split(name)
         entry = find(self.kind, own, distribution)
         if not entry.is_built_in:
-            self._check(entry)
+            self.check(entry)
         if file is not None and _FILE not in {f.name for f in fields(entry.cls)}:
             raise McaptrackError(f"{entry} takes no file, so {name} names nothing")
         return entry
@@ -226,7 +223,7 @@ class Stage:
             check_options(transform)
         return transform
 
-    def _check(self, entry: Entry) -> None:
+    def check(self, entry: Entry) -> None:
         """Raise McaptrackError if a class of another package can't be a transform of this stage."""
         cls, wanted = entry.cls, self
         check_class(entry)
@@ -256,9 +253,6 @@ class Stage:
                     f"{entry} has an output {suffix!r} of {schema.name}; that of a {entry.kind} has "
                     f"{wanted.writes[suffix].name}"
                 )
-        for suffix, schema in wanted.writes.items():
-            if self.kind == "fuser" and outputs.get(suffix) is not schema:
-                raise McaptrackError(f"{entry} has no output {suffix!r}; a fuser also writes which boxes it joined")
         if any(field.name == self.kind for field in fields(cls)):
             raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
 
@@ -287,7 +281,7 @@ def _check_suffixes(entry: Entry, outputs: Mapping[Any, object]) -> None:
                 f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
                 "writes = {'': TRACKS, 'debug': DETECTIONS}"
             )
-        if suffix in RESERVED:
+        if suffix in RESERVED or suffix in names("finisher"):
             raise McaptrackError(f"{entry} has an output {suffix!r}, which is a name of what is made of results")
 
 
@@ -447,14 +441,3 @@ def declared_stage(entry: Entry) -> Stage:
 _DECLARED: Final = ("input_topic", "output_topic", "rows", "before", "after", "also_reads")
 #: All stages by name (see ``Stages``).
 STAGES: Final = Stages(_STAGES)
-
-#: The fusion of several cameras: not a stage of one camera, but its transforms are found and checked like those of one.
-FUSION: Final = Stage(
-    name="fuse",
-    kind="fuser",
-    reads=SIGHTINGS,
-    writes={"": DETECTIONS, "sightings": SIGHTINGS},
-    input_topic="detections/sightings",
-    output_topic="detections",
-    rows="detections",
-)

@@ -24,14 +24,9 @@ def make(folder: Path) -> str:
     made: mcaptrack.IngestResult = mcaptrack.ingest(
         "video.mp4", folder / "log.mcap", fps=25, ground_plane=folder / "h.txt", classes=None
     )
-    joined: mcaptrack.RunResult = mcaptrack.fuse(
-        made.log, cameras=["east", "west"], clock_offset_s={"east": 0.3}, progress=say
-    )
-    moved: mcaptrack.CalibrateResult = mcaptrack.calibrate(made.log, cameras=("east", "west"), dry_run=True)
-    corrections: dict[str, mcaptrack.CameraCorrection] = dict(moved.cameras)
     network: Path = mcaptrack.get_model("yolox-nano")
     catalogue: tuple[mcaptrack.Model, ...] = mcaptrack.models()
-    print(drawn, joined.channels, corrections, network, [model.name for model in catalogue])
+    print(drawn, network, [model.name for model in catalogue])
     return str(made.log)
 
 
@@ -46,14 +41,7 @@ def compute(log: str) -> mcaptrack.RunResult:
         mcaptrack.predict(log, predictor="social"),
         mcaptrack.retrack(log, retracker=Retrack(), mode="offline"),
         mcaptrack.events(log, similarity="metres", gate_m=1.0),
-        mcaptrack.zones(log, zones={"type": "FeatureCollection", "features": []}, max_gap_s=1.0),
     ]
-    best: mcaptrack.TuneResult = mcaptrack.tune([log], search={"min_iou": (0.1, 0.4)}, trials=2)
-    review: mcaptrack.Review = mcaptrack.review(log, questions=3)
-    changes: mcaptrack.ReviewResult = review.finish()
-    weights: mcaptrack.TrainResult = mcaptrack.train(["tracks.parquet"], "weights.safetensors", epochs=1)
-    steps.append(mcaptrack.track(log, output="tuned.mcap", **best.settings))
-    print(mcaptrack.draw_zones(log).name, weights, changes.rows)
     whole: mcaptrack.RunResult = mcaptrack.run(log, tracker=ByteTrack(), class_limits=None, tables=True, progress=say)
     people = 0 if whole.summary is None else whole.summary.tracks
     said: tuple[mcaptrack.Notice, ...] = tuple(notice for step in (*steps, whole) for notice in step.warnings)
@@ -70,7 +58,6 @@ def read(log: str) -> None:
         picture: Frame = next(opened.frames("video", times=[0], colour="rgb"))
         message: mcaptrack.FetchedMessage = opened.fetch(opened.table("frames").to_pylist()[0])
         boxes = [(t_ns, found.xyxy) for t_ns, found in opened.supervision("detections")]
-        player: mcaptrack.Player = opened.show(end_s=1.0)
         box: Frame = mcaptrack.detections([[10, 20, 30, 40]], [0.9], [1], picture.t_ns, box_format="xyxy")
         opened.write("/own/detections", [box])
         speeds = mcaptrack.schema_of("Speed", [("track_id", "i8"), ("speed", "f4")], units={"speed": "m/s"})
@@ -78,7 +65,7 @@ def read(log: str) -> None:
         decoded: list[mcaptrack.DecodedMessage] = list(opened.messages(["/own/speeds"], decoder_factories=[]))
         for schema, channel, newest, content in opened.messages("tracks", np.datetime64(0, "ns"), reverse=True):
             print(schema and schema.name, channel.topic, newest.log_time, content)
-        print(steps.max(), rows, message.payload, boxes, player.pictures, [each.decoded_message for each in decoded])
+        print(steps.max(), rows, message.payload, boxes, [each.decoded_message for each in decoded])
     about: mcaptrack.LogInfo = mcaptrack.info(log, frames=True)
     channels: list[mcaptrack.ChannelInfo] = list(about.channels)
     frames: list[mcaptrack.FrameInfo] = list(about.frames or ())
@@ -92,11 +79,9 @@ def use(log: str) -> None:
     scores: mcaptrack.Scores = mcaptrack.evaluate(log, similarity="metres", gate_m=1.0)
     idf1: float = scores.score("IDF1", "retracks")
     tables: mcaptrack.ExportResult = mcaptrack.export(log, form="parquet")
-    video: mcaptrack.RenderResult = mcaptrack.render(log, "walk.mp4", max_fps=5.0, compare=False)
-    page: mcaptrack.ReportResult = mcaptrack.report(log)
     server: mcaptrack.LogServer = mcaptrack.view(log).start()
     server.close()
-    print(idf1, [row["MOTA"] for row in scores.rows()], tables, video, page, server.links["Lichtblick"])
+    print(idf1, [row["MOTA"] for row in scores.rows()], tables, server.links["Lichtblick"])
 
 
 def repair(log: str) -> None:

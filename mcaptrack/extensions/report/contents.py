@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -11,13 +11,13 @@ import numpy as np
 
 from mcaptrack import log, pipeline
 from mcaptrack.choices import Similarity
+from mcaptrack.contracts import ReportSection
 from mcaptrack.errors import DamagedError, McaptrackError, command
 from mcaptrack.evaluation import EvaluateOptions, EvaluationInput, EvaluationRow, evaluate, sequence_of_log
 from mcaptrack.evaluation.aligned import has_positions, resample_frames
 from mcaptrack.evaluation.event_text import PEOPLE, nouns_of
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events
 from mcaptrack.evaluation.people import PersonScores, person_scores
-from mcaptrack.evaluation.zones import ZoneInWorlds, ZoneTotals
 from mcaptrack.extensions.report import statistics
 from mcaptrack.extensions.report.headline import AFTER, BEFORE, BeforeAfter, compared
 from mcaptrack.extensions.report.identity_events import (
@@ -34,19 +34,17 @@ from mcaptrack.extensions.report.identity_events import (
 from mcaptrack.extensions.report.scene_map import forecast_map
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
-from mcaptrack.geometry.zones import Zone
-from mcaptrack.schema import DECISIONS, EVENTS, PREDICTIONS, TRACKS, ZONE_COUNTS, Frame
+from mcaptrack.registry import blamed, find, others
+from mcaptrack.schema import DECISIONS, EVENTS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
-from mcaptrack.schema.framing import frame_times, joined_parts
+from mcaptrack.schema.framing import frame_times
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import provenance_of, repaired_tracks
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.transforms import FULL
 from mcaptrack.viewing.background import SceneBackground, background_picture, moment_picture
-from mcaptrack.viewing.charts import POINTS, Axis, Floats, Line, figure, line_chart, round_most
-from mcaptrack.viewing.formatting import NONE, clock, number, plain, short
+from mcaptrack.viewing.formatting import clock, plain, short
 from mcaptrack.viewing.legend import tracker_name
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
@@ -101,7 +99,7 @@ class LogReport:
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     html: str = ""
-    zones: dict[str, Any] = field(default_factory=dict)
+    sections: dict[str, ReportSection] = field(default_factory=dict)
     has_only_people: bool = True
 
     @property
@@ -143,119 +141,6 @@ class LogReport:
         return " Metres are guessed from the size of people: the ground was not measured."
 
 
-# The section on zones and lines: their totals for each channel of tracks, and how many tracks are inside over time.
-#
-# Letters: F frames, P points of a chart.
-
-
-#: The colours of channels of tracks, by their names below the camera.
-_ROLES: Final = {"tracks": "tracks", "retracks": "offline", f"retracks{FULL}": "offline", "truth": "truth"}
-#: The most zones with a chart.
-_CHARTS: Final = 12
-_OF_ZONES: Final = ("tracks", "visits", "entered", "left", "mean stay", "median stay", "most inside", "mean inside")
-_OF_LINES: Final = ("tracks", "forward", "backward")
-_IN_WORLDS: Final = ("tracks", "mean stay", "tracks that went on to")
-
-
-def zone_section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> dict[str, Any]:
-    """Return the values of the section; ``names`` are those of tracks for people, by role.
-
-    Nothing was counted if ``rows`` and ``lines`` are empty. ``data`` are the totals as values of JSON.
-    """
-    counted = pipeline.counted_zones(opened, prefix, with_worlds=True)
-    if not counted:
-        return {"columns": _OF_ZONES, "rows": [], "line_columns": _OF_LINES, "lines": [], "figures": [], "data": {}}
-    shown = [(channel, _ROLES.get(channel.topic.removeprefix(prefix + "/"), "samples")) for channel in counted]
-    shown.sort(key=lambda pair: ([*_ROLES.values(), "samples"].index(pair[1]), pair[0].topic))
-    called = {
-        channel.topic: names.get(role, channel.topic) if role != "samples" else channel.topic for channel, role in shown
-    }
-    zones = list({zone.name: zone for channel in counted for zone in channel.zones}.values())
-    groups: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
-    for zone in zones:
-        rows = [
-            {"name": called[channel.topic], "role": role, "topic": channel.topic, "cells": _cells(total)}
-            for channel, role in shown
-            for total in channel.totals
-            if (total.zone, total.is_line) == (zone.name, zone.is_line)
-        ]
-        groups[zone.is_line].append({"zone": zone.name, "rows": rows})
-    in_worlds = [
-        {"zone": total.zone, "rows": [_in_worlds(total.in_worlds, called[channel.topic], role, channel.topic)]}
-        for channel, role in shown
-        for total in channel.totals
-        if total.in_worlds
-    ]
-    some = [zone for zone in zones if not zone.is_line][:_CHARTS]
-    inside = {channel.topic: _inside(opened, channel.topic, channel.zones) for channel in counted}
-    figures = []
-    for zone in some:
-        lines = [
-            Line(short(called[channel.topic]), role, *inside[channel.topic][zone.name])
-            for channel, role in shown
-            if zone.name in inside[channel.topic]
-        ]
-        figures.append(_chart(zone.name, lines))
-    left = sum(not zone.is_line for zone in zones) - len(some)
-    return {
-        "columns": _OF_ZONES,
-        "rows": groups[False],
-        "line_columns": _OF_LINES,
-        "lines": groups[True],
-        "world_columns": _IN_WORLDS,
-        "in_worlds": in_worlds,
-        "figures": figures,
-        "left_out": left,
-        "data": {channel.topic: [total.to_json() for total in channel.totals] for channel in counted},
-    }
-
-
-def _in_worlds(zone: ZoneInWorlds, name: str, role: str, topic: str) -> dict[str, Any]:
-    """A row of medians and intervals."""
-    stay = zone.mean_dwell_s.words(1, " s") if zone.mean_dwell_s else NONE
-    then = "; ".join(f"{to}: {tracks.words()}" for to, tracks in zone.then.items() if tracks.high)
-    return {"name": name, "role": role, "topic": topic, "cells": [zone.tracks.words(), stay, then or NONE]}
-
-
-def _cells(totals: ZoneTotals) -> list[str]:
-    if totals.is_line:
-        return [number(value) for value in (totals.tracks, totals.forward, totals.backward)]
-    return [
-        *(number(value) for value in (totals.tracks, totals.visits, totals.entered, totals.left)),
-        *(NONE if value is None else number(value, 1, "s") for value in (totals.mean_dwell_s, totals.median_dwell_s)),
-        number(totals.most_inside),
-        NONE if totals.mean_inside is None else number(totals.mean_inside, 2),
-    ]
-
-
-def _inside(opened: log.Log, topic: str, zones: tuple[Zone, ...]) -> dict[str, tuple[Floats, Floats]]:
-    """The most tracks inside each zone in equal periods: seconds since the start of the log, and numbers (P,)."""
-    frames = opened.frame_columns(f"{topic}/zones/counts", ZONE_COUNTS)
-    at_s = (frames.t_ns - opened.start_ns) / NS_PER_S
-    if not len(at_s):
-        return {}
-    edges = np.linspace(at_s[0], at_s[-1], min(POINTS, len(at_s)) + 1)
-    period = np.clip(np.searchsorted(edges, at_s, "right") - 1, 0, len(edges) - 2)
-    out = {zone.name: np.zeros(len(edges) - 1) for zone in zones if not zone.is_line}
-    for low, _, joined in joined_parts(ZONE_COUNTS, frames):
-        for zone in zones:
-            if not zone.is_line:
-                of = joined.rows["zone_id"] == zone.number
-                np.maximum.at(out[zone.name], period[joined.frame[of] + low], joined.rows["inside"][of])
-    middle = (edges[1:] + edges[:-1]) / 2
-    return {name: (middle, most) for name, most in out.items()}
-
-
-def _chart(name: str, lines: list[Line]) -> dict[str, Any]:
-    last = max((float(line.x[-1]) for line in lines), default=1.0)
-    axes = (
-        Axis("time, s", max(last, 1e-3)),
-        Axis("tracks inside", round_most([line.y for line in lines], 4.0, whole=True), whole=True),
-    )
-    chart = line_chart(f"Tracks inside {name} over time", lines, *axes)
-    return figure(chart, f"Inside {name}.", "The most at a time in each period.")
-
-
 def gather(
     opened: log.Log,
     camera: str | None,
@@ -288,7 +173,7 @@ def gather(
         out.doubtful_tracks = find_doubtful_tracks(decisions)
     progress(f"{opened.path}: pictures")
     _read_pictures(opened, out)
-    out.zones = zone_section(opened, prefix, {role: track_set.name for role, track_set in out.track_sets.items()})
+    _add_sections(opened, out)
     out.data = plain(
         _recording(opened)
         | {"name": out.name, "camera": prefix}
@@ -296,6 +181,17 @@ def gather(
         | {"notes": out.notes, "warnings": out.warnings}
     )
     return out
+
+
+def _add_sections(opened: log.Log, out: LogReport) -> None:
+    """Add the sections of installed packages."""
+    names = {role: track_set.name for role, track_set in out.track_sets.items()}
+    for name in others("report_section"):
+        entry = find("report_section", name)
+        with blamed(entry, "failed"):
+            section: ReportSection | None = entry.cls(opened, out.prefix, names)
+        if section is not None:
+            out.sections[name] = section
 
 
 def _without_path(error: McaptrackError, opened: log.Log) -> str:
@@ -517,7 +413,7 @@ def _statistics(out: LogReport) -> dict[str, Any]:
             {topic: statistics.durations_s(frames) for topic, frames in resampled.items()}
         ),
         "ground_plane": origin_of(out.planes) if out.planes else None,
-    } | ({"zones": out.zones["data"]} if out.zones["data"] else {})
+    } | {name: section.data for name, section in out.sections.items() if section.data}
 
 
 def _recording(opened: log.Log) -> dict[str, Any]:

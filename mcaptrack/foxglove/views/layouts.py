@@ -27,8 +27,6 @@ ERRORS: Final = "errors"
 SPREAD: Final = "spread"
 #: The suffix of the text of events, after the topic of tracks.
 _EVENTS: Final = "/events/view/log"
-#: The suffix of zones, after the topic of tracks.
-_ZONES: Final = "/zones"
 
 
 # Layout files of Foxglove ("Import from file") and Lichtblick: panels, and how they divide the window.
@@ -254,22 +252,26 @@ class CameraChannels(NamedTuple):
         """Whether a channel has a view."""
         return bool({name + "/view/image", name + "/view/scene"} & self.names)
 
-    def has_any_view(self) -> bool:
-        """Whether there is any view."""
-        return any(name.endswith(("/view/image", "/view/scene")) for name in self.names)
+    def drawn(self) -> set[str]:
+        """The names of what has a view."""
+        ends = ("/view/image", "/view/scene")
+        return {name.removesuffix(end) for end in ends for name in self.names if name.endswith(end)}
 
 
-def best_channels(names: Collection[str]) -> list[str]:
-    """The channels to switch on, of those below the prefix: the best tracks, and their forecasts."""
+def best_channels(names: Collection[str], channels: Collection[str]) -> list[str]:
+    """The channels to switch on, of those below the prefix that have views: the best tracks, and their forecasts.
+
+    So are drawings of what was made of these tracks at the end, such as zones; ``channels`` are all below the prefix.
+    """
     best = [name for name in BEST if name in names][:1]
     of_these = "retracks/predictions"
     forecasts = [of_these for name in best if name.startswith("retracks") and of_these in names]
-    return best + forecasts + zones_of(best, names)
+    return best + forecasts + made_of(best, names, channels)
 
 
-def zones_of(chosen: Collection[str], names: Collection[str]) -> list[str]:
-    """The zones of chosen channels of tracks, of those below the prefix."""
-    return [f"{name}{_ZONES}" for name in chosen if f"{name}{_ZONES}" in names]
+def made_of(tracks: Collection[str], names: Collection[str], channels: Collection[str]) -> list[str]:
+    """The drawings, of these, that stand below chosen tracks and are no channels themselves."""
+    return sorted(name for name in names if name.rpartition("/")[0] in tracks and name not in channels)
 
 
 def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
@@ -289,7 +291,7 @@ def eye_on(places_m: Floats, planes: Planes, t_ns: int) -> Eye:
 
 def make(camera: CameraChannels) -> dict[str, bytes]:
     """The layout files that are useful for a log, by their names; none if there is nothing to see."""
-    if not camera.has_any_view():
+    if not camera.drawn():
         return {}
     files = {TRACKING: _tracking(camera)}
     if sum(any(map(camera.has_view, kind.names)) for kind in KINDS) > 1:
@@ -300,8 +302,7 @@ def make(camera: CameraChannels) -> dict[str, bytes]:
 
 
 def _tracking(camera: CameraChannels) -> bytes:
-    channels = {name.removesuffix("/view/image").removesuffix("/view/scene") for name in camera.names}
-    on = best_channels([name for name in channels if camera.has_view(name)])
+    on = best_channels(camera.drawn(), camera.names)
     panels: dict[str, Any] = {}
     pictures = _pictures(camera, panels, "Video", on)
     scene = _ground(camera, panels, "ground", "Tracks" if camera.recorded else "Ground", on)
@@ -317,7 +318,7 @@ def _comparing(camera: CameraChannels) -> bytes:
     for number, kind in enumerate(KINDS):
         title = kind.title.capitalize()
         shown_of_kind = [name for name in kind.names if camera.has_view(name)][:1]
-        shown_of_kind += [f"{name}{_ZONES}" for name in shown_of_kind if camera.has_view(f"{name}{_ZONES}")]
+        shown_of_kind += made_of(shown_of_kind, camera.drawn(), camera.names)
         if shown_of_kind:
             shown += shown_of_kind
             upper += _image(camera, panels, f"picture{number}", title, shown_of_kind) or _ground(

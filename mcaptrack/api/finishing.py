@@ -1,0 +1,129 @@
+"""Finishers and makers of scenes of installed packages: their options, which ``run`` has, too, and their objects."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from mcaptrack.api.declared import hints_of
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import warn
+from mcaptrack.registry import Entry, Kind, blamed, find, others
+
+if TYPE_CHECKING:
+    from mcaptrack.contracts import Finished
+    from mcaptrack.geometry.plane import Planes
+    from mcaptrack.log import Log
+    from mcaptrack.pipeline.runner import Finish
+    from mcaptrack.pipeline.write import Made, RunState
+
+_KINDS: Final[tuple[Kind, ...]] = ("finisher", "scene")
+#: The option of ``run`` that a finisher gets, if it has a parameter of this name.
+_FORCE = "force"
+
+
+class Finishers:
+    """The finishers and makers of scenes of installed packages: declared functions that take options and return a part.
+
+    One that can't be imported, or has an option that ``run`` has, gives no options; each run says why it is left out.
+    """
+
+    def __init__(self) -> None:
+        self._entries: list[Entry] = []
+        self._options: dict[Entry, dict[str, inspect.Parameter]] = {}
+        self._faults: list[str] = []
+        for kind, name in ((each, name) for each in _KINDS for name in others(each)):
+            try:
+                self._entries.append(find(kind, name))
+            except McaptrackError as error:
+                self._faults.append(str(error))
+
+    @property
+    def most_used(self) -> tuple[str, ...]:
+        """The options that come first in the help."""
+        return tuple(option for entry in self._entries for option in getattr(entry.cls, "most_used", ()))
+
+    def options(self, taken: Collection[str]) -> dict[str, inspect.Parameter]:
+        """Return the options by name; ``taken`` are the names that they can't have."""
+        out: dict[str, inspect.Parameter] = {}
+        for entry in self._entries:
+            try:
+                own = _options_of(entry, {*taken, *out})
+            except McaptrackError as error:
+                self._faults.append(str(error))
+            else:
+                self._options[entry] = own
+                out |= own
+        return out
+
+    def steps(self, values: Mapping[str, object], force: bool) -> list[Finish]:
+        """Return the steps of finishers with these values of options. Warn of what is left out."""
+        for fault in self._faults:
+            warn(f"{fault}; it is left out", "left-out")
+        parts = self.parts("finisher", values, force)
+        return [step if entry.is_built_in else _OfPackage(entry, step) for entry, step in parts]
+
+    def parts(self, kind: Kind, values: Mapping[str, object], force: bool = False) -> list[tuple[Entry, Any]]:
+        """Return what the functions of a kind make of these values of options, each with its entry."""
+        parts = []
+        for entry in (entry for entry in self._options if entry.kind == kind):
+            own = {name: values[name] for name in self._options[entry] if name in values}
+            own |= {_FORCE: force} if _FORCE in inspect.signature(entry.cls).parameters else {}
+            with blamed(entry, "failed"):
+                parts.append((entry, entry.cls(**own)))
+        return parts
+
+
+def _options_of(entry: Entry, taken: Collection[str]) -> dict[str, inspect.Parameter]:
+    """Return the options of a finisher. Raises McaptrackError for one that is taken, or has no default."""
+    with blamed(entry, "has annotations that can't be read"):
+        hints, parameters = hints_of(entry.cls), inspect.signature(entry.cls).parameters
+    own = {
+        name: parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=hints.get(name, Any))
+        for name, parameter in parameters.items()
+        if name != _FORCE
+    }
+    for name, parameter in own.items():
+        if name in taken or parameter.default is parameter.empty:
+            why = "run has one of this name" if name in taken else "it has no default"
+            raise McaptrackError(f"{entry} can't have the option {name}: {why}")
+    return own
+
+
+@dataclass(frozen=True)
+class _OfPackage:
+    """A step of another package: errors name it, and it replaces only what it made itself."""
+
+    entry: Entry
+    step: Any
+
+    @property
+    def name(self) -> str:
+        return self.entry.name
+
+    def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
+        from mcaptrack.pipeline.checks import may_add
+        from mcaptrack.pipeline.staleness import is_finished
+        from mcaptrack.schema.provenance import VIEW
+
+        with blamed(self.entry, "failed"):
+            made: dict[str, Made] = dict(self.step.make(state, planes, stamps))
+            hows = {topic: channel.provenance for topic, channel in made.items()}
+        for topic, how in hows.items():
+            is_own = how.transform == self.name and is_finished(topic, how)
+            if not is_own and not (how.transform == VIEW and how.input in made):
+                raise McaptrackError(
+                    f"{self.entry} makes {topic}, which is not below its input; its provenance is "
+                    f"Provenance({self.name!r}, parameters, input, digest of the input)"
+                )
+        may_add(state.opened, [*made], self.name, f"results of {self.entry}", is_asked=True)
+        return made
+
+    def report(self, opened: Log, prefixes: Sequence[str]) -> Finished | None:
+        if not hasattr(self.step, "report"):
+            return None
+        with blamed(self.entry, "failed"):
+            report: Finished | None = self.step.report(opened, prefixes)
+        return report

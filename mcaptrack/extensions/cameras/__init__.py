@@ -1,0 +1,1 @@
+"""Several cameras that see the same ground: fuse them to one scene, and correct ground planes that disagree."""

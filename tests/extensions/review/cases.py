@@ -1,0 +1,27 @@
+"""Cases of ``review`` for the tests of the core."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+import mcaptrack
+from tests.worlds import noisy_tracks, write_channels
+
+READING = {"review": lambda log, out: [log, "--print"]}
+EFFECTS = {"review": None}  # its options are seen where tracks are doubtful: test_review
+
+
+def _answered(scene) -> str:
+    """Answer the only question about people who were occluded."""
+    walks = noisy_tracks(np.random.default_rng(2), people=2, ticks=20, hidden=0.05)
+    mcaptrack.retrack(write_channels(scene.path, samples=walks))
+    (name,) = mcaptrack.review(scene.path).questions
+    Path("answers.json").write_text(json.dumps({name: "yes"}))
+    return scene.says("review", "LOG", "--answers", "answers.json")
+
+
+PROPOSALS = {
+    "extensions/review/questions.py:solve:run": lambda s: s.untracked().says("review", "LOG"),
+    "extensions/review/command.py:show:review": _answered,
+}
