@@ -76,8 +76,6 @@ from mcaptrack.notices import Notice as Notice
 
 _MODULES: dict[str, str]
 
-def _lazily(package: str, modules: collections.abc.Mapping[str, str]) -> collections.abc.Callable[[str], object]: ...
-
 class _RunOptions(typing.TypedDict, total=False):
     """Options of ``run`` that are of extensions."""
 
