@@ -17,6 +17,7 @@ from mcaptrack.cli.help import ALL, HELP, LAST_PANELS, write_page
 from mcaptrack.cli.settings import SWITCH, Given, Setting, declared_settings, found_of, gather, nearest
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.errors import similar
+from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 
 #: The exception of Typer for a command line that it can't parse.
@@ -61,6 +62,8 @@ def _message(error: Any) -> str:
 def _unknown_option(error: Any) -> str:
     """Return the message about an unknown option: which commands have it, and which option may be meant."""
     name, context = error.option_name, error.ctx
+    if missing := missing_extension(name.removeprefix("--"), "finisher"):
+        return missing
     text = f"no such option: {name}"
     if context is None or context.parent is None:
         return f"{text}{nearest(name, error.possibilities or ())}"
