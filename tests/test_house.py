@@ -183,8 +183,8 @@ DEEP = {
     ),
     "report": (
         "it shows all that is evaluated",
-        "evaluation.aligned evaluation.events evaluation.forecasts evaluation.people evaluation.zones "
-        "foxglove.views.people geometry.zones tables.catalogue tables.export.contents viewing.background viewing.charts",
+        "evaluation.aligned evaluation.events evaluation.forecasts evaluation.people foxglove.views.people "
+        "tables.catalogue tables.export.contents viewing.background viewing.charts",
     ),
     "review": (
         "its answers are written as the channels of a stage are",
@@ -198,6 +198,12 @@ DEEP = {
     "tuning": (
         "it makes transforms with other settings, and writes these",
         "api.running cli.chosen cli.config tables.compared transforms.guarded transforms.protocol",
+    ),
+    "zones": (
+        "its counts are written, drawn and reported as those of the core are",
+        "api.running cli.many evaluation.intervals evaluation.world_tracks foxglove.annotations foxglove.views.ground "
+        "foxglove.views.image foxglove.views.people geometry.camera_path pipeline.checks pipeline.motion "
+        "pipeline.scene_views pipeline.staleness pipeline.write schema.frame_columns viewing.background viewing.charts",
     ),
 }
 
