@@ -20,6 +20,7 @@ from mcaptrack.pipeline.runner import Report as Report
 from mcaptrack.pipeline.runner import input_of as input_of
 from mcaptrack.pipeline.runner import outdated_by as outdated_by
 from mcaptrack.pipeline.runner import run as run
+from mcaptrack.pipeline.staleness import is_outdated as is_outdated
 from mcaptrack.pipeline.staleness import is_stale as is_stale
 from mcaptrack.pipeline.staleness import missing_finisher as missing_finisher
 from mcaptrack.pipeline.staleness import read_planes as read_planes
@@ -28,6 +29,8 @@ from mcaptrack.pipeline.summary import Summary as Summary
 from mcaptrack.pipeline.summary import summarise as summarise
 from mcaptrack.pipeline.views import with_views as with_views
 from mcaptrack.pipeline.write import LAYOUTS as LAYOUTS
+from mcaptrack.pipeline.write import Made as Made
+from mcaptrack.pipeline.write import RunState as RunState
 from mcaptrack.pipeline.write import attachment_of as attachment_of
 from mcaptrack.pipeline.write import layout_path as layout_path
 from mcaptrack.sources.cameras import Camera as Camera
