@@ -229,7 +229,7 @@ def json_messages(draw: random.Random) -> Iterator[bytes]:
         yield json.dumps(message, ensure_ascii=draw.random() < 0.5).encode()
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", range(2))
 def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int
 ) -> None:
@@ -241,12 +241,12 @@ def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
         at_once += bool(columns)
         return columns
 
-    for seed in range(part * 80, part * 80 + 80):
+    for seed in range(part * 70, part * 70 + 70):
         draw = random.Random(seed)
         payloads = list(json_messages(draw)) if draw.random() < 0.5 else []
-        for _ in range(draw.choice([0, 1, 2]) if payloads else draw.choice([1, 1, 2])):
+        for odd in draw.sample(ODD, draw.choice([0, 0, 1])) + [ODD[seed % len(ODD)]] * (not payloads or seed % 3 > 0):
             place = draw.randrange(len(payloads) + 1)
-            payloads[place:place] = draw.choice(ODD)
+            payloads[place:place] = odd
         path = tmp_path / f"{seed}.mcap"
         with path.open("wb") as stream:
             writer = Writer(stream)

@@ -276,7 +276,8 @@ JSON = st.deferred(
 )
 
 
-@given(st.lists(JSON, max_size=5))
+@given(st.lists(JSON, max_size=8))
+@settings(max_examples=10)
 def test_whatever_json_holds_becomes_a_table(tmp_path_factory, values):
     path = tmp_path_factory.mktemp("j") / "a.mcap"
     table = one_channel(path, "", "", b"", "json", [json.dumps(value).encode() for value in values])

@@ -24,6 +24,7 @@ from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.fleet.worker import Reply, Request
 from tests import fleet_tasks
 from tests.awaiting import until
+from tests.tiers import one_in
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
@@ -262,7 +263,7 @@ def test_two_fleets_share_the_work_and_do_no_log_twice(folder):
     assert not list(folder.glob(".*"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", one_in(2, [signal.SIGINT, signal.SIGTERM]))
 def test_a_signal_ends_workers_and_gives_claims_up(folder, number):
     (folder / "d.mcap").write_text("hang")
     script = SCRIPT.replace("import sys\n", "import signal, sys\nsignal.signal(15, lambda *_: sys.exit(143))\n", 1)

@@ -70,7 +70,7 @@ def facts(path: Path) -> object:
 
 
 @pytest.mark.parametrize(
-    ("kind", "change", "look"), one_in(4, product(KINDS, CHANGES, [all_messages, all_streamed, facts]))
+    ("kind", "change", "look"), one_in(7, product(KINDS, CHANGES, [all_messages, all_streamed, facts]))
 )
 def test_a_change_before_any_read_gives_the_old_content_the_new_one_or_an_error(
     tmp_path, monkeypatch, kind, change, look

@@ -252,7 +252,7 @@ def test_a_newer_log_that_takes_the_place_of_a_half_written_one_is_never_rolled_
     newer.write_bytes(change.old)
     add_results(newer, 3, 700)
     other = newer.read_bytes()
-    for files in kills:
+    for files in kills[::2]:
         for content in (change.new, other):
             put(path, files)
             with path.open("rb+") as stream:  # as cp does: the file stays the same one

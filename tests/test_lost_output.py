@@ -105,7 +105,8 @@ def _check(server: Any, folder: Path, line: str, log: Path | None) -> None:
         for path in folder.iterdir():
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         if log is not None:
-            shutil.copytree(log.parent, folder, dirs_exist_ok=True)
+            for name in ("a.mcap", "clip.mp4"):
+                shutil.copy(log.with_name(name), folder)
 
     def bytes_of_log() -> bytes:
         return (folder / "a.mcap").read_bytes() if log is not None else b""

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from itertools import product
 from pathlib import Path
 from threading import Thread
 from time import sleep
@@ -319,7 +320,7 @@ def test_a_network_that_breaks_its_process_is_named(use):
     assert refused(use, LOOP(USES[use][1])) == "strange.onnx can't be run: the process that ran it was ended by SIGSEGV"
 
 
-@pytest.mark.parametrize(("number", "use"), alternating([signal.SIGINT, signal.SIGTERM, signal.SIGKILL]))
+@pytest.mark.parametrize(("number", "use"), one_in(3, product([signal.SIGINT, signal.SIGKILL, signal.SIGTERM], USES)))
 def test_signals_end_a_command_and_its_network(use, number, template, folder):
     log = shutil.copyfile(template, folder / "log.mcap")
     Path("strange.onnx").write_bytes(LOOP(USES[use][1]))
