@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from itertools import groupby
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry import kalman
@@ -16,7 +19,10 @@ from mcaptrack.geometry.assignment import assign, max_weight_matching, solve
 from mcaptrack.geometry.boxes import iou, overlapping
 from mcaptrack.geometry.clocks import FrameClock, seconds_to_ns
 from mcaptrack.geometry.histories import Histories, Holt, fill_gaps, rebuild_positions
+from mcaptrack.geometry.neighbours import near_pairs
+from mcaptrack.geometry.pinhole import Lens, ground_homography, project
 from mcaptrack.geometry.plane import GroundPlane, assumed_plane, plane_at
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.resampling import is_observed_at, resample
 from mcaptrack.sources.demo import demo_scene
@@ -92,7 +98,6 @@ class TestGroundPlane:
 
 
 def best_by_trying(cost: np.ndarray, gate: float) -> tuple[int, float]:
-    """The most pairs within the gate, and the least total cost of so many."""
     rows, columns = cost.shape
     best = (0, 0.0)
     for count in range(1, min(rows, columns) + 1):
@@ -342,3 +347,147 @@ class TestResample:
         frames, times = np.array([0, 10, 50]), np.array([-1, 0, 5, 10, 30, 50, 51])
         assert is_observed_at(frames, times, 20).tolist() == [False, True, True, True, False, True, False]
         assert not is_observed_at(np.empty(0, int), times, 20).any()
+
+
+# Groups laid end to end, and pairs of near points: against plain loops
+
+
+GROUPS = st.lists(st.tuples(st.integers(-9, 9), st.integers(0, 4)), max_size=8)
+
+
+@given(GROUPS, st.sampled_from([1, 3, -2]))
+def test_ranges_are_those_of_python_laid_end_to_end(groups, step):
+    starts, counts = [start for start, _ in groups], [count for _, count in groups]
+    wanted = [n for start, count in groups for n in range(start, start + step * count, step)]
+    assert ragged_range(starts, counts, step).tolist() == wanted
+    assert group_index(counts).tolist() == [k for k, count in enumerate(counts) for _ in range(count)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 1), st.integers(0, 1), st.integers(0, 3)), max_size=12))
+def test_runs_are_those_of_groupby_and_end_at_long_gaps(members):
+    one, other, gaps = np.array(members, int).reshape(-1, 3).T
+    runs = [len(list(run)) for _, run in groupby(members, key=lambda member: member[:2])]
+    starts = run_starts(one, other)
+    assert np.diff(np.append(np.flatnonzero(starts), len(members))).tolist() == runs
+    assert (np.flatnonzero(run_ends(starts)) + 1).tolist() == np.cumsum(runs).tolist()
+    split = run_starts(one, other, times=np.cumsum(gaps), max_gap=2)
+    assert split.tolist() == [first or gap > 2 for first, gap in zip(starts.tolist(), gaps.tolist(), strict=True)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 5), st.integers(0, 5)), max_size=12))
+def test_near_pairs_are_all_pairs_of_a_group_nearer_than_the_distance(points):
+    group, *xy = np.array(points, int).reshape(-1, 3).T
+    first, second = near_pairs(group, np.stack(xy, axis=-1).astype(float), 2.0)
+    found = sorted(tuple(sorted(pair)) for pair in zip(first.tolist(), second.tolist(), strict=True))
+    assert found == [
+        (a, b)
+        for a in range(len(points))
+        for b in range(a + 1, len(points))
+        if points[a][0] == points[b][0] and np.hypot(*np.subtract(points[a][1:], points[b][1:])) < 2.0
+    ]
+
+
+# Cameras with known intrinsics, compared with OpenCV's projection
+
+
+FOCAL, CENTRE = (800.0, 790.0), (641.0, 355.0)
+LENSES = {
+    "none": Lens(FOCAL, CENTRE),
+    "four": Lens(FOCAL, CENTRE, (-0.2, 0.05, 0.001, -0.002)),
+    "plumb_bob": Lens(FOCAL, CENTRE, (-0.3, 0.1, 0.001, -0.002, -0.01)),
+    "rational": Lens(FOCAL, CENTRE, (0.4, -0.2, 0.001, 0.0005, 0.01, 0.75, -0.1, 0.03)),
+    "fisheye": Lens((400.0, 405.0), CENTRE, (-0.01, 0.02, -0.005, 0.001), is_fisheye=True),
+}
+#: A camera 1.5 m above the ground that looks along x, 10 degrees down: its axes in the ground frame.
+TURN = Rotation.from_euler("y", 10, degrees=True) * Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+ROTATION = TURN.inv().as_matrix()
+TRANSLATION = -ROTATION @ np.array([0.3, 0.1, 1.5])
+
+
+def by_opencv(points, lens):
+    turn = cv2.Rodrigues(ROTATION)[0]
+    given = np.array(lens.distortion)
+    if lens.is_fisheye:
+        found, _ = cv2.fisheye.projectPoints(points[:, None], turn, TRANSLATION, lens.matrix, given)
+    else:
+        found, _ = cv2.projectPoints(points[:, None], turn, TRANSLATION, lens.matrix, given)
+    return found[:, 0]
+
+
+def ground_points(count=300):
+    rng = np.random.default_rng(1)
+    along = rng.uniform(4, 30, count)
+    return np.stack([along, along * rng.uniform(-0.6, 0.6, count), np.zeros(count)], axis=1)
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+class TestAsOpenCV:
+    def test_points_in_front(self, lens):
+        points = ground_points() + [0, 0, 0.5]
+        found, in_front = project(points, lens, ROTATION, TRANSLATION)
+        assert in_front.all()
+        assert np.abs(found - by_opencv(points, lens)).max() < 1e-6
+
+    def test_distortion_is_taken_out(self, lens):
+        straight = Lens(lens.focal_px, lens.centre_px)
+        points = ground_points()
+        distorted = by_opencv(points, lens)
+        assert np.abs(lens.undistort(distorted) - by_opencv(points, straight)).max() < 1e-4
+
+    def test_metres_on_the_ground(self, lens):
+        points = ground_points()
+        plane = np.reshape(ground_homography(lens, ROTATION, TRANSLATION, np.eye(3)), (3, 3))
+        straight = lens.undistort(by_opencv(points, lens))
+        x, y, w = plane @ np.column_stack([straight, np.ones(len(points))]).T
+        assert (w > 0).all()
+        assert np.abs(np.stack([x / w, y / w], 1) - points[:, :2]).max() < 1e-3
+
+    def test_points_behind(self, lens):
+        found, in_front = project(np.array([[-5.0, 0, 0], [5, 0, 0]]), lens, ROTATION, TRANSLATION)
+        assert in_front.tolist() == [False, True]
+        assert np.isnan(found).all(axis=1).tolist() == [True, False]
+
+    def test_no_points(self, lens):
+        assert project(np.empty((0, 3)), lens, ROTATION, TRANSLATION)[0].shape == (0, 2)
+        assert lens.undistort(np.empty((0, 2))).shape == (0, 2)
+
+
+def test_points_beyond_the_edge_of_a_lens_are_nowhere():
+    """A polynomial folds back: OpenCV draws a point 70 degrees to the side into the picture."""
+    lens = LENSES["plumb_bob"]
+    aside = np.array([[5.0, 5 * np.tan(np.radians(70)), 0]])
+    folded = by_opencv(aside, lens)
+    assert not np.isfinite(folded).all() or np.abs(lens.undistort(folded) - folded).max() < 1e5
+    assert np.isnan(project(aside, lens, ROTATION, TRANSLATION)[0]).all()
+    assert np.isfinite(project(aside * [1, 0.2, 1], lens, ROTATION, TRANSLATION)[0]).all()
+
+
+def test_pixels_of_another_picture():
+    """The camera has moved by 7 pixels to the right and 2 down since: its lens bends what it sees now."""
+    lens = LENSES["plumb_bob"]
+    moved = lens.after(np.array([[1.0, 0, 7], [0, 1, 2]]))
+    xy = np.array([[100.0, 200], [640, 360], [1200, 700]])
+    assert moved.undistort(xy) == pytest.approx(lens.undistort(xy + [7, 2]))
+    assert moved.distort(lens.undistort(xy + [7, 2])) == pytest.approx(xy, abs=1e-4)
+    again = moved.after(np.array([[2.0, 0, 1], [0, 2, 0]]))
+    assert again.undistort(xy / 4) == pytest.approx(lens.undistort(xy / 2 + [8, 2]))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"focal_px": (0.0, 1.0)},
+        {"focal_px": (float("nan"), 1.0)},
+        {"distortion": (0.1,) * 6},
+        {"distortion": (float("inf"), 0.0, 0.0, 0.0)},
+        {"distortion": (0.1,) * 5, "is_fisheye": True},
+    ],
+)
+def test_lenses_that_are_none(bad):
+    with pytest.raises(McaptrackError):
+        Lens(**{"focal_px": FOCAL, "centre_px": CENTRE, **bad})
+
+
+def test_a_camera_below_the_ground():
+    with pytest.raises(McaptrackError, match=r"the camera is 2\.00 m below the ground"):
+        ground_homography(LENSES["none"], ROTATION, -ROTATION @ np.array([0, 0, -2.0]), np.eye(3))

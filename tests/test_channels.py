@@ -39,7 +39,6 @@ def payload(draw: random.Random, most: int) -> bytes:
 
 
 def recording(path: Path, seed: int, compression: CompressionType = CompressionType.ZSTD) -> Path:
-    """Messages of channels of different rates and sizes, nearly in the order of time."""
     draw = random.Random(seed)
     events = [(n * 1000, "/fast", payload(draw, 8)) for n in range(400)]
     events += [(n * 50_000 + 7, "/large", payload(draw, 9000)) for n in range(8)]
@@ -57,7 +56,6 @@ def recording(path: Path, seed: int, compression: CompressionType = CompressionT
 
 
 def expected(path: Path) -> dict[str, list[tuple[int, bytes]]]:
-    """Times and payloads by topic, as mcap reads them."""
     out: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in TOPICS}
     with path.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():

@@ -174,7 +174,6 @@ HEAD = "frame,id,x,y,w,h,class"
 
 
 def table(folder, name, kinds, separator=","):
-    """A table of one object of each class, 90 pixels apart, in ten frames."""
     rows = [f"{t},{k},{90 * k},{t},40,80,{kind}" for t in range(10) for k, kind in enumerate(kinds)]
     (folder / name).write_text("\n".join([HEAD, *rows]).replace(",", separator))
     return folder / name

@@ -73,8 +73,6 @@ def place(tmp_path_factory) -> Path:
 
 
 class TestErrors:
-    """An error is one line and exit code 1, and changes no file."""
-
     CASES = {
         "ingest nothing.mp4": "nothing.mp4 does not exist",
         "ingest text.mp4": "text.mp4 can't be read as a video",

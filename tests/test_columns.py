@@ -245,7 +245,6 @@ def test_columns_equal_what_mcap_ros2_reads() -> None:
 
 
 def damaged(draw: random.Random, payload: bytes, has_head: bool) -> bytes:
-    """A payload that was cut, lengthened or changed."""
     out = bytearray(payload)
     how = draw.choice(["cut", "bytes", "length", "longer", "noise"])
     if how == "cut":

@@ -263,7 +263,6 @@ def the_query(page: str, part: str) -> str:
 
 
 def asked(folder: Path, query: str) -> Rows:
-    """What DuckDB answers, in a folder with tables."""
     with chdir(folder), duckdb.connect() as connection:
         connection.execute(PRELUDE)
         return [list(row) for row in connection.sql(query).fetchall()]

@@ -63,7 +63,6 @@ def detections(boxes: list[np.ndarray] = BOXES) -> list[Frame]:
 
 
 def written(path: Path, made: Provenance, frames: list[Frame], schema: Any = DETECTIONS) -> Path:
-    """Write a log of boxes."""
     topic = f"/camera/{'tracks' if schema is TRACKS else 'detections'}"
     with log.create(path) as writer:
         number = writer.add_channel(topic, (schema.name, "protobuf", schema.descriptor), "protobuf", made.to_metadata())
@@ -74,7 +73,6 @@ def written(path: Path, made: Provenance, frames: list[Frame], schema: Any = DET
 
 @pytest.fixture(scope="module")
 def template(tmp_path_factory) -> Path:
-    """A log of boxes that were ingested, after a run."""
     folder = tmp_path_factory.mktemp("boxes")
     lines = [
         f"{number},-1,{','.join(f'{value:.2f}' for value in box)},0.9,-1,-1,-1"

@@ -339,7 +339,6 @@ def place(tmp_path) -> Path:
 
 
 def without_views(opened) -> set[str]:
-    """The topics of a log but for what is drawn of them."""
     return {topic for topic in opened.channels if not topic.endswith(("/view/scene", "/view/tf"))}
 
 

@@ -272,7 +272,6 @@ def test_boxes_on_the_ground_give_what_a_table_gives(site):
 
 
 def robot(path: str, schema: str, messages: list[dict[str, Any]]) -> None:
-    """A recording of JSON messages of one type."""
     with recorder(Path(path)) as writer:
         channel = writer.add_channel("/robot/things", (schema, "jsonschema", b"{}"))
         for number, message in enumerate(messages):
@@ -660,8 +659,6 @@ def test_what_a_command_changes_in_the_process_is_undone(site, tracked):
 
 
 class Format:
-    """A format of numbers; ``breaks`` is the law that it breaks."""
-
     in_space = False
 
     def __init__(self, breaks: str = "") -> None:

@@ -83,7 +83,6 @@ def fields(table):
 
 
 def ns(table, name):
-    """A column of times, as nanoseconds."""
     return table.column(name).cast("timestamp[ns]").cast("int64").to_pylist()
 
 

@@ -31,7 +31,6 @@ pytestmark = pytest.mark.usefixtures("never_waits")
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """A folder with three files, which are logs as far as a fleet is concerned."""
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.mcap").write_text(name)
     return tmp_path
@@ -212,7 +211,6 @@ print(json.dumps(done.counts))
 
 
 def start(folder: Path) -> subprocess.Popen[str]:
-    """A fleet in a process of its own."""
     command = [sys.executable, "-c", SCRIPT, str(folder)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

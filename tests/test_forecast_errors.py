@@ -406,7 +406,6 @@ def smoothed_past(xy: np.ndarray) -> np.ndarray:
 
 
 def of_track(frames: list[Frame], number: int) -> dict[int, np.ndarray]:
-    """The predicted positions of a track by frame."""
     rows = {frame.index: frame.rows[frame.rows["track_id"] == number] for frame in frames}
     return {k: np.stack([one["x_m"], one["y_m"]], axis=-1) for k, one in rows.items() if len(one)}
 

@@ -32,7 +32,6 @@ def place(tmp_path, monkeypatch) -> Path:
 
 
 def fault() -> str:
-    """The one line that `doctor` prints about the fault."""
     outcome = call("doctor", "-q")
     assert (outcome.code, outcome.out) == (1, "")
     (line,) = outcome.err.splitlines()

@@ -63,7 +63,6 @@ def all_streamed(path: Path) -> object:
 
 
 def facts(path: Path) -> object:
-    """What is read without reading messages."""
     with log.read(path) as opened:
         places = [[found.tolist() for found in opened.places(topic)] for topic in "abc"]
         return opened.metadata("about"), opened.attachment("notes.txt"), opened.fingerprint(), places

@@ -36,7 +36,6 @@ def test_opcodes_are_those_of_the_stock_library():
 
 
 def summary_of(path: Path):
-    """The summary as the stock reader has it."""
     with path.open("rb") as stream:
         return make_reader(stream).get_summary()
 

@@ -90,7 +90,6 @@ def server() -> Iterator[Any]:
 
 
 def _run(server: Any, folder: Path, line: str, out: str, err: str) -> tuple[int, str]:
-    """The exit code, and what was printed to the streams that are files."""
     for name in ("out", "err"):
         (folder / name).unlink(missing_ok=True)
     case = {"folder": str(folder), "words": shlex.split(line), "streams": [out, err]}

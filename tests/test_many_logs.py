@@ -21,7 +21,6 @@ pytestmark = pytest.mark.usefixtures("never_waits")
 
 @pytest.fixture
 def folder(template, tmp_path, monkeypatch) -> Path:
-    """A working folder with a folder of two logs that are up to date."""
     (tmp_path / "logs" / "deep").mkdir(parents=True)
     for name in ("logs/a.mcap", "logs/deep/b.mcap"):
         shutil.copy(template, tmp_path / name)

@@ -27,7 +27,6 @@ def tails(*parts: float) -> Tails:
 
 
 def drawn(rng: np.random.Generator, cov: np.ndarray, shape: tuple[float, float, float], count: int) -> np.ndarray:
-    """Errors (count, 2) of a mixture, drawn part by part."""
     weight, narrow, wide = shape
     scale = np.where(rng.random(count) < weight, wide, narrow)
     return np.sqrt(scale)[:, None] * rng.multivariate_normal([0, 0], cov, count)

@@ -27,7 +27,6 @@ from tests.tiers import one_in, thorough
 
 @pytest.fixture
 def folder(template, tmp_path, monkeypatch) -> Path:
-    """The working folder of a command, with a log of its own."""
     shutil.copy(template, tmp_path / "a.mcap")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -43,12 +42,10 @@ class Stage:
     chosen: tuple[tuple[str, str], ...] = ()
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters that are options, with their defaults."""
         options = [field.name for field in fields(self.transform) if not field.metadata.get("context")]
         return {name: getattr(self.transform, name) for name in options}
 
     def others(self) -> dict[str, Any]:
-        """Return a value other than the default for each parameter."""
         hints = get_type_hints(type(self.transform))
         out = {}
         for field in fields(self.transform):
@@ -57,7 +54,6 @@ class Stage:
         return out
 
     def made(self, path: Path) -> dict[str, Any]:
-        """Return the parameters in the provenance of the channel of this stage."""
         said = provenance_of(path, self.target).parameters
         return {name: value for name, value in said.items() if name in self.parameters()}
 
@@ -95,7 +91,6 @@ def as_settings(values: dict[str, Any], transform: Any) -> dict[str, Any]:
 
 
 def flags(values: dict[str, Any]) -> list[str]:
-    """Write settings as options of a command line."""
     out = []
     for name, value in values.items():
         if name == "set":
@@ -107,12 +102,10 @@ def flags(values: dict[str, Any]) -> list[str]:
 
 
 def text_of(value: Any) -> str:
-    """Write a setting as the value of an environment variable."""
     return " ".join(value) if isinstance(value, list) else str(value)
 
 
 def toml(command: str, values: dict[str, Any]) -> str:
-    """Write values as a table of mcaptrack.toml."""
     lines = [f"{name.replace('_', '-')} = {toml_value(value)}" for name, value in values.items()]
     return "\n".join([f"[{command}]", *lines]) + "\n"
 

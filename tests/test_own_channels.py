@@ -81,7 +81,6 @@ def assert_equal(found: Any, wanted: np.ndarray) -> None:
 
 
 def by_time(rows: np.ndarray) -> dict[int, np.ndarray]:
-    """The rows of each time, in the order of the array."""
     return {t_ns: rows[rows["t_ns"] == t_ns] for t_ns in sorted(set(rows["t_ns"].tolist()))}
 
 
@@ -218,8 +217,6 @@ def _without_class(rows: Any) -> Any:
 
 @dataclass
 class Fix:
-    """A position of a receiver."""
-
     t_ns: int
     lat: Annotated[float, "deg"]
     lon: float | None = field(default=None, metadata={"unit": "deg", "doc": "east of Greenwich"})

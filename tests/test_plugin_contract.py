@@ -212,8 +212,6 @@ def state() -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class Changing:
-    """A tracker that changes the process at its third frame."""
-
     change: str = ""
     reads: ClassVar = DETECTIONS
     writes: ClassVar = {"": TRACKS}

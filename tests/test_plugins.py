@@ -121,7 +121,6 @@ def place(template, tmp_path, monkeypatch) -> Iterator[Path]:
 
 
 def install(version: str = "1.5", text: str = MODULE) -> None:
-    """Put the package there, or another version of it in its place."""
     shutil.rmtree("site", ignore_errors=True)
     Path("site").mkdir()
     Path("site/own.py").write_text(text)
@@ -347,8 +346,6 @@ def test_tune_names_a_tracker_that_fails(place):
 
 
 class TestOptionsOfPredictors:
-    """The own parameters of a predictor are options of ``predict``, wherever options are set."""
-
     def variances(self) -> set[float]:
         return set(rows("/camera/predictions")["cov_xx_m2"])
 

@@ -41,7 +41,6 @@ def log_of(path: Path, offset: float = 0.0) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
-    """All that is in a folder: files with their content, and folders."""
     return {
         str(entry.relative_to(folder)): entry.read_bytes() if entry.is_file() else None for entry in folder.rglob("*")
     }

@@ -41,7 +41,6 @@ class Nearest:
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch) -> Path:
-    """A folder that stands for installed packages, with one that has a tracker."""
     folder = tmp_path / "site"
     (folder / "own_trackers").mkdir(parents=True)
     (folder / "own_trackers" / "__init__.py").write_text(PLUGIN)

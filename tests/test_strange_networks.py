@@ -366,7 +366,6 @@ def test_the_outputs_of_predictors_are_those_of_this_process_to_the_bit(monkeypa
 
 
 def strange_processes(pid: int) -> list[int]:
-    """The processes of networks that a process has started."""
     children = [Path(f"{thread}/children").read_text().split() for thread in Path(f"/proc/{pid}/task").iterdir()]
     return [int(one) for some in children for one in some if "networks.serving" in _command(int(one))]
 

@@ -36,7 +36,6 @@ STEP_NS = 400_000_000
 
 
 def walkers(count: int = 6, ticks: int = 80, noise_m: float = 0.01, seed: int = 1) -> list[Frame]:
-    """People on parallel straight lines, each 8 m from the next, measured with noise."""
     rng = np.random.default_rng(seed)
     out = []
     for tick in range(ticks):
