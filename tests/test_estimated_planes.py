@@ -517,14 +517,6 @@ def test_noise_and_hidden_people_change_the_scale_little_over_random_cameras():
     assert np.max(np.abs(off)) < 0.12
 
 
-def test_the_height_of_people_gives_the_scale():
-    boxes, _ = View(5.0, 20.0).boxes(300, seed=1)
-    small, tall = fitted(boxes), fitted(boxes, person_m=3.4)
-    assert tall.camera_height_m == pytest.approx(2 * small.camera_height_m)
-    assert tall.plane.boxes_to_metres(boxes) == pytest.approx(2 * small.plane.boxes_to_metres(boxes))
-    assert tall.pitch_deg == small.pitch_deg
-
-
 def test_all_numbers_of_a_fit_are_values_of_json():
     said = fitted(View(5.0, 20.0).boxes(300, seed=1)[0]).to_json()
     assert said["boxes"] + 0.0 == pytest.approx(300, abs=40)
