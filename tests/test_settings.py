@@ -23,7 +23,7 @@ from tests.tiers import one_in
 COMMANDS = GROUP.commands
 #: Arguments of commands, as far as they need any.
 ARGUMENTS = {"drop": ["x.mcap", "/a"], "demo": [], "doctor": []}
-EVERY_COMMAND, SOME_COMMANDS = (pytest.mark.parametrize("command", one_in(count, sorted(COMMANDS))) for count in (2, 6))
+EVERY_COMMAND, SOME_COMMANDS = (pytest.mark.parametrize("command", one_in(count, sorted(COMMANDS))) for count in (4, 9))
 
 
 @pytest.fixture(autouse=True)
