@@ -26,7 +26,7 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import Retrack, RetrackByConsistency, Sample
 from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors
 from mcaptrack.transforms.retrack.assignments import Tracks
-from tests.clothes import BLUE, RED, two_who_turn_back
+from tests.clothes import BLUE, RED, UNTIL_S, two_who_turn_back
 from tests.commands import call, done
 
 
@@ -82,6 +82,23 @@ def test_people_in_the_same_clothes_are_judged_by_motion_alone():
     facts = looks.model_card().facts
     assert facts["appearance"] == "not used"
     assert float(facts["separation"]) < 0.75
+
+
+def sides(transform: Retrack, frames) -> list[list[int]]:
+    """The tracks from left to right some time before and some time after they met."""
+    tracks = [offline.rows for offline, *_ in transform(frames) if len(offline.rows) == 2]
+    at = tracks[15], tracks[-15]
+    return [rows["track_id"][np.argsort(rows["x_m"])].tolist() for rows in at]
+
+
+def test_input_ids_that_were_exchanged_are_put_right_by_colours():
+    """A tracker follows the motion: it keeps ids 1 and 2, each for the other one. It had lost both before."""
+    ids_since = ((0.0, (5, 6)), (4.8, (1, 2)), (UNTIL_S, (2, 1)), (22.8, (7, 8)))
+    frames, descriptors = two_who_turn_back(RED, BLUE, ids_since)
+    (left, right), passed = sides(Retrack(), frames)
+    assert passed == [right, left]
+    before, after = sides(Retrack(descriptors=descriptors), frames)
+    assert before == after
 
 
 def patch(*colours: tuple[int, int, int]) -> np.ndarray:

@@ -23,7 +23,7 @@ from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.pinhole import Lens, ground_homography, project
 from mcaptrack.geometry.plane import GroundPlane, assumed_plane, plane_at
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
-from mcaptrack.schema import Frame
+from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.resampling import is_observed_at, resample
 from mcaptrack.sources.demo import demo_scene
 from tests.worlds import tracks_at
@@ -53,6 +53,10 @@ class TestGroundPlane:
         np.testing.assert_allclose(
             self.oblique.pixels_to_metres(self.oblique.metres_to_pixels(places)), places, atol=1e-6
         )
+
+    def test_there_is_no_ground_above_the_horizon_and_none_behind_the_camera(self):
+        assert np.isnan(self.oblique.pixels_to_metres(np.array([[480.0, -400.0]]))).all()
+        assert np.isnan(self.oblique.metres_to_pixels(np.array([[0.0, -30.0]]))).all()
 
     def test_foot_and_centre_by_hand(self):
         plain = (0.1, 0, 0, 0, 0.1, 0, 0, 0, 1)
@@ -241,6 +245,14 @@ class TestResample:
             (0, 1, 0.0), (0, 2, 5.0), (5, 1, 0.5), (5, 2, 5.5), (10, 1, 1.0), (10, 2, 6.0), (20, 1, 2.0), (20, 2, 7.0),
         ]  # fmt: skip
         assert [row[:3] for row in self.at([0, 5, 10, 20])] == wanted
+
+    @given(st.lists(st.integers(0, 100), min_size=1).map(sorted))
+    def test_at_their_own_times_rows_stay_as_they_are_and_of_one_time_the_last(self, times):
+        frames = [Frame(t, k, tracks_at({3: (t * 0.1, k * 7.3)})) for k, t in enumerate(times)]
+        last = {frame.t_ns: TRACKS.codec.encode(frame.rows) for frame in frames}
+        out, at = resample(frames, np.array(list(last)), 1000)
+        assert at.tolist() == list(range(len(last)))
+        assert TRACKS.codec.encode(out) == b"".join(last.values())
 
     def test_looking_is_known_between_frames_that_are_close(self):
         frames, times = np.array([0, 10, 50]), np.array([-1, 0, 5, 10, 30, 50, 51])

@@ -12,6 +12,7 @@ import pytest
 from mcaptrack import log
 from mcaptrack.evaluation.aligned import make_matchup
 from mcaptrack.evaluation.metrics import score, summary
+from mcaptrack.geometry import kalman
 from mcaptrack.geometry.affine import IDENTITY, move_boxes, move_points
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath, Verdict, poses_of
@@ -80,6 +81,24 @@ def test_a_camera_that_only_shakes_is_left_alone_unless_it_is_asked_for():
     for use, count in (("auto", 20), ("off", 20), ("on", 1)):
         tracker = TRACKERS["sort"](camera_path=path, camera_motion=use, min_hits_s=0.0, max_age_frames=0)
         assert len({one for (frame,) in tracker(frames) for one in ids(frame)}) == count, use
+
+
+def test_states_of_filters_move_as_boxes_do():
+    rng = np.random.default_rng(5)
+    boxes = np.column_stack([rng.uniform(0, 300, (6, 2)), rng.uniform(10, 90, (6, 2))])
+    state = np.empty((kalman.STATE_ROWS, 6))
+    kalman.start(state, kalman.measure(boxes.T))
+    kalman.correct(state, kalman.measure((boxes + 1.0).T))
+    before, motion = state.copy(), np.array([[0.0, -2.0, 5.0], [2.0, 0.0, 7.0]])  # a quarter turn, twice as large
+    left, top, right, bottom = kalman.corners(before)
+    kalman.move(state, motion)
+    wanted = move_boxes(motion, np.stack([left, top, right - left, bottom - top], axis=1))
+    assert pytest.approx(wanted[:, :2]) == kalman.corners(state)[:2].T
+    assert pytest.approx(wanted[:, 2:]) == (kalman.corners(state)[2:] - kalman.corners(state)[:2]).T
+    speed = before[4:6]
+    assert state[4:7] == pytest.approx(np.stack([-2 * speed[1], 2 * speed[0], 4 * before[6]]))
+    variances = np.array([4.0, 16.0, 1.0] * 3)[:, None]  # of centre, area and ratio: place, covariance, rate
+    assert state[8:] == pytest.approx(variances * before[8:])
 
 
 DATA = os.environ.get("MCAPTRACK_DATA", "")

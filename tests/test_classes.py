@@ -152,6 +152,17 @@ def test_each_class_is_retracked_as_if_it_were_alone(method):
     assert {1, 2} == {int(one) for frame in together[0] for one in frame.rows["class_id"]}
 
 
+@every_method
+def test_numbers_of_classes_have_no_influence_on_retracking(method):
+    places = {1: 9, 2: 1}
+    frames = both(*samples_of_two_classes(4))
+    found, wanted = (list(zip(*method(some), strict=True)) for some in (renamed(frames, places), frames))
+    for output, others in zip(found, wanted, strict=True):
+        has_classes = "class_id" in output[0].rows.dtype.names
+        for frame, other in zip(output, renamed(others, places) if has_classes else others, strict=True):
+            assert_same_rows(frame.rows, other.rows)
+
+
 def walk_in_two_pieces(second):
     """A walk with a new id, and perhaps another class, in its middle."""
 

@@ -88,6 +88,14 @@ def test_without_ground_truth_forecasts_are_compared_with_later_tracks(truth):
     assert (score["later_scored"], score["later_fde_m"]) == (1, 1.0)
 
 
+def test_ground_truth_of_another_time_is_ignored():
+    tracks = walk(straight_on, 12)
+    later = [frame._replace(t_ns=frame.t_ns + ns(100)) for frame in tracks]
+    made = predictions(lambda n: {1: [(0.5 * (n + k), 1.0) for k in (1, 2, 3)]} if n == 5 else {}, 12)
+    _, score = only(find_forecast_errors(made, tracks, later, tracks))
+    assert np.isnan(score["false_forecasts"])
+
+
 @pytest.mark.parametrize(
     ("step_s", "steps", "wanted"), [(0.5, 3, 2.0), (1.0, 2, 1.0), (1.0, 1, 1.0), (0.25, 3, None), (2.0, 3, None)]
 )

@@ -88,14 +88,11 @@ def test_cases_by_hand(truth, tracks, wanted):
     assert {name: found[name] for name in wanted} == pytest.approx(wanted)
 
 
-def test_the_two_evaluators_differ_where_they_are_known_to():
-    """After a miss py-motmetrics keeps the old pair though another track stands nearer; TrackEval takes the nearer."""
-    truth = [{1: 0.0}] * 3
-    tracks = [{5: 0.0}, {7: 90.0}, {5: 0.8, 6: 0.0}]
-    assert summary(score(matchup(truth, tracks), "trackeval"))["IDSW"] == 1
-    assert summary(score(matchup(truth, tracks), "motmetrics"))["IDSW"] == 0
-    tracks[1] = {}  # TrackEval skips frames without any track, so that the pair before still counts
-    assert summary(score(matchup(truth, tracks), "trackeval"))["IDSW"] == 0
+def test_people_of_other_parts_of_a_sequence_are_in_no_count():
+    """The ids of a matchup may be those of a whole sequence, of which it has a part."""
+    first = np.array([0])
+    found = metrics.clear(Matchup((first,), (first,), (np.ones((1, 1)),), 0.5, n_ground_truth=3, n_tracks=2))
+    assert [int(found[name]) for name in ("MT", "PT", "ML", "GT")] == [1, 0, 0, 1]
 
 
 @pytest.mark.parametrize("rules", ["trackeval", "motmetrics"])
@@ -175,21 +172,26 @@ def straight(who: int, steps: range, offset: float = 0.0, lane: float = 0.0) -> 
 
 
 class TestDisplacement:
-    def test_errors_by_hand(self):
-        """One person at x = step; the track lies 0.1 m beside, the forecast misses by 1, 2 and 2 m."""
-        truth = positions(straight(1, range(10)))
-        tracks = positions({5: {step: (step, 0.1) for step in range(10)}})
-        made = forecasts(predicted(4, 5, [(5.0, 1.0), (6.0, 2.0), (9.0, 0.0)]))
+    def test_people_without_a_whole_future_or_past_count_nowhere(self):
+        truth = positions(
+            straight(1, range(10)) | straight(2, range(6), lane=5.0) | straight(3, range(3, 10), lane=9.0)
+        )
+        tracks = positions(straight(7, range(10)) | straight(8, range(6), lane=5.0))
+        made = forecasts(
+            predicted(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), predicted(4, 8, [(9.0, 9), (9.0, 9), (9.0, 9)])
+        )
         result = displacement(truth, tracks, made)
-        found = result.summary()
-        assert found["ADE_m"] == pytest.approx(5 / 3)
-        assert found["FDE_m"] == pytest.approx(2.0)
-        assert found["ADE_squared_m2"] == pytest.approx(3.0)
-        assert found["recall"] == 1.0
-        # 1 m is within 1.18 sigma and 2 m are not; 2 m are within 2.15 and 2.45 sigma.
-        assert [found[f"coverage_{level}"] for level in (50, 90, 95)] == pytest.approx([1 / 3, 1, 1])
-        assert result.d_obs_m2.tolist() == pytest.approx([0.01])
-        assert found["false_forecasts_per_frame"] == 0.0
+        assert result.people == 1
+        assert result.summary()["ADE_m"] == 0.0
+        assert result.false_forecasts == 0  # 8 is person 2, who leaves: neither for nor against
+
+    def test_forecasts_of_tracks_without_positions_are_not_judged(self):
+        """Neither of an id that is not in the tracks, nor at a time at which the track is not there."""
+        truth, tracks = positions(straight(1, range(10))), positions(straight(7, range(10)))
+        for step, who in ((4, 6), (4, 8), (-1, 7), (12, 7)):
+            found = displacement(truth, tracks, forecasts(predicted(step, who, [(5.0, 0), (6.0, 0), (7.0, 0)])))
+            assert found.false_forecasts == 0
+            assert found.ade_m.tolist() == []
 
     def test_errors_by_step_are_of_pairs_below_the_threshold(self):
         """Two people; one track is 1 m off and so d_obs is 1 m^2, the other 2 m off, which is 4 m^2."""
@@ -204,6 +206,14 @@ class TestDisplacement:
         assert sorted(result.errors_by_step(5.0).tolist()) == [[0.5, 1.5, 2.5], [7.0, 8.0, 9.0]]
         assert result.errors_by_step(1.0).tolist() == []  # less than the threshold, not equal to it
         assert result.summary()["recall"] == 0.5
+
+    def test_consistency_of_consecutive_forecasts_by_hand(self):
+        truth = positions(straight(1, range(10)))
+        made = forecasts(
+            predicted(4, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]), predicted(5, 7, [(6.0, 1), (7.0, 2), (8.0, 9)])
+        )
+        found = displacement(truth, positions(straight(7, range(10))), made).summary()
+        assert found["consistency_m"] == pytest.approx(1.5)
 
     def test_a_mean_with_a_value_that_is_not_finite_is_none(self):
         truth, made = positions(straight(1, range(10))), forecasts(predicted(4, 5, [(5.0, 0), (6.0, 0), (7.0, 2)]))
@@ -446,18 +456,6 @@ def test_input_that_cannot_be_compared_is_refused_not_scored_as_zero():
         scored(truth, later)
     with pytest.raises(McaptrackError, match="the ground truth of x is empty"):
         scored(walk(lambda n: {}, 5), truth)
-
-
-def test_several_sequences_are_combined():
-    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
-    sequences = [
-        EvaluationInput(name, truth, [Candidate("t", None, tracks)])
-        for name, tracks in (("a", truth), ("b", truth[:5]))
-    ]
-    rows = [result.to_json() for result in evaluate(sequences, METRES).results]
-    assert [(row["sequence"], row["FN"]) for row in rows] == [("a", 0), ("b", 5), ("COMBINED", 5)]
-    assert rows[2]["MOTA"] == pytest.approx(0.75)
-    assert rows[2]["GT"] == 2
 
 
 def test_forecasts_are_compared_with_the_true_future():

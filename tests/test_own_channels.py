@@ -141,6 +141,15 @@ class TestRoundTrip:
                 assert channel.schema is schema
         assert len(digests) == 1
 
+    def test_names_that_json_takes_for_one_are_kept_apart(self, tmp_path):
+        rows = np.array([(5, 1.0, 2.0)], [("t_ns", "i8"), ("a1", "f8"), ("a_1", "f8")])
+        with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+            opened.write("/a", rows)
+        with (tmp_path / "a.mcap").open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            ((*_, decoded),) = reader.iter_decoded_messages()
+        assert (decoded.rows[0].a1, decoded.rows[0].a_1) == (1.0, 2.0)
+
     def test_frames_keep_their_numbers_and_those_without_rows(self, tmp_path):
         rows = np.array([(1.5,)], [("speed", "f8")])
         with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:

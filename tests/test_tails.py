@@ -14,7 +14,7 @@ from mcaptrack.evaluation.metrics.displacement import ellipse_levels
 from mcaptrack.geometry.mixtures import Tails, mass_within, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
-from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative
+from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative, running
 from mcaptrack.predictors.tail_calibration import (
     Learned,
     TailCalibration,
@@ -54,6 +54,13 @@ class TestTable:
         assert ((table.wide_weight > 0) & (table.wide_weight < 1)).all()
         assert table.short[0] > 1
         assert (table.coasting > 1).all()
+
+    def test_at_other_times_it_is_between_its_neighbours(self):
+        table = table_of("red")
+        (one,) = zip(*table.at(np.array([0.6])), strict=True)
+        for value, part in zip(one[1:], table[1:], strict=True):
+            assert min(part[:2]) <= value <= max(part[:2])
+        assert table.at(np.array([0.1, 9.0])).wide_scale.tolist() == pytest.approx(table.wide_scale[[0, -1]].tolist())
 
 
 def test_a_mixture_is_found_again_from_its_samples():
@@ -103,6 +110,11 @@ class TestFollowing:
         assert (smaller < -2).all()
         assert (larger > 0.5).all()
 
+    def test_errors_are_no_smaller_than_positions_are_known(self):
+        tiny = [np.full(1000, 1e-4)] * 3
+        assert self.followed(tiny, least=0.2).narrow_scale.tolist() == pytest.approx([0.2] * 3, rel=0.01)
+        assert (self.followed(tiny).narrow_scale < 0.01).all()
+
 
 class TestCalibration:
     def forecasts(
@@ -145,6 +157,12 @@ class TestCalibration:
         for level in (0.5, 0.95):
             assert (levels <= level).mean() == pytest.approx(level, abs=0.04)
 
+    def test_they_are_no_smaller_than_noise_allows(self):
+        self.forecasts(0.001, noise_m=0.3)
+        nothing = Forecast(np.zeros((1, 3, 2)), np.tile(np.eye(2), (1, 3, 1, 1)))
+        made, tails = self.calibration(np.array([60]), np.array([-1]), nothing, np.zeros((1, 8, 2)), np.zeros(1, bool))
+        assert (made.cov[0, :, 0, 0] * tails.narrow_scale[0] > 0.27 * 0.3**2).all()
+
     def test_tracks_that_are_lost_count_as_some_large_errors(self):
         weights = []
         for passing in (0, 200):
@@ -174,6 +192,10 @@ class TestCalibration:
         assert np.isfinite(tails).all()
         assert np.isfinite(made.cov).all()
         assert (tails.narrow_scale[0] < 0.5).all()
+
+    def test_ellipses_are_of_true_positions_though_measured_ones_have_noise(self):
+        levels = self.forecasts(0.3, noise_m=0.3, steps=200)[100:]
+        assert (levels <= 0.5).mean() == pytest.approx(0.5, abs=0.08)
 
     @pytest.mark.parametrize("together", [7, 60])
     def test_many_times_at_once_give_the_same_as_one_by_one(self, together):
@@ -389,6 +411,13 @@ def test_what_moves_and_people_are_predicted_as_without_velocities(class_id: int
         np.testing.assert_allclose(given[name], without[name], rtol=1e-6)
 
 
+@pytest.mark.usefixtures("as_predicted")
+def test_a_car_that_has_just_stopped_may_go_on():
+    """Its history still has the way that it went."""
+    stopped, stands = (axis_m(last_forecast(3, speed, True, stops=3)) for speed in (8.0, 0.0))
+    assert stopped > 3 * stands
+
+
 # Ellipses corrected by what they have held, and the noise of positions as far as tracks show it
 
 
@@ -408,6 +437,12 @@ def held(size: float, count: int) -> tuple[Tails, np.ndarray]:
 
 
 class TestLevels:
+    def test_without_errors_and_with_those_that_were_expected_mixtures_stay(self):
+        for size, count in ((1.0, 0), (1.0, 20_000)):
+            found, _ = held(size, count)
+            for one, given in zip(found, SHAPE, strict=True):
+                assert one.tolist() == pytest.approx(given.tolist(), rel=0.05)
+
     @pytest.mark.parametrize("size", [0.7, 1.5, 2.0])
     def test_after_many_errors_ellipses_hold_half_of_them(self, size):
         found, half = held(size, 20_000)
@@ -422,6 +457,16 @@ class TestLevels:
         assert np.ptp(np.log(found.narrow_scale / SHAPE.narrow_scale)) == pytest.approx(0)
         assert 0.5 <= found.narrow_scale[0] / SHAPE.narrow_scale[0] <= 2
         assert 1 <= found.wide_scale[0] / SHAPE.wide_scale[0] <= 2
+
+    def test_large_errors_only_make_the_wide_part_larger(self):
+        less, more = held(0.5, 20_000)[0], held(3.0, 20_000)[0]
+        assert less.wide_scale.tolist() == SHAPE.wide_scale.tolist()
+        assert (less.narrow_scale < 0.8 * SHAPE.narrow_scale).all()
+        assert (more.wide_scale > 1.2 * SHAPE.wide_scale).all()
+
+    def test_few_errors_change_little(self):
+        few, more, many = (squared_radius(0.5, held(2.0, count)[0])[0] for count in (2, 30, 2000))
+        assert few < 1.15 * squared_radius(0.5, SHAPE)[0] < more < many
 
     def test_steps_with_errors_of_their_own_are_corrected_more(self):
         step, half = np.repeat(np.arange(AHEAD), 30), np.tile(np.geomspace(0.2, 20, 30), AHEAD)
@@ -439,6 +484,14 @@ class TestLevels:
         for number, one in enumerate(counts):
             for part, alone in zip(together, correct(AT_ONE_TIME, one[None]), strict=True):
                 assert part[number].tolist() == alone[0].tolist()
+
+
+def test_running_sums_are_those_of_each_time_after_the_one_before():
+    before, kept, new = np.array([4.0, 1.0]), np.array([0.5, 0.1, 1.0]), np.arange(6.0).reshape(3, 2)
+    sums, last = running(before, kept, new)
+    assert sums.tolist() == [[2.0, 1.5], pytest.approx([2.2, 3.15]), pytest.approx([6.2, 8.15])]
+    assert last.tolist() == sums[-1].tolist()
+    assert running(before, kept[:0], new[:0])[1].tolist() == [4, 1]
 
 
 class TestNoise:
@@ -488,6 +541,13 @@ class TestNoise:
         alone = [noise.variances_m2(np.ones(1, int), none, one) for one in past]
         assert np.array(together).T.tolist() == [[white.item(), lasting.item()] for white, lasting in alone]
 
+    def test_what_is_older_counts_less(self):
+        noise, passed, none = PositionNoise(STEP_S), np.array([1]), np.zeros(60 * 93, int)
+        for white_m in (0.3, 0.1):
+            noise.variances_m2(passed, none, self.paths(white_m, 0.0).reshape(-1, 8, 2))
+        later = noise.variances_m2(np.array([1000]), none[:60], self.paths(0.1, 0.0)[0])
+        assert np.sqrt(later[0].item()) == pytest.approx(0.1, rel=0.35)
+
     def test_errors_of_noise_that_lasts_are_smaller_near_and_larger_far_than_they_seem(self):
         """A person stands; a forecast is the last measured position, and is compared with measured ones later."""
         past = self.paths(0.0, 0.3).reshape(-1, 8, 2)
@@ -497,6 +557,16 @@ class TestNoise:
         assert found.added.tolist() == pytest.approx(added, abs=0.03)
         assert found.added[0] < 0 < found.added[-1]
         assert (found.least <= np.var(off[0])).all()
+
+    def test_of_white_noise_all_of_it_is_added(self):
+        found = self.effect(self.paths(0.2, 0.0).reshape(-1, 8, 2))
+        assert found.added[0].tolist() == pytest.approx([0.04] * 12, rel=0.25)
+
+    def test_few_positions_and_unknown_ones_say_nothing(self):
+        noise = PositionNoise(STEP_S)
+        for past in (np.full((40, 8, 2), np.nan), np.empty((0, 8, 2)), np.zeros((9, 8, 2))):
+            found = noise.follow(np.array([1]), np.zeros(len(past), int), past, 3)
+            assert found.added.tolist() == found.least.tolist() == [[0, 0, 0]]
 
     def effect(self, past: np.ndarray) -> NoiseOfErrors:
         """The effect of noise on the errors of forecasts of 12 steps, after all of these pasts."""
