@@ -41,7 +41,7 @@ LINES = sorted(
 
 
 @pytest.fixture(scope="module")
-def template(template, tmp_path_factory) -> Path:
+def evil(template, tmp_path_factory) -> Path:
     """A folder with files and a log of evil names. Not to be changed."""
     folder = Path(shutil.copytree(template.parent, tmp_path_factory.mktemp("evil"), dirs_exist_ok=True))
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
@@ -91,7 +91,7 @@ def _replaced(text: str) -> str:
 
 
 @pytest.fixture
-def run(template, tmp_path, monkeypatch):
+def run(evil, tmp_path, monkeypatch):
     """Run a command line in a fresh copy of the template, with evil names for its files and channels."""
     monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
     monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)
@@ -99,7 +99,7 @@ def run(template, tmp_path, monkeypatch):
 
     def tried(line: str) -> Outcome:
         folder = next(folders)
-        shutil.copytree(template, folder)
+        shutil.copytree(evil, folder)
         monkeypatch.chdir(folder)
         words = [_evil(word) for word in shlex.split(line)]
         logs = any(word.endswith(".mcap") for word in words)
@@ -136,9 +136,9 @@ def test_names_of_files_that_are_not_there(command, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
-def test_a_name_that_is_no_text(tmp_path, template):
+def test_a_name_that_is_no_text(tmp_path, evil):
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/a\xff\x1b.mcap"))
-    shutil.copy(template / RENAMED["a.mcap"], path)
+    shutil.copy(evil / RENAMED["a.mcap"], path)
     for command in ("info", "check", "evaluate", "run"):
         outcome = call(command, path)
         assert outcome.code in (0, 1)
