@@ -147,7 +147,6 @@ def test_files_that_cannot_be_scored_are_refused(tmp_path):
 
 
 def test_positions_in_metres_are_no_boxes(tmp_path):
-    """Boxes in pixels against positions in metres: nothing can be compared, and that is said."""
     truth = tmp_path / "gt.txt"
     truth.write_text("".join(f"{n} 1 {n / 10} 2.0\n" for n in range(1, 11)))
     code, _, err = call("evaluate", write(tmp_path / "t.txt", *FOUND), "--truth", truth)

@@ -570,7 +570,6 @@ def test_boxes_that_cannot_tell_are_refused(boxes, words):
 
 @pytest.mark.parametrize("seen_m", [1.2, 1.4])
 def test_people_who_sit_among_others_are_refused(seen_m):
-    """Of people who sit and people who stand neither are most: metres along the view can be wrong by a factor of two."""
     boxes, _ = View(4.0, 20.0).boxes(600, seed=2)
     boxes[::2, 1] += boxes[::2, 3] * (1 - seen_m / 1.7)
     boxes[::2, 3] *= seen_m / 1.7

@@ -432,7 +432,6 @@ def test_a_worker_that_was_ended_while_it_waited_is_replaced(monkeypatch):
 
 
 def test_a_worker_that_does_not_start_is_named_as_that(monkeypatch):
-    """Not as a log that took long."""
     monkeypatch.setattr(child, "_CODE", "import signal; signal.pause()")
     monkeypatch.setattr(child, "_START_S", 0.3)
     monkeypatch.setattr(child, "_GRACE_S", 0.2)

@@ -152,7 +152,6 @@ def evaluated(truth, tracks, made):
 
 @given(scene=scenes())
 def test_constant_velocity_beside_forecasts_is_what_its_predictor_scores(scene):
-    """Forecasts by ``cv`` score what stands beside them, and what stands beside others at the same times is the same."""
     truth, tracks, _ = scene
     made = [frame for (frame,) in Predict(predictor="cv", horizon_s=3 * STEP_S)(tracks)]
     moved = [frame._replace(rows=frame.rows.copy()) for frame in made]

@@ -76,7 +76,6 @@ class TestPredictors:
     @every_linear
     @pytest.mark.parametrize("known", [1, 3, 8])
     def test_variance_equals_that_of_simulated_motion(self, name, known):
-        """Simulate the motion model: the variance of the errors equals that of the forecast."""
         rng, step, fine, people = np.random.default_rng(known), 0.4, 8, 20_000
         speed = rng.normal(0, SPEED_M_PER_S, people)
         place, path = np.zeros(people), []
