@@ -23,7 +23,7 @@ from mcaptrack.fleet.expansion import NamedLog, outputs_in
 from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.fleet.worker import Reply, Request
 from tests import fleet_tasks
-from tests.awaiting import until
+from tests.awaiting import is_running, until
 from tests.tiers import one_in
 
 pytestmark = pytest.mark.usefixtures("never_waits")
@@ -215,14 +215,6 @@ def start(folder: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def is_running(process: int) -> bool:
-    """Whether a process runs; one that has ended may wait for long to be noticed by the process that adopted it."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 def wait_for(path: Path) -> None:
     until(lambda: path.exists() and path.read_text())
 
@@ -272,7 +264,7 @@ def test_a_signal_ends_workers_and_gives_claims_up(folder, number):
         ended.communicate()
     assert ended.returncode in (-signal.SIGINT, 1, 143)
     assert not list(folder.glob(".*"))
-    assert not is_running(int((folder / "d.hangs").read_text()))
+    until(lambda: not is_running(int((folder / "d.hangs").read_text())))
 
 
 def test_the_first_failure_can_end_it(folder):

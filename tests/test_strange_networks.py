@@ -27,6 +27,7 @@ from mcaptrack.predictors.onnx import Onnx
 from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import OnnxDetector
+from tests.awaiting import is_running
 from tests.onnx_graphs import (
     FLOAT,
     INPUTS,
@@ -375,13 +376,6 @@ def _command(pid: int) -> str:
         return Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:
         return ""
-
-
-def is_running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def at_work(pid: int) -> int:
