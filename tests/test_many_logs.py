@@ -67,7 +67,7 @@ def test_lines_of_json_say_when_what_ended_and_how(folder, monkeypatch):
     (folder / "logs" / "noise.mcap").write_bytes(b"noise")
     monkeypatch.setattr(common, "PROGRESS_S", 0.0)
     began = time.time() - 0.001  # times have milliseconds
-    code, out, err = call("export", "logs", "--jobs", "2", "--log-format", "json", "--json")
+    code, out, err = call("export", "logs", "--jobs", "1", "--log-format", "json", "--json")
     said, results = [json.loads(line) for line in err.splitlines()], json.loads(out)["results"]
     assert code == 3
     assert all({"time", "level", "event", "command", "message"} <= line.keys() for line in said)
