@@ -222,14 +222,13 @@ def test_over_a_missing_recording_no_id_is_taken_over_and_none_is_used_twice(par
         assert ids.min() > (known if name == "tracks" else largest)
 
 
-@pytest.fixture(scope="module")
-def of_three_cameras(tmp_path_factory) -> list[Path]:
-    """Two recordings of three cameras, one after the other, made of one. Tests must not change them."""
-    folder = tmp_path_factory.mktemp("three")
-    whole = write_log(folder / "whole.mcap", CAMERAS[:3])
+@pytest.fixture
+def several(tmp_path) -> list[Path]:
+    """Two recordings of three cameras, one after the other, made of one."""
+    whole = write_log(tmp_path / "whole.mcap", CAMERAS[:3])
     paths = []
     for number, (begin_s, end_s) in enumerate([(0.0, 9.2), (9.2, 99.0)]):
-        paths.append(Path(shutil.copy(whole, folder / f"{number}.mcap")))
+        paths.append(Path(shutil.copy(whole, tmp_path / f"{number}.mcap")))
         with mcaptrack.open(paths[-1]) as opened:
             for camera in CAMERAS[:3]:
                 topic = f"/{camera.name}/detections"
@@ -237,11 +236,6 @@ def of_three_cameras(tmp_path_factory) -> list[Path]:
                 times = [t_ns for t_ns in np.unique(rows["t_ns"]) if begin_s <= t_ns / NS < end_s]
                 opened.write(topic, [boxes_of(rows[rows["t_ns"] == t_ns], int(t_ns)) for t_ns in times], replace=True)
     return paths
-
-
-@pytest.fixture
-def several(of_three_cameras, tmp_path) -> list[Path]:
-    return [Path(shutil.copy(path, tmp_path)) for path in of_three_cameras]
 
 
 def boxes_of(rows: np.ndarray, t_ns: int) -> Frame:

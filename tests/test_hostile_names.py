@@ -12,15 +12,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from mcaptrack.cli.text import printable
-from mcaptrack.location import sibling
-from mcaptrack.log import results_path
-from mcaptrack.log.journal import journal_of
 from mcaptrack.sources import demo
 from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, Outcome, call, done, press_ctrl_c
@@ -41,7 +36,7 @@ LINES = sorted(
 
 
 @pytest.fixture(scope="module")
-def evil(template, tmp_path_factory) -> Path:
+def template(template, tmp_path_factory) -> Path:
     """A folder with files and a log of evil names. Not to be changed."""
     folder = Path(shutil.copytree(template.parent, tmp_path_factory.mktemp("evil"), dirs_exist_ok=True))
     done("ingest", folder / "clip.mp4", "--truth", folder / "truth.txt", "-o", folder / "fresh.mcap")
@@ -91,7 +86,7 @@ def _replaced(text: str) -> str:
 
 
 @pytest.fixture
-def run(evil, tmp_path, monkeypatch):
+def run(template, tmp_path, monkeypatch):
     """Run a command line in a fresh copy of the template, with evil names for its files and channels."""
     monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(2.0, seed=seed))
     monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)
@@ -99,7 +94,7 @@ def run(evil, tmp_path, monkeypatch):
 
     def tried(line: str) -> Outcome:
         folder = next(folders)
-        shutil.copytree(evil, folder)
+        shutil.copytree(template, folder)
         monkeypatch.chdir(folder)
         words = [_evil(word) for word in shlex.split(line)]
         logs = any(word.endswith(".mcap") for word in words)
@@ -136,9 +131,9 @@ def test_names_of_files_that_are_not_there(command, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
-def test_a_name_that_is_no_text(tmp_path, evil):
+def test_a_name_that_is_no_text(tmp_path, template):
     path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/a\xff\x1b.mcap"))
-    shutil.copy(evil / RENAMED["a.mcap"], path)
+    shutil.copy(template / RENAMED["a.mcap"], path)
     for command in ("info", "check", "evaluate", "run"):
         outcome = call(command, path)
         assert outcome.code in (0, 1)
@@ -164,71 +159,3 @@ def test_nothing_but_one_module_prints():
         found = re.findall(r"(?<![\w.])print\(|\bConsole\(|\bstd(?:out|err)\.write|\becho\(", path.read_text())
         allowed = {"command.py": 1, "text.py": 3, "common.py": 2, "group.py": 1, "query.py": 1}.get(path.name, 0)
         assert len(found) == allowed, (path.name, found)
-
-
-# Names are bytes: logs whose names are as long as they can be, not UTF-8, or look like URLs or options
-
-
-NAMES = {
-    "not UTF-8": os.fsdecode(b"a\xff\xfe.mcap"),
-    "a time": "walk-12:00.mcap",
-    "as long as can be": "n" * 250 + ".mcap",
-    "letters of two bytes": "\u00e9" * 124 + "xx.mcap",
-    "a store": "s3:foo.mcap",
-    "an address": "http:x.mcap",
-    "lines": "a\nb\x1b[2J.mcap",
-    "an option": "--json.mcap",
-    "no room for a journal": "n" * 243 + ".mcap",
-    "a blank": " ",
-}
-
-
-@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
-@pytest.mark.parametrize("name", one_in(len(NAMES), NAMES.values()), ids=NAMES)
-def test_logs_of_all_names_are_used_as_others_are(template, tmp_path, monkeypatch, name):
-    monkeypatch.chdir(tmp_path)
-    shutil.copy(template, name)
-    for line in (
-        ["info", "--json"],
-        ["track", "--force"],
-        ["run"],
-        ["export", "--force"],
-        ["query", "select count(*) > 0 as many from tracks", "--json"],
-        ["export", "--format", "rosbag2"],
-        ["report"],
-        ["zones", "draw"],
-        ["recover"],
-        ["track", "--sidecar", "--force"],
-        ["drop", "/camera/predictions*"],
-        ["info", "--json"],
-    ):
-        words = [*line[:1], *(["draw"] if "draw" in line else []), f"./{name}", *(w for w in line[1:] if w != "draw")]
-        outcome = call(*words)
-        assert outcome.code == 0, (line, outcome)
-        assert all(text.isprintable() for text in (outcome.out + outcome.err).split("\n")), (line, outcome)
-        if line[0] == "info":
-            assert json.loads(outcome.out)["results"][0]["log"] == name
-    assert results_path(Path(name)).is_file()
-    assert not list(tmp_path.glob(".*.part"))
-
-
-@pytest.mark.parametrize("command", ["info", "run", "drop", "query", "export"])
-def test_names_that_no_file_can_have_are_refused_in_one_line(command):
-    outcome = call(command, "n" * 300 + ".mcap", *(["select 1"] if command in ("query", "drop") else []))
-    assert (outcome.code, outcome.out, outcome.err.count("\n")) == (1, "", 1)
-    assert "File name too long" in outcome.err
-
-
-@given(
-    st.sets(
-        st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_size=1, max_size=60), min_size=1, max_size=9
-    )
-)
-def test_names_beside_a_log_fit_and_differ(parts):
-    names = {part * (250 // len(part.encode())) for part in parts if part.strip(".")}
-    paths = [Path(f"{name}.mcap") for name in names]
-    for beside in (results_path, journal_of, lambda path: sibling(path, ".report.html")):
-        found = [beside(path).name for path in paths]
-        assert len(set(found)) == len(paths)
-        assert all(len(name.encode()) <= 255 for name in found)
-    assert sibling(Path("a/b.c.mcap"), ".tables") == Path("a/b.c.tables")

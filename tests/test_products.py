@@ -126,9 +126,11 @@ def leave_nothing_undone(work: Work, tmp_path: Path, step: int) -> None:
     assert kills >= 3
 
 
-@pytest.mark.parametrize(("name", "step"), [("run", 41), ("export to a bag", 5), ("ingest", 2)])
-def test_killed_at_some_calls_the_next_command_completes_what_is_owed(name, step, tmp_path):
-    leave_nothing_undone(WORKS[name], tmp_path, step)
+@pytest.mark.parametrize("name", one_in(2, sorted(WORKS.keys() - {"run with another re-tracker"})))
+def test_killed_at_some_calls_the_next_command_completes_what_is_owed(name, tmp_path):
+    leave_nothing_undone(
+        WORKS[name], tmp_path, {"ingest": 2, "export": 29, "export to a bag": 5, "retrack": 11}.get(name, 41)
+    )
 
 
 def fleet_over(folder: Path) -> None:
