@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -16,3 +17,11 @@ def until(ask: Callable[[], T], bound_s: float = 600.0) -> T:
         assert time.monotonic() < end, "it never comes to this"
         time.sleep(0.01)
     return answer
+
+
+def is_running(process: int) -> bool:
+    """Whether a process runs; one that has ended may wait for long to be noticed by the process that adopted it."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -55,7 +55,6 @@ class Tab:
     _session: str | None = None
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Call a method of the protocol, and wait for its result."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         message |= {"sessionId": self._session} if self._session else {}
@@ -93,7 +92,6 @@ class Tab:
         return message
 
     def open(self, address: str) -> None:
-        """Open a page, and wait until it is loaded."""
         self._loaded = False
         self._contexts.clear()
         self.call("Page.navigate", url=address)
@@ -127,7 +125,6 @@ class Tab:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
 
     def pdf(self, path: Path) -> None:
-        """Print the page."""
         path.write_bytes(base64.b64decode(self.call("Page.printToPDF", printBackground=False)["data"]))
 
 

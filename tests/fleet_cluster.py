@@ -17,15 +17,12 @@ _SETTINGS = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0", "DASK_DISTRIB
 
 
 class Running(NamedTuple):
-    """The address of a scheduler, and its process."""
-
     address: str
     process: subprocess.Popen[bytes]
 
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Running]:
-    """A cluster, until the end of the block."""
     file = folder / "scheduler.json"
     scheduler = _start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", file)
     workers = []

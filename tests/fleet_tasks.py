@@ -18,8 +18,6 @@ _BLOCK = 300_000_000
 
 @dataclass(frozen=True)
 class Seen:
-    """What a task has read, and in which process."""
-
     text: str
     process: int
     is_up_to_date: bool = False
@@ -73,5 +71,4 @@ def touch(log, *, output=None, add="", progress=None) -> Seen:
 
 
 def parity(log, *, progress=None) -> str:
-    """Return the name of a file."""
     return Path(log).name

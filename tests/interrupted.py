@@ -36,7 +36,6 @@ def contents(path: Path) -> dict[str, list[bytes]]:
 
 
 def add_results(path: Path, seed: int, count: int) -> None:
-    """Replace the results of a log by random ones."""
     noise = random.Random(seed)
     with log.read(path) as opened:
         there = [topic for topic in opened.channels if topic.startswith("/result")]

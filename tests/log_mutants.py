@@ -44,7 +44,6 @@ def joined(records: list[Record]) -> bytes:
 
 
 def content(body: bytes) -> bytes:
-    """What is in a chunk."""
     length = struct.unpack_from("<I", body, 28)[0]
     data = body[32 + length + 8 :]
     return zstandard.decompress(data) if length else data

@@ -54,7 +54,6 @@ def write_with_views(opened: log.Log, prefix: str, made: dict[str, Made]) -> dic
 
 
 def provenance_of(path: Path | str, topic: str) -> Provenance:
-    """How a channel that mcaptrack wrote was made."""
     with log.read(Path(path)) as opened:
         made = Provenance.from_metadata(opened.channel(topic).metadata)
     assert made is not None
@@ -70,7 +69,6 @@ class Recorder(Writer):
 
 @contextmanager
 def recorder(path: Path, profile: str = "", library: str = "other-software", **options: Any) -> Iterator[Recorder]:
-    """Record a log with the stock writer, as other software does."""
     with path.open("wb") as stream:
         writer = Recorder(stream, **options)
         writer.start(profile, library)

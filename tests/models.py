@@ -64,7 +64,6 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def serve() -> tuple[ThreadingHTTPServer, str]:
-    """A server, and its address."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
     return server, f"http://127.0.0.1:{server.server_port}"

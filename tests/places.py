@@ -32,7 +32,6 @@ class Drawn:
 
     @property
     def matrix(self) -> np.ndarray:
-        """The projection (3, 4)."""
         ahead = np.array([6.0, 5.0, 0.8]) - self.eye
         ahead /= np.linalg.norm(ahead)
         right = np.cross(ahead, [0, 0, 1.0])
@@ -123,7 +122,6 @@ def _boxes_of(rows: np.ndarray, t_ns: int) -> Frame:
 
 
 def fused(path: Path, topic: str = "/world/detections") -> dict[int, np.ndarray]:
-    """Rows by time in ns."""
     with mcaptrack.open(path) as log:
         rows = log.array("sightings" if topic.endswith("sightings") else "detections", topic)
     return {int(t_ns): rows[rows["t_ns"] == t_ns] for t_ns in np.unique(rows["t_ns"])}

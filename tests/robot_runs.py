@@ -18,7 +18,6 @@ OBJECTS = {
 
 
 def place(number: int, stamp_ns: int, start_ns: int) -> np.ndarray:
-    """Where an object is in the map."""
     _, at, velocity, _, _ = OBJECTS[number]
     return np.array(at) + np.array(velocity) * ((stamp_ns - start_ns) / NS_PER_S)
 
@@ -36,7 +35,6 @@ def passing_robot(shots: int = 25) -> Robot:
 
 
 def truth_of(robot: Robot) -> str:
-    """The truth as a table."""
     lines = ["t_ns,id,class,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad"]
     for shot in robot.shots:
         for number, (name, _, _, heading, size) in OBJECTS.items():

@@ -307,8 +307,6 @@ def write(
 def by_ros(
     make: Callable[[int, Sequence[Seen]], tuple[Ros, bytes]], late_ns: int = LATE_NS
 ) -> Callable[[Recorder], Callable[[int, Shot], None]]:
-    """Boxes as messages of ROS on /lidar/boxes."""
-
     def begin(writer: Recorder) -> Callable[[int, Shot], None]:
         channel = None
 
@@ -330,8 +328,6 @@ def by_ros(
 def by_foxglove(
     make: Callable[[int, Sequence[Seen]], bytes], encoding: str = "protobuf", name: str = "foxglove.SceneUpdate"
 ) -> Callable[[Recorder], Callable[[int, Shot], None]]:
-    """Boxes as messages of Foxglove on /lidar/boxes."""
-
     def begin(writer: Recorder) -> Callable[[int, Shot], None]:
         record = schema_record(name) if encoding == "protobuf" else (name, "jsonschema", b"{}")
         channel = writer.add_channel("/lidar/boxes", record, encoding)

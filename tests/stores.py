@@ -59,7 +59,6 @@ class Store:
         self._app, inner.app = inner.app, self._answer
 
     def put(self, key: str, content: bytes | Path) -> str:
-        """Write an object, as another program does; returns its URL."""
         data = content.read_bytes() if isinstance(content, Path) else content
         self.client.put_object(Bucket=BUCKET, Key=key, Body=data)
         return f"s3://{BUCKET}/{key}"
@@ -72,7 +71,6 @@ class Store:
         return [found["Key"] for found in self.client.list_objects_v2(Bucket=BUCKET).get("Contents", [])]
 
     def clear(self) -> None:
-        """Remove all objects."""
         for key in self.names():
             self.client.delete_object(Bucket=BUCKET, Key=key)
 
@@ -90,7 +88,6 @@ class Store:
 
     @contextmanager
     def counted(self) -> Iterator[list[Request]]:
-        """The requests of the block."""
         start = len(self.requests)
         found: list[Request] = []
         yield found

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import itertools
+from itertools import groupby
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.spatial.transform import Rotation
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry import kalman
-from mcaptrack.geometry.assignment import assign, max_weight_matching, solve
+from mcaptrack.geometry.assignment import assign, max_weight_matching
 from mcaptrack.geometry.boxes import iou, overlapping
 from mcaptrack.geometry.clocks import FrameClock, seconds_to_ns
-from mcaptrack.geometry.histories import Histories, Holt, fill_gaps, rebuild_positions
+from mcaptrack.geometry.histories import fill_gaps
+from mcaptrack.geometry.neighbours import near_pairs
+from mcaptrack.geometry.pinhole import Lens, ground_homography, project
 from mcaptrack.geometry.plane import GroundPlane, assumed_plane, plane_at
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.resampling import is_observed_at, resample
 from mcaptrack.sources.demo import demo_scene
@@ -92,7 +98,6 @@ class TestGroundPlane:
 
 
 def best_by_trying(cost: np.ndarray, gate: float) -> tuple[int, float]:
-    """The most pairs within the gate, and the least total cost of so many."""
     rows, columns = cost.shape
     best = (0, 0.0)
     for count in range(1, min(rows, columns) + 1):
@@ -119,12 +124,6 @@ def test_a_far_pair_takes_no_place_from_a_near_one():
     assert [part.tolist() for part in assign(cost, 3.0)] == [[0, 1], [0, 1]]
     cost = np.array([[np.nan, 2.0], [np.inf, 1.5]])
     assert [part.tolist() for part in assign(cost, 3.0)] == [[1], [1]]
-
-
-@given(hnp.arrays(float, st.tuples(st.integers(1, 4), st.integers(1, 4)), elements=st.floats(-5, 5)))
-def test_the_solver_finds_the_least_total(cost):
-    rows, columns = solve(cost)
-    assert cost[rows, columns].sum() == pytest.approx(solve_by_hand(cost))
 
 
 @given(hnp.arrays(float, (4, 5), elements=st.integers(0, 6).map(float)), st.integers(0, 5))
@@ -186,17 +185,6 @@ class TestFrameClock:
         assert {clock.tick(seconds_to_ns(1 + n / 10 + off)) for n, off in enumerate(jitter)} == {1}
         assert clock.frames(0.5) in (4, 5, 6, 7)
 
-    def test_time_that_stands_still_or_runs_back_counts_a_frame(self):
-        clock = FrameClock()
-        assert [clock.tick(t) for t in (100, 100, 50, 150)] == [1, 1, 1, 1]
-
-    def test_stamps_that_come_early_and_late_in_turn_count_one_frame_each(self):
-        """As at 24 frames a second on a clock of 60: 33 ms, 50 ms, 33 ms."""
-        clock = FrameClock()
-        times = np.cumsum([33, 50] * 30)
-        assert {clock.tick(int(t)) for t in times} == {1}
-        assert clock.stretch == 1.0
-
     def test_a_new_frame_rate_is_noticed_once_and_jitter_never(self):
         rng = np.random.default_rng(2)
         times = np.cumsum([1000] * 60 + [2000] * 60).astype(float)
@@ -211,40 +199,6 @@ class TestFrameClock:
 
 
 class TestBoxFilter:
-    def test_it_is_the_seven_state_filter_of_the_paper(self):
-        """The decoupled filter against plain matrices."""
-        rng = np.random.default_rng(1)
-        boxes = np.abs(rng.normal(50, 10, (30, 4))) + np.arange(30)[:, None] * [1.5, 0.5, 0.2, 0.3]
-        measured = kalman.measure(boxes.T)
-        move = np.eye(7) + np.diag([1.0, 1, 1], 4)[:7, :7]
-        see = np.eye(4, 7)
-        noise_seen = np.diag([1.0, 1, 10, 10])
-        noise_move = np.diag([1, 1, 1, 1, 0.01, 0.01, 1e-4])
-        mean = np.append(measured[:, 0], [0, 0, 0])
-        cov = np.diag([10.0, 10, 10, 10, 1e4, 1e4, 1e4])
-        ours = np.empty((kalman.STATE_ROWS, 1))
-        kalman.start(ours, measured[:, :1])
-        for number in range(1, 30):
-            mean, cov = move @ mean, move @ cov @ move.T + noise_move
-            kalman.predict(ours)
-            if number % 4:  # some frames are missed
-                seen = measured[:, number]
-                gain = cov @ see.T @ np.linalg.inv(see @ cov @ see.T + noise_seen)
-                mean, cov = mean + gain @ (seen - see @ mean), (np.eye(7) - gain @ see) @ cov
-                kalman.correct(ours, measured[:, number : number + 1])
-            np.testing.assert_allclose(ours[:7, 0], mean, rtol=1e-9)
-            of_centre, of_area, of_ratio = ours[8:, 0].reshape(3, 3).T
-            np.testing.assert_allclose(of_centre, [cov[0, 0], cov[0, 4], cov[4, 4]], rtol=1e-9)
-            np.testing.assert_allclose(of_area, [cov[2, 2], cov[2, 6], cov[6, 6]], rtol=1e-9)
-            np.testing.assert_allclose(of_ratio, [cov[3, 3], 0, 0], rtol=1e-9)
-
-    @given(hnp.arrays(float, (4, 3), elements=st.floats(1, 500)))
-    def test_boxes_there_and_back(self, boxes):
-        state = np.empty((kalman.STATE_ROWS, 3))
-        kalman.start(state, kalman.measure(boxes))
-        corners = kalman.corners(state)
-        np.testing.assert_allclose(np.concatenate([corners[:2], corners[2:] - corners[:2]]), boxes, rtol=1e-9)
-
     def test_an_area_that_would_vanish_stops_shrinking(self):
         state = np.empty((kalman.STATE_ROWS, 1))
         kalman.start(state, kalman.measure(np.array([[0.0], [0], [4], [4]])))
@@ -266,42 +220,12 @@ class TestBoxFilter:
 
 
 class TestHistories:
-    def test_pasts_slide_and_strangers_are_forgotten(self):
-        memory = Histories(3)
-        memory.push(np.array([7, 3]), np.array([[0.0, 0], [10, 10]]))
-        past, known = memory.push(np.array([3]), np.array([[11.0, 11]]))
-        assert known.tolist() == [[False, True, True]]
-        np.testing.assert_array_equal(past[0, 1:], [[10, 10], [11, 11]])
-        memory.push(np.empty(0, int), np.empty((0, 2)), steps=2)
-        assert memory.ids.tolist() == [3]
-        past, known = memory.push(np.array([7]), np.array([[5.0, 5]]), steps=50)
-        assert memory.ids.tolist() == [7]
-        assert known.tolist() == [[False, False, True]]
-
-    def test_ids_come_back_in_the_order_they_were_asked(self):
-        memory = Histories(2)
-        past, _ = memory.push(np.array([9, 2, 5]), np.array([[9.0, 0], [2, 0], [5, 0]]))
-        assert past[:, -1, 0].tolist() == [9, 2, 5]
-
     def test_holes_are_filled_linearly(self):
         nan = np.nan
         xy = np.array([[[nan, nan], [0, 0], [nan, nan], [nan, nan], [3, 6.0]]])
         filled, known = fill_gaps(xy, np.isfinite(xy[..., 0]))
         np.testing.assert_allclose(filled[0], [[0, 0], [0, 0], [1, 2], [2, 4], [3, 6]])
         assert known.tolist() == [4]
-
-    def test_holt_by_hand(self):
-        """Eq. 3 with alpha = beta = 0.5 on displacements 1, 2, 4."""
-        holt = Holt(0.5, 0.5)
-        level, trend = holt.start(np.array([[1.0, 0.0]]))
-        level, trend = holt.step(level, trend, np.array([[2.0, 0.0]]))
-        assert (level[0, 0], trend[0, 0]) == (1.5, 0.25)  # .5 * 2 + .5 * (1 + 0);  .5 * (1.5 - 1) + .5 * 0
-        level, trend = holt.step(level, trend, np.array([[4.0, 0.0]]))
-        assert (level[0, 0], trend[0, 0]) == (2.875, 0.8125)  # .5 * 4 + .5 * 1.75;  .5 * 1.375 + .5 * .25
-
-    def test_the_past_is_rebuilt_backwards_from_now(self):
-        past = rebuild_positions(np.array([[10.0, 0.0]]), np.array([[[1.0, 0], [2, 0], [3, 0]]]))
-        assert past[0, :, 0].tolist() == [4, 5, 7, 10]
 
 
 class TestResample:
@@ -322,14 +246,6 @@ class TestResample:
         ]  # fmt: skip
         assert [row[:3] for row in self.at([0, 5, 10, 20])] == wanted
 
-    def test_what_lies_inside_a_hole_was_not_seen(self):
-        assert [row[3] for row in self.at([5, 10, 20])] == [True, False, True, False, False, False]
-
-    def test_a_hole_that_is_too_long_stays_one(self):
-        assert self.at([20], hole=20) == []
-        assert [row[1] for row in self.at([5], hole=20)] == [1]
-        assert self.at([-5, 41]) == []  # before the first and after the last
-
     @given(st.lists(st.integers(0, 100), min_size=1).map(sorted))
     def test_at_their_own_times_rows_stay_as_they_are_and_of_one_time_the_last(self, times):
         frames = [Frame(t, k, tracks_at({3: (t * 0.1, k * 7.3)})) for k, t in enumerate(times)]
@@ -342,3 +258,147 @@ class TestResample:
         frames, times = np.array([0, 10, 50]), np.array([-1, 0, 5, 10, 30, 50, 51])
         assert is_observed_at(frames, times, 20).tolist() == [False, True, True, True, False, True, False]
         assert not is_observed_at(np.empty(0, int), times, 20).any()
+
+
+# Groups laid end to end, and pairs of near points: against plain loops
+
+
+GROUPS = st.lists(st.tuples(st.integers(-9, 9), st.integers(0, 4)), max_size=8)
+
+
+@given(GROUPS, st.sampled_from([1, 3, -2]))
+def test_ranges_are_those_of_python_laid_end_to_end(groups, step):
+    starts, counts = [start for start, _ in groups], [count for _, count in groups]
+    wanted = [n for start, count in groups for n in range(start, start + step * count, step)]
+    assert ragged_range(starts, counts, step).tolist() == wanted
+    assert group_index(counts).tolist() == [k for k, count in enumerate(counts) for _ in range(count)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 1), st.integers(0, 1), st.integers(0, 3)), max_size=12))
+def test_runs_are_those_of_groupby_and_end_at_long_gaps(members):
+    one, other, gaps = np.array(members, int).reshape(-1, 3).T
+    runs = [len(list(run)) for _, run in groupby(members, key=lambda member: member[:2])]
+    starts = run_starts(one, other)
+    assert np.diff(np.append(np.flatnonzero(starts), len(members))).tolist() == runs
+    assert (np.flatnonzero(run_ends(starts)) + 1).tolist() == np.cumsum(runs).tolist()
+    split = run_starts(one, other, times=np.cumsum(gaps), max_gap=2)
+    assert split.tolist() == [first or gap > 2 for first, gap in zip(starts.tolist(), gaps.tolist(), strict=True)]
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 5), st.integers(0, 5)), max_size=12))
+def test_near_pairs_are_all_pairs_of_a_group_nearer_than_the_distance(points):
+    group, *xy = np.array(points, int).reshape(-1, 3).T
+    first, second = near_pairs(group, np.stack(xy, axis=-1).astype(float), 2.0)
+    found = sorted(tuple(sorted(pair)) for pair in zip(first.tolist(), second.tolist(), strict=True))
+    assert found == [
+        (a, b)
+        for a in range(len(points))
+        for b in range(a + 1, len(points))
+        if points[a][0] == points[b][0] and np.hypot(*np.subtract(points[a][1:], points[b][1:])) < 2.0
+    ]
+
+
+# Cameras with known intrinsics, compared with OpenCV's projection
+
+
+FOCAL, CENTRE = (800.0, 790.0), (641.0, 355.0)
+LENSES = {
+    "none": Lens(FOCAL, CENTRE),
+    "four": Lens(FOCAL, CENTRE, (-0.2, 0.05, 0.001, -0.002)),
+    "plumb_bob": Lens(FOCAL, CENTRE, (-0.3, 0.1, 0.001, -0.002, -0.01)),
+    "rational": Lens(FOCAL, CENTRE, (0.4, -0.2, 0.001, 0.0005, 0.01, 0.75, -0.1, 0.03)),
+    "fisheye": Lens((400.0, 405.0), CENTRE, (-0.01, 0.02, -0.005, 0.001), is_fisheye=True),
+}
+#: A camera 1.5 m above the ground that looks along x, 10 degrees down: its axes in the ground frame.
+TURN = Rotation.from_euler("y", 10, degrees=True) * Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+ROTATION = TURN.inv().as_matrix()
+TRANSLATION = -ROTATION @ np.array([0.3, 0.1, 1.5])
+
+
+def by_opencv(points, lens):
+    turn = cv2.Rodrigues(ROTATION)[0]
+    given = np.array(lens.distortion)
+    if lens.is_fisheye:
+        found, _ = cv2.fisheye.projectPoints(points[:, None], turn, TRANSLATION, lens.matrix, given)
+    else:
+        found, _ = cv2.projectPoints(points[:, None], turn, TRANSLATION, lens.matrix, given)
+    return found[:, 0]
+
+
+def ground_points(count=300):
+    rng = np.random.default_rng(1)
+    along = rng.uniform(4, 30, count)
+    return np.stack([along, along * rng.uniform(-0.6, 0.6, count), np.zeros(count)], axis=1)
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+class TestAsOpenCV:
+    def test_points_in_front(self, lens):
+        points = ground_points() + [0, 0, 0.5]
+        found, in_front = project(points, lens, ROTATION, TRANSLATION)
+        assert in_front.all()
+        assert np.abs(found - by_opencv(points, lens)).max() < 1e-6
+
+    def test_distortion_is_taken_out(self, lens):
+        straight = Lens(lens.focal_px, lens.centre_px)
+        points = ground_points()
+        distorted = by_opencv(points, lens)
+        assert np.abs(lens.undistort(distorted) - by_opencv(points, straight)).max() < 1e-4
+
+    def test_metres_on_the_ground(self, lens):
+        points = ground_points()
+        plane = np.reshape(ground_homography(lens, ROTATION, TRANSLATION, np.eye(3)), (3, 3))
+        straight = lens.undistort(by_opencv(points, lens))
+        x, y, w = plane @ np.column_stack([straight, np.ones(len(points))]).T
+        assert (w > 0).all()
+        assert np.abs(np.stack([x / w, y / w], 1) - points[:, :2]).max() < 1e-3
+
+    def test_points_behind(self, lens):
+        found, in_front = project(np.array([[-5.0, 0, 0], [5, 0, 0]]), lens, ROTATION, TRANSLATION)
+        assert in_front.tolist() == [False, True]
+        assert np.isnan(found).all(axis=1).tolist() == [True, False]
+
+    def test_no_points(self, lens):
+        assert project(np.empty((0, 3)), lens, ROTATION, TRANSLATION)[0].shape == (0, 2)
+        assert lens.undistort(np.empty((0, 2))).shape == (0, 2)
+
+
+def test_points_beyond_the_edge_of_a_lens_are_nowhere():
+    """A polynomial folds back: OpenCV draws a point 70 degrees to the side into the picture."""
+    lens = LENSES["plumb_bob"]
+    aside = np.array([[5.0, 5 * np.tan(np.radians(70)), 0]])
+    folded = by_opencv(aside, lens)
+    assert not np.isfinite(folded).all() or np.abs(lens.undistort(folded) - folded).max() < 1e5
+    assert np.isnan(project(aside, lens, ROTATION, TRANSLATION)[0]).all()
+    assert np.isfinite(project(aside * [1, 0.2, 1], lens, ROTATION, TRANSLATION)[0]).all()
+
+
+def test_pixels_of_another_picture():
+    """The camera has moved by 7 pixels to the right and 2 down since: its lens bends what it sees now."""
+    lens = LENSES["plumb_bob"]
+    moved = lens.after(np.array([[1.0, 0, 7], [0, 1, 2]]))
+    xy = np.array([[100.0, 200], [640, 360], [1200, 700]])
+    assert moved.undistort(xy) == pytest.approx(lens.undistort(xy + [7, 2]))
+    assert moved.distort(lens.undistort(xy + [7, 2])) == pytest.approx(xy, abs=1e-4)
+    again = moved.after(np.array([[2.0, 0, 1], [0, 2, 0]]))
+    assert again.undistort(xy / 4) == pytest.approx(lens.undistort(xy / 2 + [8, 2]))
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"focal_px": (0.0, 1.0)},
+        {"focal_px": (float("nan"), 1.0)},
+        {"distortion": (0.1,) * 6},
+        {"distortion": (float("inf"), 0.0, 0.0, 0.0)},
+        {"distortion": (0.1,) * 5, "is_fisheye": True},
+    ],
+)
+def test_lenses_that_are_none(bad):
+    with pytest.raises(McaptrackError):
+        Lens(**{"focal_px": FOCAL, "centre_px": CENTRE, **bad})
+
+
+def test_a_camera_below_the_ground():
+    with pytest.raises(McaptrackError, match=r"the camera is 2\.00 m below the ground"):
+        ground_homography(LENSES["none"], ROTATION, -ROTATION @ np.array([0, 0, -2.0]), np.eye(3))

@@ -26,7 +26,6 @@ WORDS = {"query": ["select 1"]}
 
 @pytest.fixture
 def folder(template, tmp_path, monkeypatch) -> Path:
-    """A working folder with two logs and a file that is not a log."""
     for name in ("a.mcap", "z.mcap"):
         shutil.copy(template, tmp_path / name)
     (tmp_path / "broken.mcap").write_bytes(b"no log at all")

@@ -198,7 +198,6 @@ PICTURE_PX = (1280, 720)
 
 
 def sway(frame: int) -> float:
-    """By how much the scene has moved to the right in a frame, in pixels."""
     return 170 * float(np.sin(frame / 3.5) - np.sin(0))
 
 

@@ -39,7 +39,6 @@ def payload(draw: random.Random, most: int) -> bytes:
 
 
 def recording(path: Path, seed: int, compression: CompressionType = CompressionType.ZSTD) -> Path:
-    """Messages of channels of different rates and sizes, nearly in the order of time."""
     draw = random.Random(seed)
     events = [(n * 1000, "/fast", payload(draw, 8)) for n in range(400)]
     events += [(n * 50_000 + 7, "/large", payload(draw, 9000)) for n in range(8)]
@@ -57,7 +56,6 @@ def recording(path: Path, seed: int, compression: CompressionType = CompressionT
 
 
 def expected(path: Path) -> dict[str, list[tuple[int, bytes]]]:
-    """Times and payloads by topic, as mcap reads them."""
     out: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in TOPICS}
     with path.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():
@@ -229,7 +227,7 @@ def json_messages(draw: random.Random) -> Iterator[bytes]:
         yield json.dumps(message, ensure_ascii=draw.random() < 0.5).encode()
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", range(2))
 def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int
 ) -> None:
@@ -241,12 +239,12 @@ def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
         at_once += bool(columns)
         return columns
 
-    for seed in range(part * 80, part * 80 + 80):
+    for seed in range(part * 70, part * 70 + 70):
         draw = random.Random(seed)
         payloads = list(json_messages(draw)) if draw.random() < 0.5 else []
-        for _ in range(draw.choice([0, 1, 2]) if payloads else draw.choice([1, 1, 2])):
+        for odd in draw.sample(ODD, draw.choice([0, 0, 1])) + [ODD[seed % len(ODD)]] * (not payloads or seed % 3 > 0):
             place = draw.randrange(len(payloads) + 1)
-            payloads[place:place] = draw.choice(ODD)
+            payloads[place:place] = odd
         path = tmp_path / f"{seed}.mcap"
         with path.open("wb") as stream:
             writer = Writer(stream)

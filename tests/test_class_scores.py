@@ -68,21 +68,6 @@ def test_a_class_has_the_scores_that_it_has_alone_and_counts_of_all_are_sums():
     assert "class_means" not in rows["person"]
 
 
-def test_an_object_of_another_class_is_a_miss_and_a_false_positive():
-    truth = world(0)
-    tracks = [frame._replace(rows=frame.rows.copy()) for frame in truth]
-    for frame in tracks:
-        frame.rows["class_id"][frame.rows["track_id"] == 0] = 2
-    found, _ = scored(truth, tracks)
-    person, other = found["person"].to_json(), found["class 2"].to_json()
-    assert (person["FN"], person["FP"], other["FN"], other["FP"]) == (40, 0, 0, 40)
-    happened = find_events(tracks, truth, EventOptions("metres", 1.0))
-    events = EVENTS.joined([frame.rows for frame in happened.events])
-    missed, false = (events[events["kind"] == kind] for kind in (EventKind.MISS, EventKind.FALSE_TRACK))
-    assert (missed["truth_id"].tolist(), missed["frames"].tolist()) == ([0], [40])
-    assert (false["track_id"].tolist(), false["frames"].tolist()) == ([0], [40])
-
-
 def test_classes_are_the_same_where_their_names_are_whatever_their_numbers():
     truth, tracks = world(0, classes=(1, 2)), world(1, noise=0.3, classes=(9, 0))
     wanted, _ = scored(truth, world(1, noise=0.3), {2: "Cart"}, {2: "cart"})
@@ -171,7 +156,6 @@ HEAD = "frame,id,x,y,w,h,class"
 
 
 def table(folder, name, kinds, separator=","):
-    """A table of one object of each class, 90 pixels apart, in ten frames."""
     rows = [f"{t},{k},{90 * k},{t},40,80,{kind}" for t in range(10) for k, kind in enumerate(kinds)]
     (folder / name).write_text("\n".join([HEAD, *rows]).replace(",", separator))
     return folder / name

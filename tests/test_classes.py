@@ -103,20 +103,6 @@ def test_numbers_of_classes_have_no_influence(tracker):
             np.testing.assert_array_equal(one.rows[name], other.rows[name])
 
 
-@every_tracker
-def test_a_track_never_passes_to_an_object_of_another_class(tracker):
-    """The oracle is the scene: which object each box belongs to, and what that object is."""
-    frames, truth = crossing(7, count=10)
-    owners = {}
-    for frame, there, (made,) in zip(frames, truth, tracker(frames), strict=True):
-        for row in made.rows:
-            box = np.abs(frame.rows["x_px"] - row["x_px"]) + np.abs(frame.rows["y_px"] - row["y_px"])
-            owners.setdefault(int(row["track_id"]), set()).add((int(row["class_id"]), int(there[box.argmin()] % 2) + 1))
-    # Boxes move a little by the filter.
-    assert sum(len(found) == 1 for found in owners.values()) >= 0.9 * len(owners) > 5
-    assert all(len({one for one, _ in found}) == 1 for found in owners.values())
-
-
 def test_across_classes_a_track_has_the_class_of_most_of_its_detections():
     box = {"x_px": [100.0], "y_px": [50.0], "w_px": [40.0], "h_px": [120.0]}
     of = [2, 1, 1, 2, 1, 1, 1, 2]

@@ -73,8 +73,6 @@ def place(tmp_path_factory) -> Path:
 
 
 class TestErrors:
-    """An error is one line and exit code 1, and changes no file."""
-
     CASES = {
         "ingest nothing.mp4": "nothing.mp4 does not exist",
         "ingest text.mp4": "text.mp4 can't be read as a video",
@@ -192,7 +190,6 @@ def test_a_closed_terminal_ends_the_command_after_it_has_cleared_up(tmp_path, be
 
 
 def test_the_demonstration(tmp_path, monkeypatch):
-    """The test replaces the scene by a short one."""
     monkeypatch.setitem(demo.SCENES, "square", lambda seed: small_scene(seed=seed))
     monkeypatch.setattr(sys, "argv", ["mcaptrack", "demo"])
     folder = tmp_path / "d"

@@ -207,8 +207,6 @@ def test_what_changed_is_said_and_nothing_else_and_of_many_things_five_and_how_m
 
 
 class TestPairs:
-    """Which boxes are the same object, by hand."""
-
     @pytest.mark.parametrize(
         ("column", "by_px", "same"), [("x", 2.0, 1), ("x", 2.01, 0), ("y", 2.0, 1), ("y", -2.01, 0), ("w", 3.0, 0)]
     )

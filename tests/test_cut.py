@@ -57,7 +57,7 @@ def about(path: Path) -> tuple[list[tuple[str, bytes]], list[tuple[str, dict[str
 
 @pytest.mark.parametrize("options", STOCK_OPTIONS)
 @given(messages=MESSAGES, span=SPANS, topics=st.sets(st.sampled_from("abc"), min_size=1))
-@settings(max_examples=25)
+@settings(max_examples=8)
 def test_a_cut_has_the_messages_of_its_time_and_topics(tmp_path_factory, options, messages, span, topics):
     path = tmp_path_factory.mktemp("cut") / "a.mcap"
     write_stock(path, messages, **STOCK_OPTIONS[options])

@@ -22,7 +22,6 @@ QUICK = [Phase.explicit, Phase.generate]
 
 
 def decided(frames: list[Frame], transform: Retrack | None = None) -> tuple[list[Frame], list[Frame]]:
-    """The offline tracks and the decisions."""
     offline, _, _, decisions = (list(part) for part in zip(*(transform or Retrack())(frames), strict=True))
     return offline, decisions
 

@@ -23,7 +23,6 @@ from tests.worlds import ns, small_scene
 
 
 def footage(scene: SyntheticScene) -> tuple[list[Frame], list[np.ndarray]]:
-    """The brightness of a scene's pictures, and the true boxes in each."""
     shots = list(scene.shots())
     frames = [Frame(ns(shot.seconds), n, shot.image.mean(axis=2).astype(np.uint8)) for n, shot in enumerate(shots)]
     return frames, [shot.boxes for shot in shots]
@@ -87,7 +86,6 @@ STILL = KnnDetector(stabilise=False)
 
 
 def boxes_of(pictures: list[np.ndarray], detector: KnnDetector = STILL) -> list[list[list[float]]]:
-    """The boxes in each picture, ten pictures a second."""
     frames = [Frame(ns(n / 10), n, picture) for n, picture in enumerate(pictures)]
     return [columns_to_boxes(frame.rows).tolist() for (frame,) in detector(frames)]
 

@@ -258,7 +258,6 @@ def the_query(page: str, part: str) -> str:
 
 
 def asked(folder: Path, query: str) -> Rows:
-    """What DuckDB answers, in a folder with tables."""
     with chdir(folder), duckdb.connect() as connection:
         connection.execute(PRELUDE)
         for table in Path("log.tables").glob("*"):  # those that only some logs have, too

@@ -28,7 +28,6 @@ EMPTY = [
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch) -> Iterator[Path]:
-    """A working folder with a file that looks like a log; nothing in it may change."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.mcap").write_bytes(b"what was recorded")
     yield tmp_path

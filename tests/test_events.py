@@ -18,8 +18,6 @@ from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, ev
 from mcaptrack.evaluation.event_text import describe, log_messages
 from mcaptrack.evaluation.events import EventOptions, MatchRule, find_events, lifecycle_of
 from mcaptrack.pipeline.checks import describe_origin
-from mcaptrack.pipeline.runner import tally
-from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import COUNTS, EVENT_KINDS, EVENTS, TRACKS, EventKind, Frame
 from mcaptrack.schema.proto import parse
 from mcaptrack.schema.provenance import INGEST, Provenance
@@ -339,7 +337,6 @@ def place(tmp_path) -> Path:
 
 
 def without_views(opened) -> set[str]:
-    """The topics of a log but for what is drawn of them."""
     return {topic for topic in opened.channels if not topic.endswith(("/view/scene", "/view/tf"))}
 
 
@@ -577,14 +574,3 @@ def test_events_are_made_again_as_they_were_asked_for_unless_something_else_is(t
         run_watch(path, options=options)
         found = provenance_of(path, "/camera/tracks/events").parameters["asked"]
         assert found == dict(zip(names, asked_now, strict=True))
-
-
-def test_events_are_tallied_by_kind_for_each_channel():
-    kinds = [EventKind.BIRTH, EventKind.BIRTH, EventKind.MISS, EventKind.PARTED]
-    rows = EVENTS.empty(len(kinds))
-    rows["kind"] = kinds
-    made = Made(EVENTS, [Frame(0, 0, rows[:1]), Frame(1, 1, rows[1:])], Provenance("events", {}))
-    text = made._replace(drawn="foxglove.Log")
-    found = tally({"/a/events": made, "/a/events/view/log": text, "/a/counts": Made(COUNTS, [], made.provenance)})
-    counted = {"birth": 2, "miss": 1, "parted": 1}
-    assert found == {"/a": dict.fromkeys(EVENT_KINDS.values(), 0) | counted}

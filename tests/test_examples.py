@@ -17,7 +17,6 @@ NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 
 def printed(notebook: Any) -> list[str]:
-    """What each cell of code prints and gives, as text; pictures by their types."""
     out = []
     for cell in (cell for cell in notebook.cells if cell["cell_type"] == "code"):
         texts = []

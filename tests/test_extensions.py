@@ -35,6 +35,7 @@ from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources import fixed_frame
 from mcaptrack.testing import LawError
 from tests.commands import call, done
+from tests.distributions import package
 from tests.logs import provenance_of, recorder
 from tools import pages
 
@@ -48,14 +49,8 @@ TABLE = "frame,id,class,x,y,w,h\n0,1,person,10,20,30,60\n1,2,dog,90,50,40,30\n1,
 
 
 def install(folder: Path, points: dict[str, dict[str, str]], name: str = "my-trackers", version: str = "1.0") -> None:
-    """What pip leaves of a package with these entry points."""
-    info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    lines = [line for group, own in points.items() for line in (f"[{group}]", *(f"{k} = {v}" for k, v in own.items()))]
-    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
     modules = {value.partition(":")[0] for own in points.values() for value in own.values()}
-    (info / "top_level.txt").write_text("\n".join(sorted(modules)) + "\n")
+    package(folder, name, version, points, sorted(modules))
 
 
 @pytest.fixture
@@ -276,7 +271,6 @@ def test_boxes_on_the_ground_give_what_a_table_gives(site):
 
 
 def robot(path: str, schema: str, messages: list[dict[str, Any]]) -> None:
-    """A recording of JSON messages of one type."""
     with recorder(Path(path)) as writer:
         channel = writer.add_channel("/robot/things", (schema, "jsonschema", b"{}"))
         for number, message in enumerate(messages):
@@ -667,8 +661,6 @@ def test_what_a_command_changes_in_the_process_is_undone(site, tracked):
 
 
 class Format:
-    """A format of numbers; ``breaks`` is the law that it breaks."""
-
     in_space = False
 
     def __init__(self, breaks: str = "") -> None:

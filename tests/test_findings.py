@@ -33,13 +33,11 @@ def path(template, tmp_path, monkeypatch) -> Path:
 
 
 def written(path: Path, **tracks: list[Frame]) -> Path:
-    """Write a log with only these channels of tracks of a camera, by name."""
     made = {name: Provenance("retrack" if name == "retracks" else "track", {}) for name in tracks}
     return write_channels(path, {f"/camera/{name}": (TRACKS, made[name], frames) for name, frames in tracks.items()})
 
 
 def kept(path: Path) -> list[tuple[str, str]]:
-    """Return topics and codes of the warnings in the tables of a log."""
     with mcaptrack.open(path) as opened:
         rows = opened.table("warnings").to_pylist()
         assert opened.table("recordings")["warnings"].to_pylist() == [len({row["message"] for row in rows})]

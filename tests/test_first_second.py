@@ -32,7 +32,6 @@ CHANGES = {4: "identity switch", 7: "joined", 8: "parted"}
 
 
 def opened_at(link: str) -> float:
-    """The time in a link, in seconds since 1970."""
     (text,) = parse_qs(urlsplit(link).query)["time"]
     return datetime.fromisoformat(text).timestamp()
 

@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 import pytest
-import zstandard
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from grpc_tools import protoc
@@ -15,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log
@@ -83,7 +81,6 @@ def fields(table):
 
 
 def ns(table, name):
-    """A column of times, as nanoseconds."""
     return table.column(name).cast("timestamp[ns]").cast("int64").to_pylist()
 
 
@@ -166,46 +163,6 @@ def test_bytes_are_kept_where_they_are_asked_for(tmp_path, state):
     assert pq.ParquetFile(file).read().column("picture").to_pylist() == [b"\x00\xff"]
 
 
-@pytest.mark.parametrize(("encoding", "is_packed"), [("ros1", False), ("cdr", False), ("cdr", True)])
-def test_ros_messages_are_read_by_their_definition(tmp_path, encoding, is_packed):
-    """Also those that rosbag2 compressed one by one."""
-    text = ROS1_IMU
-    if encoding == "cdr":
-        text = text.replace("uint32 seq\ntime stamp", "builtin_interfaces/Time stamp").replace(
-            "\nduration", "\nbuiltin_interfaces/Duration"
-        )
-    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.LATEST)
-    store.register(get_types_from_msg(text, "robot/msg/Imu"))
-    types = store.types
-    header = {"stamp": types["builtin_interfaces/msg/Time"](sec=3, nanosec=9), "frame_id": "imu"}
-    if encoding == "ros1":
-        header["seq"] = 1
-    duration = "builtin_interfaces/msg/Duration"
-    vector = types["geometry_msgs/msg/Vector3"]
-    message = types["robot/msg/Imu"](
-        header=types["std_msgs/msg/Header"](**header),
-        angular_velocity=vector(x=0.5, y=math.nan, z=-math.inf),
-        angular_velocity_covariance=np.arange(9.0),
-        raw=np.array([1, 255], np.uint8),
-        names=["a", "b"],
-        more=[vector(x=1.0, y=2.0, z=3.0)],
-        took=types[duration](sec=-1, nanosec=5),
-    )
-    write = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
-    payload = bytes(write(message, "robot/msg/Imu"))
-    payload = zstandard.compress(payload) if is_packed else payload
-    name, kind = ("robot/Imu", "ros1msg") if encoding == "ros1" else ("robot/msg/Imu", "ros2msg")
-    table = one_channel(tmp_path / "a.mcap", name, kind, text.encode(), encoding, [payload])
-    (row,) = table.to_pylist()
-    assert (ns(table, "header_stamp"), row["header_frame_id"]) == ([3_000_000_009], "imu")
-    assert row["took_ns"] == -999_999_995
-    assert (row["angular_velocity_x"], row["angular_velocity_z"]) == (0.5, -math.inf)
-    assert math.isnan(row["angular_velocity_y"])
-    assert (row["angular_velocity_covariance"], row["names"]) == (list(range(9)), ["a", "b"])
-    assert row["more"] == [{"x": 1.0, "y": 2.0, "z": 3.0}]
-    assert "raw" not in fields(table)
-
-
 def test_fields_of_json_become_columns_with_names_of_their_own(tmp_path):
     rows = [
         {"i": 1, "a.b": 1, "t": 5, "T_2": 6, "only": [], "half": "\ud800x"},
@@ -276,7 +233,8 @@ JSON = st.deferred(
 )
 
 
-@given(st.lists(JSON, max_size=5))
+@given(st.lists(JSON, max_size=8))
+@settings(max_examples=10)
 def test_whatever_json_holds_becomes_a_table(tmp_path_factory, values):
     path = tmp_path_factory.mktemp("j") / "a.mcap"
     table = one_channel(path, "", "", b"", "json", [json.dumps(value).encode() for value in values])

@@ -23,14 +23,14 @@ from mcaptrack.fleet.expansion import NamedLog, outputs_in
 from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.fleet.worker import Reply, Request
 from tests import fleet_tasks
-from tests.awaiting import until
+from tests.awaiting import is_running, until
+from tests.tiers import one_in
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    """A folder with three files, which are logs as far as a fleet is concerned."""
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.mcap").write_text(name)
     return tmp_path
@@ -211,17 +211,8 @@ print(json.dumps(done.counts))
 
 
 def start(folder: Path) -> subprocess.Popen[str]:
-    """A fleet in a process of its own."""
     command = [sys.executable, "-c", SCRIPT, str(folder)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def is_running(process: int) -> bool:
-    """Whether a process runs; one that has ended may wait for long to be noticed by the process that adopted it."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def wait_for(path: Path) -> None:
@@ -262,7 +253,7 @@ def test_two_fleets_share_the_work_and_do_no_log_twice(folder):
     assert not list(folder.glob(".*"))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", one_in(2, [signal.SIGINT, signal.SIGTERM]))
 def test_a_signal_ends_workers_and_gives_claims_up(folder, number):
     (folder / "d.mcap").write_text("hang")
     script = SCRIPT.replace("import sys\n", "import signal, sys\nsignal.signal(15, lambda *_: sys.exit(143))\n", 1)
@@ -273,7 +264,7 @@ def test_a_signal_ends_workers_and_gives_claims_up(folder, number):
         ended.communicate()
     assert ended.returncode in (-signal.SIGINT, 1, 143)
     assert not list(folder.glob(".*"))
-    assert not is_running(int((folder / "d.hangs").read_text()))
+    until(lambda: not is_running(int((folder / "d.hangs").read_text())))
 
 
 def test_the_first_failure_can_end_it(folder):
@@ -433,7 +424,6 @@ def test_a_worker_that_was_ended_while_it_waited_is_replaced(monkeypatch):
 
 
 def test_a_worker_that_does_not_start_is_named_as_that(monkeypatch):
-    """Not as a log that took long."""
     monkeypatch.setattr(child, "_CODE", "import signal; signal.pause()")
     monkeypatch.setattr(child, "_START_S", 0.3)
     monkeypatch.setattr(child, "_GRACE_S", 0.2)

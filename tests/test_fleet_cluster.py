@@ -20,7 +20,6 @@ pytestmark = pytest.mark.usefixtures("never_waits")
 
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory) -> Iterator[fleet_cluster.Running]:
-    """A scheduler with two workers."""
     with fleet_cluster.cluster(tmp_path_factory.mktemp("cluster")) as running:
         yield running
 

@@ -77,23 +77,6 @@ def test_a_forecast_is_assigned_below_tau(aside_m, truth_id):
     assert score["scored"] == (truth_id == 1)
 
 
-def test_a_forecast_that_veers_off():
-    """1 m off to the side at the first step, 2 m at the second, 4 m at the third: by hand."""
-    truth = walk(straight_on, 12)
-    tracks = walk(lambda n: {7: straight_on(n)[1]}, 12)
-    made = predictions(lambda n: {7: [(2.5, 1.0), (3.0, 2.0), (3.5, 4.0)]} if n == 4 else {}, 12)
-    row, score = only(find_forecast_errors(made, tracks, truth, tracks))
-    assert (row["track_id"], row["truth_id"], row["later_id"]) == (7, 1, 7)
-    assert row["ade_m"] == pytest.approx((1 + 2 + 4) / 3)
-    assert row["fde_m"] == pytest.approx(4.0)
-    assert row["error_1s_m"] == pytest.approx(3.0)  # halfway between 0.8 s and 1.2 s
-    assert row["within_95"] == pytest.approx(2 / 3)  # up to 2.45 deviations
-    for name in ("ade_m", "fde_m", "error_1s_m", "within_95"):
-        assert row["later_" + name] == row[name]
-    assert (score["forecasts"], score["scored"], score["false_forecasts"], score["later_scored"]) == (1, 1, 0, 1)
-    assert (score["ade_m"], score["ade_so_far_m"]) == pytest.approx((7 / 3, 7 / 3))
-
-
 @pytest.mark.parametrize("truth", [None, [], walk(lambda n: {}, 12), walk(lambda n: {1: (np.nan, np.nan)}, 12)])
 def test_without_ground_truth_forecasts_are_compared_with_later_tracks(truth):
     tracks = walk(straight_on, 12)
@@ -169,7 +152,6 @@ def evaluated(truth, tracks, made):
 
 @given(scene=scenes())
 def test_constant_velocity_beside_forecasts_is_what_its_predictor_scores(scene):
-    """Forecasts by ``cv`` score what stands beside them, and what stands beside others at the same times is the same."""
     truth, tracks, _ = scene
     made = [frame for (frame,) in Predict(predictor="cv", horizon_s=3 * STEP_S)(tracks)]
     moved = [frame._replace(rows=frame.rows.copy()) for frame in made]
@@ -352,20 +334,6 @@ def test_forecasts_without_reference_do_not_fail_a_run(tmp_path):
         assert ERRORS not in opened.channels
 
 
-def test_a_recorded_channel_is_never_replaced(tmp_path):
-    path = write_channels(tmp_path / "a.mcap", **ALL)
-    with log.read(path) as opened, log.extend(opened) as writer:
-        writer.add_message(writer.add_channel(SCORES, ("", "", b""), "json", {}), 0, 0, b"{}")
-    with log.read(path) as opened, notices.collected() as heard:
-        pipeline.run(opened, "/camera", [], finishing=[pipeline.Watch(again=True)])
-    assert [notice.message for notice in heard] == [
-        f"no errors of /camera/predictions: they would replace {SCORES}, which was recorded by others (no schema)"
-    ]
-    with log.read(path) as opened:
-        assert [message.payload for message in opened.messages(SCORES)] == [b"{}"]
-        assert ERRORS not in opened.channels
-
-
 def test_drop_takes_errors_along_and_tables_have_them(tmp_path):
     path = write_channels(tmp_path / "a.mcap", **ALL)
 
@@ -406,7 +374,6 @@ def smoothed_past(xy: np.ndarray) -> np.ndarray:
 
 
 def of_track(frames: list[Frame], number: int) -> dict[int, np.ndarray]:
-    """The predicted positions of a track by frame."""
     rows = {frame.index: frame.rows[frame.rows["track_id"] == number] for frame in frames}
     return {k: np.stack([one["x_m"], one["y_m"]], axis=-1) for k, one in rows.items() if len(one)}
 

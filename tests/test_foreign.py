@@ -40,7 +40,6 @@ def gradient(height: int = 24, width: int = 32) -> np.ndarray:
 
 
 def blue() -> np.ndarray:
-    """Its first channel alone."""
     return gradient()[..., 0].copy()
 
 

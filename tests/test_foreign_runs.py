@@ -31,7 +31,6 @@ IMAGES = "/robot/front/image"
 
 
 def content(path: Path) -> dict[str, list]:
-    """Read all channels with the mcap library: the messages and the metadata of each."""
     out: dict[str, list] = {}
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
@@ -42,7 +41,6 @@ def content(path: Path) -> dict[str, list]:
 
 
 def mcaptrack(*words: object) -> None:
-    """Run a stage on a recording in place."""
     assert not GROUP([*map(str, words), "--in-place"], standalone_mode=False), words
 
 

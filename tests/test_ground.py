@@ -278,8 +278,6 @@ def test_headings_are_interpolated_around_the_circle():
 
 
 def test_cars_are_predicted_in_their_own_unit():
-    """A car at four times the speed of a person is predicted at four times the distance."""
-
     def forecast(name: str, factor: float) -> np.ndarray:
         rows = [
             TRACKS.rows(

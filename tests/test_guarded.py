@@ -43,7 +43,6 @@ def answers(answer: Answer, kind: str = "tracker", given: Iterable[Frame] = GIVE
 
 
 def one(**changes: Any) -> Answer:
-    """Answers of one frame each, with these changes."""
     return lambda frame: [(frame._replace(**{"rows": ROWS, **changes}),)]
 
 
@@ -224,8 +223,6 @@ def test_an_error_of_the_input_is_not_blamed_on_the_transform():
 
 
 class Own:
-    """A predictor that returns, or raises, what it is told to."""
-
     steps, step_s, past = 2, 0.5, 1
     result: ClassVar[Any] = None
 

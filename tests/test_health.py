@@ -32,7 +32,6 @@ def place(tmp_path, monkeypatch) -> Path:
 
 
 def fault() -> str:
-    """The one line that `doctor` prints about the fault."""
     outcome = call("doctor", "-q")
     assert (outcome.code, outcome.out) == (1, "")
     (line,) = outcome.err.splitlines()
@@ -125,7 +124,7 @@ def test_what_an_extra_lacks_is_no_fault(monkeypatch):
 
 
 def test_a_plug_in_that_cant_be_imported_is_a_warning(tmp_path, monkeypatch):
-    package(tmp_path, "own", "1.5", "mcaptrack.trackers", {"mine": "nothing_there:Mine"})
+    package(tmp_path, "own", "1.5", {"mcaptrack.trackers": {"mine": "nothing_there:Mine"}})
     monkeypatch.syspath_prepend(str(tmp_path))
     said = json.loads(done("doctor", "--json").out)
     ((name, why),) = said["plugins"].items()

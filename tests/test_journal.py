@@ -26,7 +26,6 @@ pytestmark = pytest.mark.usefixtures("never_waits")
 
 @pytest.fixture
 def path(tmp_path) -> Path:
-    """A log that was left half written, with its journal."""
     path = tmp_path / "a b.mcap"  # a name that a shell takes apart
     write_log(path, SOME, "media")
     interrupt(path)

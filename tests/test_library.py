@@ -161,7 +161,6 @@ class TestUnused:
 
 
 def flag_of(name: str, parameter: str) -> str:
-    """The option of a command for a parameter of its function."""
     (found,) = (one for one in GROUP.commands[name].params if one.name == parameter)
     return max(found.opts, key=len)
 
@@ -248,8 +247,6 @@ class TestRefused:
 
 
 class TestChecked:
-    """Choices and ranges that the command line has hold for calls, before anything is read."""
-
     @staticmethod
     def words(name: str, parameter: str, value: object) -> str:
         with pytest.raises(McaptrackError) as refused:

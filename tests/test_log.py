@@ -143,7 +143,7 @@ def test_hostile_chunks_are_refused_before_they_cost_anything(tmp_path):
 
 @pytest.mark.parametrize("options", STOCK_OPTIONS.values(), ids=STOCK_OPTIONS)
 @given(messages=MESSAGES, span=st.tuples(st.integers(0, 2**62), st.integers(0, 2**62)))
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_a_span_of_time_over_several_channels_is_what_the_stock_reader_gives(tmp_path_factory, options, messages, span):
     path = tmp_path_factory.mktemp("log") / "a.mcap"
     write_stock(path, messages, **options)

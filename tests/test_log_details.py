@@ -36,7 +36,6 @@ def test_opcodes_are_those_of_the_stock_library():
 
 
 def summary_of(path: Path):
-    """The summary as the stock reader has it."""
     with path.open("rb") as stream:
         return make_reader(stream).get_summary()
 
@@ -232,8 +231,8 @@ def test_chunks_and_their_indexes_are_read_as_they_were_written_or_not_at_all(co
 def shallow() -> Iterator[int]:
     """How deep calls may be: less than usual, so that fewer channels suffice to show that none are nested."""
     usual = sys.getrecursionlimit()
-    sys.setrecursionlimit(400)
-    yield 400
+    sys.setrecursionlimit(300)
+    yield 300
     sys.setrecursionlimit(usual)
 
 

@@ -25,7 +25,6 @@ CHANGES = {"grows": (30, 1500), "shrinks": (1500, 30), "stays as long": (400, 40
 
 
 def seen(path: Path) -> dict[str, list[bytes]]:
-    """What our reader finds."""
     with log.read(path) as opened:
         found = {topic: [m.payload for m in opened.messages(topic)] for topic in opened.channels}
         return found | {"layout": [opened.attachment("layout") or b""]}
@@ -37,7 +36,6 @@ def counts(found: dict[str, list[bytes]]) -> dict[str, int]:
 
 
 def photo(folder: Path) -> dict[str, tuple[bytes, int]]:
-    """Everything in a folder: names, content, times."""
     return {entry.name: (entry.read_bytes(), entry.stat().st_mtime_ns) for entry in sorted(folder.iterdir())}
 
 
@@ -131,7 +129,6 @@ def left_behind(path: Path, kills: list[dict[str, bytes]]) -> Iterator[dict[str,
 
 
 def put(path: Path, files: dict[str, bytes]) -> None:
-    """Make these the files of the folder."""
     reset(path, files[path.name])
     for name in files.keys() - {path.name}:
         path.with_name(name).write_bytes(files[name])
@@ -252,7 +249,7 @@ def test_a_newer_log_that_takes_the_place_of_a_half_written_one_is_never_rolled_
     newer.write_bytes(change.old)
     add_results(newer, 3, 700)
     other = newer.read_bytes()
-    for files in kills:
+    for files in kills[::2]:
         for content in (change.new, other):
             put(path, files)
             with path.open("rb+") as stream:  # as cp does: the file stays the same one

@@ -21,7 +21,6 @@ pytestmark = pytest.mark.usefixtures("never_waits")
 
 @pytest.fixture
 def folder(template, tmp_path, monkeypatch) -> Path:
-    """A working folder with a folder of two logs that are up to date."""
     (tmp_path / "logs" / "deep").mkdir(parents=True)
     for name in ("logs/a.mcap", "logs/deep/b.mcap"):
         shutil.copy(template, tmp_path / name)
@@ -67,7 +66,7 @@ def test_lines_of_json_say_when_what_ended_and_how(folder, monkeypatch):
     (folder / "logs" / "noise.mcap").write_bytes(b"noise")
     monkeypatch.setattr(common, "PROGRESS_S", 0.0)
     began = time.time() - 0.001  # times have milliseconds
-    code, out, err = call("export", "logs", "--jobs", "2", "--log-format", "json", "--json")
+    code, out, err = call("export", "logs", "--jobs", "1", "--log-format", "json", "--json")
     said, results = [json.loads(line) for line in err.splitlines()], json.loads(out)["results"]
     assert code == 3
     assert all({"time", "level", "event", "command", "message"} <= line.keys() for line in said)

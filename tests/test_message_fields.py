@@ -329,7 +329,6 @@ ENCODINGS = ("ros1", "cdr", "json")
 
 
 def made(ros: Ros, name: str, fields: dict):
-    """A message with these fields; the others are empty or 0."""
     values = {}
     for key, kind in ros.store.fielddefs[name][1]:
         values[key] = value_of(ros, kind, fields.get(key))

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.evaluation import metrics
+from mcaptrack.errors import McaptrackError
+from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate, metrics
 from mcaptrack.evaluation.metrics import Matchup, combine, distances, metres_to_similarity, score, summary
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement
 from mcaptrack.evaluation.metrics.matchup import SparseTables
+from mcaptrack.evaluation.occupancy import occupancy
 from mcaptrack.geometry.boxes import iou
+from mcaptrack.predictors import Forecast
+from mcaptrack.schema import PREDICTIONS, Frame
+from mcaptrack.schema.predictions import forecast_to_rows
 from tests.forecasts import forecasts, positions, predicted
+from tests.worlds import boxed, ns, tracks_at, walk
 
 
 def matchup(truth, tracks, gate: float = 1.0) -> Matchup:
@@ -78,29 +86,6 @@ CASES = {
 def test_cases_by_hand(truth, tracks, wanted):
     found = summary(score(matchup(truth, tracks)))
     assert {name: found[name] for name in wanted} == pytest.approx(wanted)
-
-
-@pytest.mark.parametrize("rules", ["trackeval", "motmetrics"])
-@pytest.mark.parametrize("others", [0, 1, 2])
-def test_a_pair_exactly_at_the_gate_counts(rules, others):
-    """Alone, beside another track at the gate, and beside a second person who competes for both."""
-    tracks = [{5: 1.0} | ({6: -1.0} if others else {})] * 3
-    truth = [{1: 0.0} | ({2: 2.0} if others == 2 else {})] * 3
-    found = summary(score(matchup(truth, tracks), rules))
-    assert found["FN"] == 0
-    assert found["FP"] == (3 if others == 1 else 0)
-    beyond = summary(score(matchup([{1: 0.0}] * 3, [{5: 1.0 + 1e-9, 6: -1.0 - 1e-9}] * 3), rules))
-    assert beyond["FN"] == 3
-
-
-def test_the_two_evaluators_differ_where_they_are_known_to():
-    """After a miss py-motmetrics keeps the old pair though another track stands nearer; TrackEval takes the nearer."""
-    truth = [{1: 0.0}] * 3
-    tracks = [{5: 0.0}, {7: 90.0}, {5: 0.8, 6: 0.0}]
-    assert summary(score(matchup(truth, tracks), "trackeval"))["IDSW"] == 1
-    assert summary(score(matchup(truth, tracks), "motmetrics"))["IDSW"] == 0
-    tracks[1] = {}  # TrackEval skips frames without any track, so that the pair before still counts
-    assert summary(score(matchup(truth, tracks), "trackeval"))["IDSW"] == 0
 
 
 def test_people_of_other_parts_of_a_sequence_are_in_no_count():
@@ -187,22 +172,6 @@ def straight(who: int, steps: range, offset: float = 0.0, lane: float = 0.0) -> 
 
 
 class TestDisplacement:
-    def test_errors_by_hand(self):
-        """One person at x = step; the track lies 0.1 m beside, the forecast misses by 1, 2 and 2 m."""
-        truth = positions(straight(1, range(10)))
-        tracks = positions({5: {step: (step, 0.1) for step in range(10)}})
-        made = forecasts(predicted(4, 5, [(5.0, 1.0), (6.0, 2.0), (9.0, 0.0)]))
-        result = displacement(truth, tracks, made)
-        found = result.summary()
-        assert found["ADE_m"] == pytest.approx(5 / 3)
-        assert found["FDE_m"] == pytest.approx(2.0)
-        assert found["ADE_squared_m2"] == pytest.approx(3.0)
-        assert found["recall"] == 1.0
-        # 1 m is within 1.18 sigma and 2 m are not; 2 m are within 2.15 and 2.45 sigma.
-        assert [found[f"coverage_{level}"] for level in (50, 90, 95)] == pytest.approx([1 / 3, 1, 1])
-        assert result.d_obs_m2.tolist() == pytest.approx([0.01])
-        assert found["false_forecasts_per_frame"] == 0.0
-
     def test_people_without_a_whole_future_or_past_count_nowhere(self):
         truth = positions(
             straight(1, range(10)) | straight(2, range(6), lane=5.0) | straight(3, range(3, 10), lane=9.0)
@@ -245,13 +214,6 @@ class TestDisplacement:
         )
         found = displacement(truth, positions(straight(7, range(10))), made).summary()
         assert found["consistency_m"] == pytest.approx(1.5)
-
-    def test_without_values_scores_are_none(self):
-        truth = positions(straight(1, range(3)))
-        made = forecasts(predicted(1, 7, [(5.0, 0), (6.0, 0), (7.0, 0)]))
-        found = displacement(truth, positions(straight(7, range(3))), made).summary()
-        assert found["ADE_m"] is None
-        assert found["recall"] is None
 
     def test_a_mean_with_a_value_that_is_not_finite_is_none(self):
         truth, made = positions(straight(1, range(10))), forecasts(predicted(4, 5, [(5.0, 0), (6.0, 0), (7.0, 2)]))
@@ -339,7 +301,6 @@ OURS_AND_TRACKEVALS = {
 
 
 def by_trackeval(part: Matchup) -> list[tuple]:
-    """Each of TrackEval's metrics with its result."""
     metrics = pytest.importorskip("trackeval.metrics")
     data = {
         "num_tracker_dets": part.track_rows,
@@ -414,3 +375,185 @@ def test_counts_of_boxes_equal_motmetrics(sequence):
     for name, ours_name in names.items():
         if np.isfinite(theirs[name]):
             assert ours[ours_name] == pytest.approx(float(theirs[name]), abs=1e-9), name
+
+
+# Scores of logs and label files against ground truth
+
+
+METRES = EvaluateOptions(similarities=("metres",), gates_m=(1.0,))
+
+
+def scored(truth, tracks, options=METRES, forecasts=None):
+    outcome = evaluate([EvaluationInput("x", truth, [Candidate("t", None, tracks, forecasts, "p")])], options)
+    return [result.to_json() for result in outcome.results]
+
+
+@pytest.mark.parametrize("similarity", ["metres", "iou"])
+def test_rows_that_cannot_be_compared_are_as_if_they_were_not_there(similarity):
+    """Of the ground truth and of the tracks, in the first frame, in the middle and in the last one."""
+    rng = np.random.default_rng(3)
+    options = EvaluateOptions(similarities=(similarity,), gates_m=(1.0,))
+    whole, lacking, without = [], [], []
+    for n in range(12):
+        places = {number: (10.0 * number + n, rng.normal(0, 0.2)) for number in (3, 5, 8)}
+        rows = tracks_at(places) if similarity == "metres" else boxed({k: (20 * x, y) for k, (x, y) in places.items()})
+        gone = rng.random(3) < (0.7 if n in (0, 6, 11) else 0.1)
+        odd = rows.copy()
+        for name in ("x_m", "y_m") if similarity == "metres" else ("x_px", "y_px", "w_px", "h_px"):
+            odd[name][gone] = np.nan
+        whole.append(Frame(ns(n), n, rows))
+        lacking.append(Frame(ns(n), n, odd))
+        without.append(Frame(ns(n), n, rows[~gone]))
+    for one, other in ((whole, lacking), (lacking, whole), (lacking, lacking)):
+        same = [without if some is lacking else some for some in (one, other)]
+        assert scored(one, other, options) == scored(*same, options)
+
+
+def test_frames_without_tracks_count_as_missed():
+    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
+    (row,) = scored(truth, truth[:7])
+    assert (row["FN"], row["FP"]) == (3, 0)
+
+
+def test_tracks_with_more_frames_are_scored_at_labelled_times():
+    truth = walk(lambda n: {1: (float(n), 0.0)}, 10)
+    tracks = [Frame(ns(n / 30), n, tracks_at({1: (n / 12, 0.0)})) for n in range(9 * 12 + 1)]
+    (row,) = scored(truth, tracks)
+    assert (row["MOTA"], row["FN"], row["FP"]) == (1.0, 0, 0)
+
+
+def test_ground_truth_is_resampled_to_the_prediction_rate():
+    """Truth at 7 frames a second, tracks at 2.5: no time in common but a few, all rows comparable."""
+    truth = [Frame(ns(n / 7), n, tracks_at({1: (n / 7, 0.0)})) for n in range(71)]
+    tracks = walk(lambda n: {1: (0.4 * n, 0.05)}, 26)
+    (row,) = scored(truth, tracks)
+    assert (row["MOTA"], row["FN"], row["FP"]) == (1.0, 0, 0)
+
+
+def test_unlabelled_times_are_not_scored():
+    truth = [Frame(ns(n / 7), n, tracks_at({1: (0.0, 0.0)})) for n in range(35)]  # 5 s
+    tracks = walk(lambda n: {1: (0.0, 0.0), 2: (50.0, 0.0)}, 50)  # 20 s
+    (row,) = scored(truth, tracks)
+    assert row["FP"] == 13  # the ghost, at the 13 ticks within the labels
+
+
+def test_boxes_and_metres_are_scored_where_both_sides_have_them():
+    boxes = [Frame(ns(n), n, boxed({1: (5 * n, 0)})) for n in range(5)]
+    rows = scored(boxes, boxes, EvaluateOptions())
+    assert [(row["similarity"], row["gate"], row["MOTA"]) for row in rows] == [("iou", 0.5, 1.0)]
+    with pytest.raises(McaptrackError, match="the ground truth and t have no positions in metres"):
+        scored(boxes, boxes, METRES)
+    with pytest.raises(McaptrackError, match="t and the ground truth share neither boxes nor positions"):
+        scored(boxes, walk(lambda n: {1: (0.0, 0.0)}, 13), EvaluateOptions())
+
+
+def test_input_that_cannot_be_compared_is_refused_not_scored_as_zero():
+    truth = walk(lambda n: {1: (0.0, 0.0)}, 5)
+    later = [frame._replace(t_ns=frame.t_ns + ns(1000)) for frame in truth]
+    with pytest.raises(
+        McaptrackError, match=r"the ground truth \(0\.000 to 1\.600 s\) and t \(1000\.000 to .*never overlap in time"
+    ):
+        scored(truth, later)
+    with pytest.raises(McaptrackError, match="the ground truth of x is empty"):
+        scored(walk(lambda n: {}, 5), truth)
+
+
+def test_forecasts_are_compared_with_the_true_future():
+    """Constant velocity for a person who turns after 4 s: right before, wrong after, and not judged at the end."""
+
+    def path(n):
+        return {1: (0.5 * min(n, 10), 0.5 * max(n - 10, 0))}
+
+    truth = walk(path, 30)
+    frames = []
+    for n in range(30):
+        x, y = path(n)[1]
+        mean = np.array([[[x + 0.5 * k, y] for k in range(1, 4)]])
+        rows = forecast_to_rows(np.array([1]), Forecast(mean, np.tile(np.eye(2), (1, 3, 1, 1))), 0.4)
+        frames.append(Frame(ns(0.4 * n), n, rows if n >= 3 else PREDICTIONS.empty()))
+    (row,) = scored(truth, truth, METRES, frames)
+    found = row["displacement"]
+    assert found["recall"] == 1.0
+    assert found["ADE_m"] > 0
+    assert len(found["curve_recall"]) == 24  # ticks 3 to 26 have a past and a future
+    assert found["curve_recall"][-1] == 1.0
+    early = [frame for frame in frames if frame.index <= 7]
+    (row,) = scored(truth, truth, METRES, early)
+    assert row["displacement"]["ADE_m"] == pytest.approx(0.0, abs=1e-12)
+
+
+# Where people spend their time: person-seconds on a grid
+
+
+S = 10**9
+
+
+def test_nothing_is_an_empty_grid():
+    t_ns, ids = np.array([0, 1, 0, 1]) * S, np.array([1, 1, 2, 2])
+    for rows in (0, 1):
+        heat = occupancy(t_ns[:rows], ids[:rows], np.zeros((rows, 2)))
+        assert heat.person_s.shape == (0, 0)
+    unknown = np.array([[np.nan, 0.0], [0.0, 0.0], [1.0, np.inf], [0.0, 0.0]])
+    assert occupancy(t_ns, ids, unknown).person_s.size == 0
+
+
+def slowly(t_ns, ids, xy, cell, gap_s):
+    """Step by step, piece by piece; the extent by adding up the time of ends of steps along each axis."""
+    steps = []
+    for one in sorted(set(ids.tolist())):
+        mine = sorted((int(t), *at) for t, at in zip(t_ns[ids == one], xy[ids == one].tolist(), strict=True))
+        steps += [
+            (a, b) for a, b in pairwise([row for row in mine if np.isfinite(row).all()]) if b[0] - a[0] <= gap_s * S
+        ]
+    bounds = []
+    for axis in (0, 1):
+        ends = sorted((end[1 + axis], (b[0] - a[0]) / S) for a, b in steps for end in (a, b))
+        total = np.cumsum([time for _, time in ends])
+        place = [
+            next(at for (at, _), so_far in zip(ends, total, strict=True) if so_far >= share * total[-1])
+            for share in (0.002, 0.998)
+        ]
+        bounds.append(tuple(math.floor(at / cell) for at in place))
+    (x0, x1), (y0, y1) = bounds
+    grid, outside = np.zeros((max(y1 - y0 + 1, 1), max(x1 - x0 + 1, 1))), 0.0
+    for a, b in steps:
+        way = [b[1] - a[1], b[2] - a[2]]
+        pieces = min(max(math.ceil(8 * max(map(abs, way)) / cell), 1), 64)
+        for piece in range(pieces):
+            x, y = (a[1 + axis] + (piece + 0.5) / pieces * way[axis] for axis in (0, 1))
+            column, row = math.floor(x / cell) - x0, math.floor(y / cell) - y0
+            if 0 <= row < len(grid) and 0 <= column < grid.shape[1]:
+                grid[row, column] += (b[0] - a[0]) / S / pieces
+            else:
+                outside += (b[0] - a[0]) / S / pieces
+    return grid, (x0 * cell, y0 * cell), outside
+
+
+@pytest.mark.parametrize(("part", "gap_s"), [(1 << 18, 2.0), (40, 2.0), (40, 0.5)])
+def test_the_grid_is_that_of_a_slow_count(part, gap_s, monkeypatch):
+    for name, value in {"_PART": part, "_CELL_M": 0.7, "MAX_GAP_S": gap_s}.items():
+        monkeypatch.setattr(f"mcaptrack.evaluation.occupancy.{name}", value)
+    rng = np.random.default_rng(5)
+    count = 120
+    ids = rng.integers(0, 5, count)
+    t_ns = np.sort(rng.choice(400, count, replace=False)) * (S // 10)
+    xy = rng.normal(0, 3, (count, 2))
+    xy[7, 0], xy[30] = np.nan, 60.0  # not known, and farther than 64 pieces tell
+    heat = occupancy(t_ns, ids, xy)
+    grid, low_m, outside = slowly(t_ns, ids, xy, 0.7, gap_s)
+    np.testing.assert_allclose(heat.person_s, grid, atol=1e-9)
+    assert heat.low_m == pytest.approx(low_m)
+    assert heat.high_m == pytest.approx((low_m[0] + 0.7 * grid.shape[1], low_m[1] + 0.7 * grid.shape[0]))
+    assert heat.outside_s == pytest.approx(outside)
+
+
+def test_cells_grow_where_there_would_be_more_than_two_hundred():
+    t_ns, ids = np.array([0, 1]) * S, np.array([1, 1])
+    for extent, cell in (
+        *((100.0, 0.5), (100.5, 1.0), (200.0, 1.0), (200.5, 2.0), (400.0, 2.0), (401.0, 5.0), (1000.0, 5.0)),
+        *((1001.0, 10.0), (2000.0, 10.0), (2001.0, 20.0), (4001.0, 50.0), (10_001.0, 100.0), (1e6, 5000.0)),
+    ):
+        for way in ((extent, 1.0), (1.0, -extent)):
+            assert occupancy(t_ns, ids, np.array([(0.0, 0.0), way])).cell_m == cell
+    nothing = occupancy(t_ns[:1], ids[:1], np.zeros((1, 2)))
+    assert (nothing.low_m, nothing.high_m, nothing.cell_m, nothing.outside_s) == ((0.0, 0.0), (0.0, 0.0), 0.5, 0.0)

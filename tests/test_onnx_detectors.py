@@ -49,8 +49,6 @@ pytestmark = pytest.mark.usefixtures("networks_here")
 
 @pytest.fixture
 def network(tmp_path):
-    """Writes a network; its file."""
-
     def write(layout="yolox", data=None, name="network.onnx", **options) -> Path:
         path = tmp_path / name
         path.write_bytes(detector(layout, **options) if data is None else data)

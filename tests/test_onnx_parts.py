@@ -193,7 +193,6 @@ def test_what_has_no_nodes_is_no_network(data):
 
 
 def constants(data: bytes) -> dict[str, list[int]]:
-    """The whole numbers of all tensors of a network, by name."""
     found = graph._constants(graph.parse(data))
     return {name: np.frombuffer(one.raw_data, "<i8").tolist() for name, one in found.items() if one.data_type == INT64}
 

@@ -309,10 +309,6 @@ def test_a_score_at_the_limit_passes(finished):
     assert call(*words, "--fail-under", f"MOTA={one['MOTA'] + 1e-4!r}").code == 4
 
 
-def test_text_is_printed_without_what_a_terminal_acts_on():
-    assert text.printable("a\x1b[31m\n\u202eb\udc80 ä") == r"a\x1b[31m\n\u202eb\udc80 ä"
-
-
 def test_a_terminal_shows_sixty_rows_of_an_answer_and_a_pipe_all(folder, monkeypatch, terminal):
     answer = pa.table({"n": pa.array(range(61), pa.int64()), "word": ["a\x1b[31m"] * 61})
     monkeypatch.setattr(mcaptrack, "query", lambda log, sql, **_: answer)

@@ -1,4 +1,4 @@
-"""Parameters of stages arrive from the command line, the environment and files.
+"""Parameters of stages arrive in what they make.
 
 The tests follow from what the code declares, so that an option that is added is tested, too.
 """
@@ -8,26 +8,22 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import dataclass, fields
-from itertools import product
 from pathlib import Path
 from typing import Any, get_type_hints
 
-import pyarrow.parquet as pq
 import pytest
 
-from mcaptrack import log
 from mcaptrack.predictors import NAMES
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS
 from mcaptrack.transforms import STAGES as STAGES_OF_LOGS
 from mcaptrack.transforms.protocol import bare_type, choices
-from tests.commands import call, done, toml_value
+from tests.commands import done, toml_value
 from tests.logs import provenance_of
-from tests.tiers import one_in, thorough
+from tests.tiers import one_in
 
 
 @pytest.fixture
 def folder(template, tmp_path, monkeypatch) -> Path:
-    """The working folder of a command, with a log of its own."""
     shutil.copy(template, tmp_path / "a.mcap")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -43,12 +39,10 @@ class Stage:
     chosen: tuple[tuple[str, str], ...] = ()
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters that are options, with their defaults."""
         options = [field.name for field in fields(self.transform) if not field.metadata.get("context")]
         return {name: getattr(self.transform, name) for name in options}
 
     def others(self) -> dict[str, Any]:
-        """Return a value other than the default for each parameter."""
         hints = get_type_hints(type(self.transform))
         out = {}
         for field in fields(self.transform):
@@ -57,7 +51,6 @@ class Stage:
         return out
 
     def made(self, path: Path) -> dict[str, Any]:
-        """Return the parameters in the provenance of the channel of this stage."""
         said = provenance_of(path, self.target).parameters
         return {name: value for name, value in said.items() if name in self.parameters()}
 
@@ -95,7 +88,6 @@ def as_settings(values: dict[str, Any], transform: Any) -> dict[str, Any]:
 
 
 def flags(values: dict[str, Any]) -> list[str]:
-    """Write settings as options of a command line."""
     out = []
     for name, value in values.items():
         if name == "set":
@@ -106,49 +98,30 @@ def flags(values: dict[str, Any]) -> list[str]:
     return out
 
 
-def text_of(value: Any) -> str:
-    """Write a setting as the value of an environment variable."""
-    return " ".join(value) if isinstance(value, list) else str(value)
-
-
 def toml(command: str, values: dict[str, Any]) -> str:
-    """Write values as a table of mcaptrack.toml."""
     lines = [f"{name.replace('_', '-')} = {toml_value(value)}" for name, value in values.items()]
     return "\n".join([f"[{command}]", *lines]) + "\n"
 
 
-@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: "-".join([stage.command, *dict(stage.chosen).values()]))
-@pytest.mark.parametrize("way", one_in(3, ["flag", "environment", "file"]))
-def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, way, folder, monkeypatch):
-    values = as_settings(stage.others(), stage.transform)
-    words = [stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen))]
-    if way == "flag":
-        words += flags(values)
-    elif way == "environment":
-        for name, value in values.items():
-            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), text_of(value))
-    else:
-        Path("mcaptrack.toml").write_text(toml(stage.command, values))
-    code, _, err = call(*words)
-    assert code == 0, err
+def named(stage: Stage) -> str:
+    return "-".join([stage.command, *dict(stage.chosen).values()])
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=named)
+def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, folder):
+    """From the command line: tests/test_settings.py has it that a value is the same wherever it comes from."""
+    values = flags(as_settings(stage.others(), stage.transform))
+    done(stage.command, "a.mcap", "-o", "b.mcap", *flags(dict(stage.chosen)), *values)
     assert stage.made(folder / "b.mcap") == stage.others()
     assert len(stage.others()) == len(stage.parameters())
 
 
-@pytest.mark.parametrize(
-    ("stage", "way"),
-    # Motion is made by run only where it is needed.
-    one_in(3, product([stage for stage in STAGES if stage.command != "motion"], ["environment", "file"])),
-    ids=lambda one: one if isinstance(one, str) else "-".join([one.command, *dict(one.chosen).values()]),
-)
-def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypatch):
+# Motion is made by run only where it is needed.
+@pytest.mark.parametrize("stage", one_in(2, [stage for stage in STAGES if stage.command != "motion"]), ids=named)
+def test_parameters_reach_the_stages_that_run_makes(stage, folder):
     """``run --force`` applies them where the channel exists; without it a warning says that they are not applied."""
     values = as_settings(stage.others(), stage.transform) | dict(stage.chosen)
-    if way == "environment":
-        for name, value in values.items():
-            monkeypatch.setenv(f"MCAPTRACK_{stage.command}_{name}".upper(), text_of(value))
-    else:
-        Path("mcaptrack.toml").write_text(toml(stage.command, values))
+    Path("mcaptrack.toml").write_text(toml(stage.command, values))
     before = (folder / "a.mcap").read_bytes()
     left = json.loads(done("run", "a.mcap", "--no-tables", "--json", "-q").out)
     assert (folder / "a.mcap").read_bytes() == before
@@ -159,33 +132,6 @@ def test_parameters_reach_the_stages_that_run_makes(stage, way, folder, monkeypa
     assert stage.made(folder / "a.mcap") == stage.others()
     after = json.loads(done("run", "a.mcap", "--no-tables", "--json").out)["warnings"]
     assert "other-settings" not in [one["code"] for one in after]
-
-
-@thorough
-def test_a_forced_run_makes_the_same_channels(folder):
-    """``run --force`` keeps the parameters of each channel, also those that are not the defaults."""
-    done("track", "a.mcap", "--tracker", "ocsort", "--max-age-s", 3)
-    done("events", "a.mcap", "--similarity", "metres", "--gate-m", 0.5)
-    done("run", "a.mcap")
-    before, (path,) = _content(folder / "a.mcap"), folder.glob("a.tables/tracks/*/part-0.parquet")
-    table, raw = pq.read_table(path), path.read_bytes()
-    broken = raw[:100] + bytes([raw[100] ^ 1]) + raw[101:]
-    path.write_bytes(broken)
-    done("run", "a.mcap")
-    assert path.read_bytes() == broken  # by what it says it is up to date
-    done("run", "a.mcap", "--force")
-    assert pq.read_table(path).equals(table)
-    assert _content(folder / "a.mcap") == before
-
-
-def _content(path: Path) -> dict[str, tuple[dict[str, str], list[tuple[int, bytes]]]]:
-    """Return the metadata and messages of all channels except the one that all views share, which names one of them."""
-    with log.read(path) as opened:
-        return {
-            topic: (dict(channel.metadata), [(m.t_ns, m.payload) for m in opened.messages(topic)])
-            for topic, channel in opened.channels.items()
-            if not topic.endswith("/view/tf")
-        }
 
 
 def test_a_parameter_has_an_option_in_all_transforms_of_a_stage_or_in_none():

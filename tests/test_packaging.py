@@ -33,7 +33,6 @@ HOME = "https://github.com/mcaptrack/mcaptrack"
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory) -> Path:
-    """The source distribution, unpacked."""
     folder = tmp_path_factory.mktemp("sdist")
     (artifact,) = SdistBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
     with tarfile.open(artifact) as archive:
@@ -49,7 +48,6 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def shipped(wheel) -> set[str]:
-    """The names in the wheel."""
     return set(zipfile.ZipFile(wheel).namelist())
 
 

@@ -107,7 +107,6 @@ CODEC_OF = {"h264": "libx264", "h265": "libx265", "vp9": "libvpx-vp9", "av1": "l
 
 
 def encoded(codec: str) -> bytes:
-    """The first picture of a stream."""
     context = av.CodecContext.create(codec, "w")
     context.width, context.height = SIZE
     context.pix_fmt, context.time_base, context.framerate = "yuv420p", Fraction(1, 10), 10

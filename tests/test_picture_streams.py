@@ -74,7 +74,6 @@ def encoded(name: str) -> list[bytes]:
 
 
 def units(data: bytes) -> list[bytes]:
-    """The NAL units of a packet with start codes."""
     return [part for part in data.replace(b"\0\0\0\1", b"\0\0\1").split(b"\0\0\1") if part]
 
 

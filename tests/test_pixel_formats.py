@@ -56,7 +56,6 @@ def pattern(width: int, height: int) -> np.ndarray:
 
 
 def planes(frame: av.VideoFrame) -> list[np.ndarray]:
-    """The rows of bytes of each plane, without padding."""
     out = []
     for number, plane in enumerate(frame.planes):
         rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height]

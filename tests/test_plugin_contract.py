@@ -121,7 +121,7 @@ REPLACED = [
 ]
 
 
-@pytest.mark.parametrize(("begin", "kind", "name"), one_in(3, REPLACED))
+@pytest.mark.parametrize(("begin", "kind", "name"), one_in(4, REPLACED))
 def test_outputs_may_be_missing_or_more_and_go_with_their_class(logs, place, begin, kind, name):
     """Each command takes the log, a second run has nothing to do, and the built-in class gives the usual log again."""
     command, main, built_in = COMMANDS[kind]
@@ -212,8 +212,6 @@ def state() -> tuple[Any, ...]:
 
 @dataclass(frozen=True)
 class Changing:
-    """A tracker that changes the process at its third frame."""
-
     change: str = ""
     reads: ClassVar = DETECTIONS
     writes: ClassVar = {"": TRACKS}

@@ -122,18 +122,10 @@ def place(template, tmp_path, monkeypatch) -> Iterator[Path]:
 
 
 def install(version: str = "1.5", text: str = MODULE) -> None:
-    """Put the package there, or another version of it in its place."""
     shutil.rmtree("site", ignore_errors=True)
     Path("site").mkdir()
     Path("site/own.py").write_text(text)
-    package(Path("site"), "own", version, "mcaptrack.detectors", {})
-    points = Path(f"site/own-{version}.dist-info/entry_points.txt")
-    lines = [
-        line
-        for kind, entries in ENTRIES.items()
-        for line in (f"[mcaptrack.{kind}]", *(f"{name} = {where}" for name, where in entries.items()))
-    ]
-    points.write_text("\n".join(lines) + "\n")
+    package(Path("site"), "own", version, {f"mcaptrack.{kind}": entries for kind, entries in ENTRIES.items()})
     uncached()
 
 
@@ -216,7 +208,7 @@ def test_they_are_used_seen_made_again_and_refused_when_they_are_gone(place):
 def test_an_entry_point_that_another_package_has_now_is_not_the_same(place):
     done("track", "a.mcap", "--tracker", "single", "-q")
     shutil.rmtree("site/own-1.5.dist-info")
-    package(Path("site"), "thief", "1.5", "mcaptrack.trackers", {"single": "own:Single"})
+    package(Path("site"), "thief", "1.5", {"mcaptrack.trackers": {"single": "own:Single"}})
     uncached()
     refused = call("run", "a.mcap", "--no-tables", "--force")
     assert refused.code == 1
@@ -226,7 +218,7 @@ def test_an_entry_point_that_another_package_has_now_is_not_the_same(place):
 def test_of_two_packages_with_one_name_a_run_takes_the_one_that_made_the_channel(place):
     done("track", "a.mcap", "--tracker", "single", "-q")
     before = made("/camera/tracks")
-    package(Path("site"), "other", "3", "mcaptrack.trackers", {"single": "elsewhere:Single"})
+    package(Path("site"), "other", "3", {"mcaptrack.trackers": {"single": "elsewhere:Single"}})
     uncached()
     assert not {"other-version", "left-out", "out-of-date"} & set(codes("run", "a.mcap", "--no-tables", "--force"))
     assert made("/camera/tracks") == before
@@ -349,8 +341,6 @@ def test_tune_names_a_tracker_that_fails(place):
 
 
 class TestOptionsOfPredictors:
-    """The own parameters of a predictor are options of ``predict``, wherever options are set."""
-
     def variances(self) -> set[float]:
         return set(rows("/camera/predictions")["cov_xx_m2"])
 

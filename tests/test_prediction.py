@@ -10,14 +10,9 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.predictors import make
 from mcaptrack.predictors.linear import (
     DRIFT_M2_PER_S3,
-    MAX_SCALE,
-    MIN_SCALE,
     POSITION_NOISE_M,
-    PRIOR_COUNT,
     SPEED_M_PER_S,
-    TAIL_FACTOR,
     LinearPredictor,
-    linear_variance,
 )
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.transforms import Predict, Sample
@@ -78,30 +73,9 @@ class TestPredictors:
         assert forecast.mean.shape == (0, 12, 2)
         assert forecast.cov.shape == (0, 12, 2, 2)
 
-    def test_kalman_weights_equal_a_kalman_filter(self):
-        """Against a filter with matrices, on noisy positions."""
-        rng, step = np.random.default_rng(2), 0.4
-        seen = np.cumsum(rng.normal(0.4, 0.2, 8))
-        move = np.array([[1, step], [0, 1]])
-        noise = DRIFT_M2_PER_S3 * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
-        state, cov = np.array([seen[0], 0.0]), np.diag([POSITION_NOISE_M**2, SPEED_M_PER_S**2])
-        surprise = 0.0
-        for value in seen[1:]:
-            state, cov = move @ state, move @ cov @ move.T + noise
-            gain = cov[:, 0] / (cov[0, 0] + POSITION_NOISE_M**2)
-            surprise += 2 * (value - state[0]) ** 2 / (cov[0, 0] + POSITION_NOISE_M**2)  # along x and along y
-            state, cov = state + gain * (value - state[0]), cov - np.outer(gain, cov[0])
-        forecast = make("kalman", 12, step).predict(np.stack([seen, seen], -1)[None], np.ones((1, 8), bool))
-        scale = TAIL_FACTOR * np.clip((PRIOR_COUNT + surprise) / (PRIOR_COUNT + 14), MIN_SCALE, MAX_SCALE)
-        for ahead in range(1, 13):
-            state, cov = move @ state, move @ cov @ move.T + noise
-            np.testing.assert_allclose(forecast.mean[0, ahead - 1], state[0], rtol=1e-9)
-            np.testing.assert_allclose(forecast.cov[0, ahead - 1], scale * cov[0, 0] * np.eye(2), rtol=1e-9)
-
     @every_linear
     @pytest.mark.parametrize("known", [1, 3, 8])
     def test_variance_equals_that_of_simulated_motion(self, name, known):
-        """Simulate the motion model: the variance of the errors equals that of the forecast."""
         rng, step, fine, people = np.random.default_rng(known), 0.4, 8, 20_000
         speed = rng.normal(0, SPEED_M_PER_S, people)
         place, path = np.zeros(people), []
@@ -145,12 +119,6 @@ class TestPredictors:
             np.testing.assert_allclose(cov[:, :, 0, 0], wanted[:, None] * plain, rtol=1e-9)
             np.testing.assert_allclose(cov[:, :, 1, 1], cov[:, :, 0, 0])
             assert not cov[:, :, 0, 1].any()
-
-    def test_variance_by_hand_for_standing_still(self):
-        """One position, weight 1, predicted 1 s ahead: the variances of noise, velocity and drift add up."""
-        variance = linear_variance(np.ones((1, 1)), np.array([0.0]), np.array([1.0]))
-        assert variance[0] == pytest.approx(POSITION_NOISE_M**2 + SPEED_M_PER_S**2 + DRIFT_M2_PER_S3 / 3)
-        assert variance[0] == pytest.approx(0.2**2 + 1 + 0.06 / 3)
 
 
 class TestPredict:

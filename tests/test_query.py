@@ -9,7 +9,6 @@ import re
 import subprocess
 import sys
 from contextlib import chdir, redirect_stdout
-from dataclasses import replace
 from pathlib import Path
 
 import duckdb
@@ -20,9 +19,6 @@ import pytest
 from mcaptrack import log, tables
 from mcaptrack.schema import EVENTS, FORECAST_ERRORS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources import demo
-from mcaptrack.sources.demo import demo_scene
-from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.tables.export import ALWAYS, default_folder, export
 from mcaptrack.tables.sql import Database
 from tests.commands import GROUP, Outcome, Terminal, call
@@ -31,12 +27,10 @@ from tests.worlds import ns, tracks_at
 
 PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
 PRELUDE = re.findall(r"```sql\n(create view.*?)```", PAGE, re.S)[0]
-#: Queries of the page that one log answers, and those of them in which no tracker has a hand.
+#: Queries of the page that one log answers.
 QUERIES = [
     query for query in re.findall(r"```sql\n(.*?)```", PAGE, re.S) if not re.search("create view|before join", query)
 ]
-SURE = [query for query in QUERIES if "from metrics" not in query and not re.search(r"'/camera/(?!truth')", query)]
-EXAMPLES = [query for query in QUERIES if query not in SURE]
 
 
 def rows_of(table):
@@ -61,71 +55,8 @@ def refusal(*words):
     return line.removeprefix("mcaptrack: ")
 
 
-@pytest.fixture(scope="module")
-def square(tmp_path_factory) -> Path:
-    """A folder with the ground truth of the demonstration, as a log and as tables; independent of trackers."""
-    folder = tmp_path_factory.mktemp("square")
-    footage = demo.draw(demo_scene(), folder, video=False)
-    options = IngestOptions(fps=demo_scene().fps, ground_plane=footage.ground_plane, role="truth")
-    ingest(footage.ground_truth, folder / "labels.mcap", options)
-    with log.read(folder / "labels.mcap") as opened:
-        frames = opened.frames("/camera/truth", TRACKS)
-        made = Provenance.from_metadata(opened.channel("/camera/truth").metadata)
-    # Labels alone say their frame rate; those of the demonstration stand beside a video.
-    made = replace(made, parameters={key: value for key, value in made.parameters.items() if key != "fps"})
-    write_channels(folder / "demo.mcap", {"/camera/truth": (TRACKS, made, frames)})
-    with log.read(folder / "demo.mcap") as opened:
-        export(opened, folder / "demo.tables")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def answers(square) -> dict[str, tuple[list[str], list[list]]]:
-    """What DuckDB alone answers to each query of the page: names of columns, and rows."""
-    with chdir(square), duckdb.connect() as connection:
-        connection.execute(PRELUDE)
-        asked = {query: connection.sql(query) for query in SURE}
-        return {query: (found.columns, [list(row) for row in found.fetchall()]) for query, found in asked.items()}
-
-
-def test_queries_of_the_page_give_the_same_answers_in_duckdb(square, answers):
-    assert len(SURE) >= 9
-    for query, answer in answers.items():
-        with Database([square / "demo.mcap"]) as database:
-            agree(rows_of(database.ask(query)), answer)
-
-
 def test_the_prelude_names_the_tables_that_always_have_a_file():
     assert set(re.findall(r"create view (\w+)", PRELUDE)) == ALWAYS | {"recordings"}
-
-
-def test_answers_of_the_page_are_correct(answers):
-    def answer_to(word):
-        ((_, rows),) = (answer for query, answer in answers.items() if word in query)
-        return rows
-
-    walkers = {walker.id: walker for walker in demo_scene().people}
-    for who, x_m, y_m in answer_to("t_ns = 10_000_000_000"):
-        assert walkers[who].at(10.0) == pytest.approx((x_m, y_m), abs=0.35), who
-    for who, mean, fastest in answer_to("fastest_m_s"):
-        (start, *_), (end, *_) = walkers[who].route[0], walkers[who].route[-1]
-        points = [walkers[who].at(min(start + 0.04 * n, end)) for n in range(round((end - start) / 0.04) + 1)]
-        steps = [((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2) ** 0.5 for a, b in zip(points, points[25:], strict=False)]
-        assert mean == pytest.approx(sum(steps) / len(steps), abs=0.08)
-        assert fastest == pytest.approx(max(steps), abs=0.15)
-    for one, other, closest_m, at_s in answer_to("closest_m"):
-        (a, b), (c, d) = walkers[one].at(at_s), walkers[other].at(at_s)
-        assert closest_m == pytest.approx(((a - c) ** 2 + (b - d) ** 2) ** 0.5, abs=0.3)
-    ticks = [n / 25 for n in range(1000)]
-    for who, _, seconds in answer_to("visits"):
-        there = [walkers[who].at(t) for t in ticks]
-        inside = sum(1 for place in there if place and -2 <= place[0] <= 2 and 11 <= place[1] <= 14)
-        assert seconds == pytest.approx(inside / 25, abs=0.5)
-    for from_s, begin in answer_to("first_t_ns"):
-        assert begin == sum(from_s <= walker.route[0][0] < from_s + 10 for walker in walkers.values())
-
-
-# Examples: a log with known answers
 
 
 def forecasts(rows):
@@ -174,47 +105,31 @@ def known_log(path, tracked=(7, 8)):
     )
 
 
-KNOWN = {
-    "kind = 4": [[1, 7, 9, 2.4, 2.0, 0.0]],
-    "next_ns": [[3, 1.0, 2.0]],
-    "kind = 2": [[1, 2, 2.0], [2, 1, 0.4]],
-    "made.input": [[0.4, 2, 0.15], [0.8, 2, 0.25]],
-    "recursive": [
-        ["/camera/retracks", "retrack", "/camera/samples"],
-        ["/camera/samples", "sample", "/camera/tracks"],
-        ["/camera/tracks", "track", "/camera/detections"],
-    ],
-    "from metrics": [["known", f"/camera/{name}", 1.0, 1.0, 0] for name in ("retracks", "samples", "tracks")],
-}
-
-
 @pytest.fixture(scope="module")
 def known(tmp_path_factory) -> Path:
     return known_log(tmp_path_factory.mktemp("known") / "known.mcap")
 
 
-@pytest.mark.parametrize("part", KNOWN)
-def test_examples_of_the_page_give_known_answers(known, part):
-    assert len(EXAMPLES) == len(KNOWN)
-    (query,) = (query for query in EXAMPLES if part in query)
-    with Database([known]) as database:
-        found = [row for row in rows_of(database.ask(query))[1] if "/camera/retracks/full" not in row]
-    assert len(found) == len(KNOWN[part])
-    for one, other in zip(found, KNOWN[part], strict=True):
-        assert one == pytest.approx(other)
+@pytest.fixture(scope="module")
+def exported(known) -> Path:
+    """The folder of the log, with its tables where the page has those of the demonstration."""
+    with log.read(known) as opened:
+        export(opened, known.parent / "demo.tables")
+    return known.parent
 
 
-@pytest.mark.parametrize("library", ["polars", "pandas"])
-def test_other_libraries_give_the_same_answers(square, answers, monkeypatch, library):
-    (block,) = re.findall(rf"```python\n(import {library} as .*?)```", PAGE, re.S)
-    monkeypatch.chdir(square)
-    names = {}
-    exec(block, names)
-    for name, column in (("seconds", "as visits"), ("begin", "as begin")):
-        found = names[name].rows() if library == "polars" else list(names[name].items())
-        (wanted,) = (rows for query, (_, rows) in answers.items() if column in query)
-        assert [row[0] for row in found] == [row[0] for row in wanted]
-        assert [row[-1] for row in found] == pytest.approx([row[-1] for row in wanted], abs=0.06)
+def test_queries_of_the_page_give_the_same_answers_in_duckdb(exported, known):
+    """That they are right, tests/test_documented_queries.py has; that they print what the page has, tests/test_docs.py."""
+    answered = 0
+    for query in QUERIES:
+        with chdir(exported), duckdb.connect() as connection:
+            connection.execute(PRELUDE)
+            asked = connection.sql(query)
+            wanted = asked.columns, [list(row) for row in asked.fetchall()]
+        with Database([known]) as database:
+            agree(rows_of(database.ask(query)), wanted)
+        answered += bool(wanted[1])
+    assert answered > 0.7 * len(QUERIES) > 9
 
 
 # Where tables come from
@@ -437,10 +352,10 @@ def test_a_file_that_is_not_a_log_is_refused(tmp_path):
     assert "no file matches" in refusal(tmp_path / "x*.mcap", "select 1")
 
 
-def test_a_damaged_table_is_refused(square, tmp_path):
+def test_a_damaged_table_is_refused(exported, tmp_path):
     damaged = tmp_path / "tracks/recording=a/part-0.parquet"
     damaged.parent.mkdir(parents=True)
-    source = square / "demo.tables/tracks/recording=demo/part-0.parquet"
+    source = exported / "demo.tables/tracks/recording=known/part-0.parquet"
     content = bytearray(source.read_bytes())
     where = pq.read_metadata(source).row_group(0).column(10)
     assert where.path_in_schema == "x_m"

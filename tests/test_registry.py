@@ -41,11 +41,10 @@ class Nearest:
 
 @pytest.fixture
 def installed(tmp_path, monkeypatch) -> Path:
-    """A folder that stands for installed packages, with one that has a tracker."""
     folder = tmp_path / "site"
     (folder / "own_trackers").mkdir(parents=True)
     (folder / "own_trackers" / "__init__.py").write_text(PLUGIN)
-    package(folder, "own-trackers", "1.5", "mcaptrack.trackers", {"nearest": "own_trackers:Nearest"})
+    package(folder, "own-trackers", "1.5", {"mcaptrack.trackers": {"nearest": "own_trackers:Nearest"}})
     monkeypatch.syspath_prepend(str(folder))
     yield folder
     for name in [name for name in sys.modules if name.partition(".")[0] == "own_trackers"]:
@@ -117,16 +116,16 @@ def test_a_class_that_inherits_from_a_built_in_one_is_another(monkeypatch):
 
 
 def test_built_in_names_cannot_be_taken(installed):
-    package(installed, "thief", "1", "mcaptrack.trackers", {"sort": "own_trackers:Nearest"})
+    package(installed, "thief", "1", {"mcaptrack.trackers": {"sort": "own_trackers:Nearest"}})
     assert names("tracker").count("sort") == 1
     assert find("tracker", "sort").cls is Sort
     (installed / "own_trackers" / "__init__.py").write_text("class Thief: ...")
-    package(installed, "another", "1", "mcaptrack.trackers", {"ocsort": "own_trackers:Thief"})
+    package(installed, "another", "1", {"mcaptrack.trackers": {"ocsort": "own_trackers:Thief"}})
     assert entry_of("tracker", find("tracker", "own_trackers:Thief").cls).name == "own_trackers:Thief"
 
 
 def test_two_packages_of_one_name_are_refused_unless_one_of_them_is_named(installed):
-    package(installed, "other", "2", "mcaptrack.trackers", {"nearest": "elsewhere:Nearest"})
+    package(installed, "other", "2", {"mcaptrack.trackers": {"nearest": "elsewhere:Nearest"}})
     for distribution in ("", "third"):
         with pytest.raises(
             McaptrackError, match=r"several installed packages have a tracker nearest: elsewhere:Nearest"
@@ -140,7 +139,7 @@ def test_of_a_package_that_is_installed_twice_the_first_counts(installed, tmp_pa
     later = tmp_path / "later"
     later.mkdir()
     package(
-        later, "Own.Trackers", "2.0", "mcaptrack.trackers", {"nearest": "elsewhere:Nearest", "other": "elsewhere:O"}
+        later, "Own.Trackers", "2.0", {"mcaptrack.trackers": {"nearest": "elsewhere:Nearest", "other": "elsewhere:O"}}
     )
     monkeypatch.setattr(sys, "path", [*sys.path, str(later)])
     assert names("tracker") == ("sort", "bytetrack", "ocsort", "ground", "nearest")

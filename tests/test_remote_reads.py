@@ -148,7 +148,6 @@ def test_the_oldest_is_forgotten_first(monkeypatch):
 @settings(max_examples=30, deadline=None)
 @given(st.data())
 def test_bytes_are_those_of_the_object(data):
-    """Whatever is announced and asked for, and however much is kept."""
     places = st.integers(0, SIZE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(remote, "_KEPT_BYTES", data.draw(st.sampled_from([200 * KIB, 64 * 2**20])))

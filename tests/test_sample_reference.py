@@ -21,7 +21,6 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def as_rows(frames: list[Frame]) -> list[tuple[int, dict[str, float]]]:
-    """All rows with their times."""
     return [(f.t_ns, {name: row[name].item() for name in row.dtype.names}) for f in frames for row in f.rows]
 
 

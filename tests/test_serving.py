@@ -266,7 +266,6 @@ def test_the_number_of_connections_is_limited(tmp_path):
 
 
 def exchange(server: Server, data: bytes) -> bytes:
-    """Send bytes, and return everything until the connection ends."""
     with connect(server) as connection:
         with suppress(OSError):  # it may be answered and closed before all is sent
             connection.sendall(data)

@@ -108,7 +108,6 @@ class TestWhatPredictorsAreGiven:
 
     @pytest.mark.parametrize("profile", ["default", "paper"])
     def test_retracking_gives_all_tracks_of_a_step_at_once(self, monkeypatch, profile):
-        """However many tracks are predicted at once."""
         rng = np.random.default_rng(1)
         frames = [frame(n, {k: (0.4 * n, 2 * k + rng.normal(0, 0.05)) for k in range(5)}) for n in range(12)]
         monkeypatch.setattr(likelihood, "_BATCH", 4)

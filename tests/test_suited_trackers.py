@@ -23,8 +23,6 @@ BOX = {"x_px": [10.0], "y_px": [10.0], "w_px": [8.0], "h_px": [20.0]}
 
 @dataclass(frozen=True, kw_only=True)
 class Plain:
-    """One box in each picture."""
-
     reads: ClassVar = VIDEO
     writes: ClassVar = {"": DETECTIONS}
     latency_s: ClassVar = {"": 0.0}

@@ -15,6 +15,7 @@ import resource
 import signal
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import duckdb
 import numpy as np
@@ -32,11 +33,12 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.schema import EVENTS, SCHEMAS, SIGHTINGS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.tables import TABLES, Pointers, text
+from mcaptrack.tables import TABLES, Pointers, build, files, messages, text
 from mcaptrack.tables import files as tables_files
 from mcaptrack.tables.fields import CODES
 from tests.commands import call
 from tests.logs import flat_table, write_channels
+from tests.memory import held
 from tests.strategies import columns
 from tests.tiers import one_in
 from tests.worlds import ns, table_to_frames, tracks_at
@@ -55,7 +57,6 @@ def pointers(frames):
 
 
 def some_tracks(people):
-    """A table of tracks, a frame a dictionary of people."""
     return tables.rows_in_pieces(TRACKS, {"/a": [Frame(n, n, tracks_at(who)) for n, who in enumerate(people)]}).table()
 
 
@@ -336,7 +337,6 @@ def two_tables():
 
 
 def same(path, form, table):
-    """Whether the file is whole and holds the table."""
     assert tables.verify(path, form) == table.num_rows if form in ("parquet", "arrow") else path.stat().st_size
     read = {
         "parquet": pq.read_table,
@@ -504,7 +504,6 @@ def test_a_table_is_written_in_pieces_that_lack_nothing(count, monkeypatch):
 
 
 def column(*values: object) -> pa.ChunkedArray:
-    """The column that a field with these values becomes."""
     pieces, _ = flat_table([{"a": value} for value in values], blobs=True)
     return pa.concat_tables(pieces).column("a")
 
@@ -584,3 +583,90 @@ def test_cameras_of_sightings_are_named_as_the_channel_says(tmp_path):
     with mcaptrack.open(write_channels(tmp_path / "a.mcap", channels)) as opened:
         table = opened.table("sightings")
     assert table["camera_name"].to_pylist() == ["west", "east", None, None, None, None]
+
+
+# Tables of single channels are made in parts: the same as of all messages at once, and without holding them
+
+
+NUMBERS = st.integers(-(2**64), 2**65) | st.sampled_from([0, 1, 2**53, 2**53 + 1, 2**63, -(2**63), 2**64 - 1])
+PLAIN = st.booleans() | NUMBERS | st.floats(allow_nan=False) | st.sampled_from(["", "a", "1"])
+LISTS = st.lists(st.integers(-3, 2**63), max_size=3) | st.lists(st.floats(0, 1), max_size=2) | st.just([])
+FIELDS = {
+    "flag": st.booleans(),
+    "whole": st.integers(0, 9),
+    "large": NUMBERS,
+    "number": st.integers(-5, 2**54) | st.floats(0, 1),
+    "text": st.text(max_size=3),
+    "list": LISTS,
+    "mixed": PLAIN | LISTS,
+    "parts": st.lists(
+        st.fixed_dictionaries({}, optional={"a": st.integers(0, 9), "b": st.text(max_size=2)}), max_size=3
+    ),
+    "blob": st.binary(max_size=3) | st.none(),
+}
+MESSAGES = st.lists(st.fixed_dictionaries({}, optional=FIELDS), max_size=12)
+
+
+def equals(value: object, stored: object) -> bool:
+    """Whether a stored value is the value: a struct has all fields, and what no type holds is JSON."""
+    if isinstance(value, dict) and isinstance(stored, dict):
+        return all(equals(value.get(name), stored[name]) for name in stored) and value.keys() <= stored.keys()
+    if isinstance(value, list) and isinstance(stored, list):
+        return len(value) == len(stored) and all(map(equals, value, stored))
+    if isinstance(stored, str) and stored != value:
+        return bool(json.loads(stored) == (value.hex() if isinstance(value, bytes) else value))
+    return bool(value == stored)
+
+
+@settings(max_examples=40)
+@given(MESSAGES, st.booleans(), st.integers(1, 5), st.integers(1, 300), st.integers(1, 6))
+def test_parts_give_the_table_of_all_messages(rows, blobs, count, piece, piece_rows):
+    whole, left_out = flat_table(rows, blobs)
+    expected = whole.table()
+    with (
+        patch.object(messages, "_PART_MESSAGES", count),
+        patch.object(messages, "PIECE_BYTES", piece),
+        patch.object(build, "PIECE_ROWS", piece_rows),
+    ):
+        pieces, without = flat_table(rows, blobs)
+        table = pa.concat_tables(list(pieces))
+    assert (table.schema, without) == (expected.schema, left_out)
+    assert table.equals(expected) or table.to_pylist() == expected.to_pylist()  # infinities in lists
+    assert table.column("message_offset").to_pylist() == list(range(len(rows)))
+    for name in table.column_names[7:]:
+        for row, stored in zip(rows, table.column(name).to_pylist(), strict=True):
+            assert equals(row.get(name), stored), name
+
+
+def test_a_channel_of_pictures_is_exported_without_holding_them(tmp_path):
+    """Pictures of 40 kB: with their bytes and without, the log may be of any length."""
+    random = np.random.default_rng(1)
+    pictures = [random.bytes(40_000) for _ in range(8)]
+
+    def export(count: int, blobs: bool) -> tuple[int, int]:
+        rows = [{"format": "raw", "data": pictures[n % 8]} for n in range(count)]
+
+        def work() -> None:
+            made, _ = flat_table(rows, blobs)
+            files.write(tmp_path / "a.parquet", made, {}, force=True)
+
+        before, pool = pa.default_memory_pool(), pa.proxy_memory_pool(pa.default_memory_pool())
+        pa.set_memory_pool(pool)
+        try:
+            _, most = held(work)
+        finally:
+            pa.set_memory_pool(before)
+        file = pq.ParquetFile(tmp_path / "a.parquet")
+        assert file.metadata.num_rows == count
+        if blobs:
+            assert file.read_row_group(file.num_row_groups - 1)["data"].to_pylist()[-1] == pictures[(count - 1) % 8]
+        return most, pool.max_memory()
+
+    with (
+        patch.object(messages, "_PART_MESSAGES", 4),
+        patch.object(messages, "PIECE_BYTES", 2**18),
+        patch.object(files, "_BYTES_READ", 2**18),
+    ):
+        for blobs in (False, True):
+            few, many = export(40, blobs), export(140, blobs)
+            assert sum(many) - sum(few) < 0.2 * 100 * 40_000

@@ -36,7 +36,6 @@ STEP_NS = 400_000_000
 
 
 def walkers(count: int = 6, ticks: int = 80, noise_m: float = 0.01, seed: int = 1) -> list[Frame]:
-    """People on parallel straight lines, each 8 m from the next, measured with noise."""
     rng = np.random.default_rng(seed)
     out = []
     for tick in range(ticks):
@@ -200,7 +199,6 @@ class TestCalibration:
 
     @pytest.mark.parametrize("together", [7, 60])
     def test_many_times_at_once_give_the_same_as_one_by_one(self, together):
-        """Tracks come and go, and there are times without tracks."""
         rng, predictor = np.random.default_rng(8), make("kalman", 12, 0.4)
         step = np.repeat(np.array([*range(30), *range(47, 77)]), 9)
         ids, coasts = np.tile(np.arange(9), 60) + 9 * (step // 10), rng.random(540) < 0.1
@@ -414,7 +412,6 @@ def test_what_moves_and_people_are_predicted_as_without_velocities(class_id: int
 
 @pytest.mark.usefixtures("as_predicted")
 def test_a_car_that_has_just_stopped_may_go_on():
-    """Its history still has the way that it went."""
     stopped, stands = (axis_m(last_forecast(3, speed, True, stops=3)) for speed in (8.0, 0.0))
     assert stopped > 3 * stands
 

@@ -19,14 +19,11 @@ from tests.extension_cases import of_extensions
 
 
 def _results(path: Path) -> dict[str, tuple[int, ...]]:
-    """The times of the messages of every channel of a log."""
     with log.read(path) as opened:
         return {name: tuple(opened.times(name).tolist()) for name in opened.channels}
 
 
 def _of_copy(work: Callable[[Path, str, Path], object]) -> Callable[[Path, str, Path], Any]:
-    """What a log holds after work on a copy."""
-
     def done(path: Path, topic: str, folder: Path) -> Any:
         work(path, topic, folder / "copy.mcap")
         return _results(folder / "copy.mcap")

@@ -95,7 +95,6 @@ def ends_of_ranges(kind) -> dict[str, list]:
 @given(data=st.data(), seed=SEEDS)
 @settings(max_examples=5)
 def test_options_at_the_ends_of_their_ranges_run_without_warnings(name, data, seed):
-    """Any options at the least or greatest value that they accept: rows conform to the schema, and no warnings."""
     kind = KINDS[name]
     base = data.draw(st.sampled_from(list(PROFILES.values()))) if name == "retrack" else kind()
     ends = ends_of_ranges(type(base))

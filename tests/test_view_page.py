@@ -39,7 +39,6 @@ def pictures(finished, tmp_path) -> Path:
 
 
 def index_of(server: mcaptrack.LogServer) -> dict:
-    """The data in the first page."""
     status, _, body = ask(server.address)
     assert status == 200
     reader = Reader(body.decode())
@@ -47,7 +46,6 @@ def index_of(server: mcaptrack.LogServer) -> dict:
 
 
 def inside(server: mcaptrack.LogServer, address: str) -> Reader:
-    """A page that the first one shows."""
     return Reader(ask(server.address.rstrip("/") + address)[2].decode())
 
 

@@ -286,7 +286,6 @@ def test_stamps_are_those_of_the_pictures_where_they_differ_from_the_log():
 
 
 def test_drawings_are_independent_of_batches():
-    """Messages are made in batches; where one ends is not to be seen."""
     pictures = np.arange(600) * ns(0.1)
     frames = [Frame(int(t), n, boxed({2: (n, 5), 5: (5, n)})) for n, t in enumerate(pictures)]
     whole = list(view("/c/tracks", TRACKS, frames, pictures, PLANE))

@@ -36,7 +36,6 @@ BLANK = np.full((360, 640, 3), 128, np.uint8)
 
 
 def shown(scene: SyntheticScene) -> list[dict[int, tuple[np.ndarray, np.ndarray]]]:
-    """For each picture the boxes (4,) and places (2,) of the people who are whole in it, by their numbers."""
     pictures = []
     for shot in scene.shots(draw=False):
         ends = np.concatenate([shot.boxes[:, :2], shot.boxes[:, :2] + shot.boxes[:, 2:]], axis=1)
