@@ -154,3 +154,9 @@ SCHEMA_VERSION: int
 # exporter cvat: mcaptrack.extensions.exchange
 # exporter kitti: mcaptrack.extensions.exchange
 # exporter rerun: mcaptrack.extensions.rerun
+# exporter rosbag2: mcaptrack.extensions.bags
+# exporter rosbag2-sqlite3: mcaptrack.extensions.bags
+# recording rosbag: mcaptrack.extensions.bags
+# ending .bag: mcaptrack.extensions.bags
+# ending .db3: mcaptrack.extensions.bags
+# ending metadata.yaml: mcaptrack.extensions.bags

@@ -16,16 +16,15 @@ from rosbags.rosbag1 import Writer as BagWriter
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.bags.metadata_yaml import read_metadata
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK
-from mcaptrack.sources.ingest import IngestOptions, IngestReport, RecordingJob, ingest
-from mcaptrack.sources.ingest.bags import decompression, plain_yaml
-from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
-from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError
+from mcaptrack.sources.ingest import IngestOptions, IngestReport, RecordingJob, decompression, ingest, plain_yaml
 from mcaptrack.sources.ingest.job import FOR_VIDEOS
 from mcaptrack.sources.ingest.labels.timeline import CameraTopics, camera_prefix, choose_camera
+from mcaptrack.sources.ingest.plain_yaml import UnsupportedYamlError
 from tests.bags import ROS1, STRING1, T0, bag1
 from tests.logs import provenance_of
 from tests.worlds import ns

@@ -21,10 +21,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log
+from mcaptrack.extensions.bags import metadata_yaml
 from mcaptrack.schema import SCHEMAS, TRACKS
 from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bags import metadata_yaml
 from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
 from tests.logs import recorder

@@ -48,6 +48,7 @@ Kind = Literal[
     "stage",
     "label_format",
     "message_reader",
+    "recording",
     "exporter",
     "judge",
     "command",
@@ -70,7 +71,7 @@ _COMMANDS: Final = (
     "evaluate events zones calibrate check recover drop doctor"
 )
 #: Kinds that only entry points name.
-_BY_ENTRY_POINT: Final = ("stage", "message_reader", "command", "page", "player", "viewer", "name")
+_BY_ENTRY_POINT: Final = ("stage", "message_reader", "recording", "command", "page", "player", "viewer", "name")
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
@@ -149,9 +150,10 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "visualization_msgs/MarkerArray": f"{_SOLIDS}:marker_solids",
             "visualization_msgs/Marker": f"{_SOLIDS}:marker_solids",
         },
+        # Of other containers than MCAP, by what their names or first bytes say.
+        "recording": {},
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
-            **dict.fromkeys(("rosbag2", "rosbag2-sqlite3"), "mcaptrack.tables.rosbag2:write_bag"),
             "mot": "mcaptrack.tables.box_files:MotFile",
         },
         "judge": {},

@@ -28,7 +28,6 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions, fitted
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts
@@ -70,7 +69,7 @@ def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[l
     their own ground truth.
     """
     for path in tracks:
-        if is_mcap(path):
+        if log.is_mcap(path):
             labels = ground_truths[0] if len(ground_truths) == 1 else "LABELS"
             add = call("ingest", labels, role="truth", into=path)
             raise McaptrackError(

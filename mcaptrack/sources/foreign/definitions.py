@@ -498,6 +498,6 @@ def unpacked(payload: bytes) -> bytes:
     """A CDR message, decompressed if it is compressed. Raises ValueError."""
     if not is_packed(payload):
         return payload
-    from mcaptrack.sources.ingest.bags.decompression import unzstd
+    from mcaptrack.sources.ingest.decompression import unzstd
 
     return unzstd(payload, _MAX_MESSAGE_BYTES)

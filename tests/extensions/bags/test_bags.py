@@ -19,15 +19,15 @@ from rosbags.rosbag1 import Writer as Writer1
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.bags import rosbag2
+from mcaptrack.extensions.bags.metadata_yaml import names_file
+from mcaptrack.extensions.bags.rosbag2 import open_bag, open_files
+from mcaptrack.extensions.bags.sqlite_tables import SqliteTables
 from mcaptrack.notices import collected
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
-from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.bags import decompression, rosbag2
-from mcaptrack.sources.ingest.bags.metadata_yaml import names_file
-from mcaptrack.sources.ingest.bags.recording import ReadingNotes
-from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
-from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
+from mcaptrack.sources.ingest import IngestOptions, decompression, ingest
+from mcaptrack.sources.ingest.recording import ReadingNotes
 from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database, plain
 from tests.logs import recorder
 
