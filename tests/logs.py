@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,8 @@ from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.tables import TablePieces, messages
-from tests.commands import LACKS, zones_file
+from tests.commands import zones_file
+from tests.extension_cases import of_extensions
 from tests.worlds import boxes_at, ns, tracks_at
 
 SCHEMA = ("test.Thing", "jsonschema", b"{}")
@@ -158,7 +158,7 @@ def some_log(path, **more):
     return path
 
 
-#: How each command is run so that it only reads the log; nothing comes into the log's folder.
+#: How each command is run so that it only reads the log, and writes to another folder.
 READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "check": lambda log, out: [log],
     "cut": lambda log, out: [log, "-o", out / "cut.mcap"],
@@ -169,20 +169,19 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "ingest": lambda log, out: [log, "-o", out / "ingested.mcap"],
     "query": lambda log, out: [log, "select count(*) from tracks"],
     "recover": lambda log, out: [log, "-o", out / "recovered.mcap"],
-    "render": lambda log, out: [log, "-o", out / "rendered.gif", "--width", "64", "--end-s", "0.2"],
-    "report": lambda log, out: [log, "-o", out / "report.html"],
-    "review": lambda log, out: [log, "--print"],
-    "tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"],
     "zones": lambda log, out: [log, "--zones", zones_file(out), "-o", out / "other.mcap"],
     "view": lambda log, out: [log, "--layout", "no such layout"],
     **{
         name: lambda log, out: [log, "-o", out / "other.mcap"]
         for name in ("detect", "motion", "track", "sample", "predict", "retrack", "run", "fuse", "events")
     },
-}
-if find_spec("torch"):  # without it `train` reads nothing
-    READING["train"] = lambda log, out: [log, "-o", out / "trained", "--epochs", "1", "--device", "cpu"]
-READING = {name: words for name, words in READING.items() if name not in LACKS}
+} | {name: words for name, words in of_extensions("READING").items() if words}
+
+
+def on_a_log(command: str, log: Path, out: Path) -> list[object]:
+    """The words of a command that reads a log, and writes into it if it can."""
+    words = READING[command](log, out)
+    return words[:-2] if words[-1] == out / "other.mcap" else words
 
 
 def flat_table(rows: Sequence[Mapping[str, object]], blobs: bool) -> tuple[TablePieces, list[str]]:

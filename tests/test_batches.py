@@ -9,14 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import GROUP, LACKS, call, zones_file
+from tests.commands import GROUP, call, zones_file
+from tests.logs import READING
 from tests.tiers import one_in
 
-#: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
-COMBINING = {"cut", "report", "query", "evaluate", "tune", "train"}
-SEVERAL = {name for name, command in GROUP.commands.items() if any(one.nargs == -1 for one in command.params)} - {
-    "drop"
+SEVERAL = {
+    name
+    for name, command in GROUP.commands.items()
+    if any(one.nargs == -1 for one in command.params) and "output" in command.settings and name != "drop"
 }
+#: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
+COMBINING = {name for name in SEVERAL if "jobs" not in GROUP.commands[name].settings}
 WORDS = {"query": ["select 1"]}
 
 
@@ -68,17 +71,9 @@ def test_a_missing_input_is_one_line(folder):
 
 def test_a_command_that_combines_inputs_needs_all_of_them(folder):
     before = sorted(folder.rglob("*"))
-    for command in sorted(COMBINING - {"train"} - LACKS):  # which needs torch
-        more = [] if command == "tune" else ["--json"]
-        outcome = call(
-            command,
-            "a.mcap",
-            "broken.mcap",
-            *WORDS.get(command, []),
-            "-o",
-            "out.mcap" if command == "cut" else "out.html",
-            *more,
-        )
+    for command in sorted(COMBINING & READING.keys()):
+        name = {"cut": "out.mcap", "tune": "out.toml"}.get(command, "out.html")
+        outcome = call(command, "a.mcap", "broken.mcap", *WORDS.get(command, []), "-o", name)
         assert (outcome.code, outcome.out) == (1, "")
         assert "broken.mcap" in outcome.err
         assert sorted(folder.rglob("*")) == before

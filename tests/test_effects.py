@@ -32,6 +32,7 @@ from mcaptrack.viewing.serving import Server
 from tests.bags import plain
 from tests.commands import GROUP, call, done, press_ctrl_c
 from tests.effects.commands import CASES
+from tests.extension_cases import of_extensions
 from tests.models import DATA, stocked
 from tests.tiers import one_in
 from tests.undefined import write_undefined
@@ -61,8 +62,9 @@ def parameters(command: str) -> set[str]:
 
 
 def test_every_option_has_a_case():
+    elsewhere = {name for name, effects in of_extensions("EFFECTS").items() if effects is None}
     for command, known in Commands().items():
-        if command in ("train", "review"):  # need torch, and doubtful tracks: see test_training and test_review
+        if command in elsewhere:
             continue
         options = set(known.settings)
         options -= {name.replace("_", "-") for name in NAMES}  # see test_many_logs
@@ -82,7 +84,6 @@ def template(template, tmp_path_factory) -> Path:
         words = ("--as", "detections", "--fps", 10, "--camera", camera, "--ground-plane", folder / "plane.txt")
         done("ingest", folder / "truth.txt", *words, where, folder / "two.mcap")
     (folder / "walk.txt").write_text("\n".join(walk) + "\n")
-    (folder / "old.html").write_text("")
     with log.create(folder / "things.mcap") as writer:
         channel = writer.add_channel("/things", ("my_msgs/Things", "jsonschema", b"{}"), "json", {})
         for number in range(40):
@@ -117,7 +118,6 @@ def template(template, tmp_path_factory) -> Path:
     for path in [*(folder / "taken").glob("*/recording=fresh")]:
         path.rename(path.with_name("recording=a"))
     (folder / "taken" / "demo.mcap").write_text("")
-    done("tune", folder / "a.mcap", "--trials", 2, "--study", folder / "old.jsonl", "-o", folder / "x.toml")
     return folder
 
 
@@ -254,7 +254,7 @@ def test_an_option_has_an_effect(command, option, see):
 #: Options that need data of their own to be seen: rules that differ in rare frames, a table that isn't asked for, classes.
 BY_DATA = ("set", "seed", "with", "classes")
 #: Other things that commands are used for: an option that does nothing there has to be refused, or a line says so.
-ALSO = {
+USES = {
     "evaluate": [
         "evaluate a.mcap",
         "evaluate a.mcap --similarity iou",
@@ -263,16 +263,6 @@ ALSO = {
     ],
     "events": ["events a.mcap --similarity iou", "events a.mcap --similarity metres"],
     "query": ["query a.mcap 'from events'", "query a.mcap 'from events' --format csv", "query a.mcap --tables"],
-    "tune": [
-        "tune a.mcap --trials 1",
-        "tune tall.txt --truth truth.txt --trials 1 --fps 10",
-    ],
-    "render": [
-        "render a.mcap -o b.mp4",
-        "render a.mcap --blur people -o c.mcap",
-        "render a.mcap --compare --end-s 0.2",
-        "render a.mcap --heatmap",
-    ],
     "ingest": [
         "ingest truth.txt --fps 10 --as truth",
         "ingest truth.txt --fps 10 --as truth --ground-plane plane.txt",
@@ -280,11 +270,11 @@ ALSO = {
         "ingest clip.mp4",
         "ingest clip.mp4 --image-format jpeg",
     ],
-}
+} | of_extensions("USES")
 
 
 @pytest.mark.parametrize(
-    ("command", "base"), one_in(9, [(name, base) for name, bases in ALSO.items() for base in bases])
+    ("command", "base"), one_in(9, [(name, base) for name, bases in USES.items() for base in bases])
 )
 def test_an_option_without_effect_is_a_warning(command, base, see):
     before, silent = KNOWN.get(base) or see(base), []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import tomllib
@@ -14,7 +15,8 @@ import yaml
 
 from mcaptrack.installed import declared
 
-ROOT = Path(__file__).parent.parent
+TESTS = Path(__file__).parent
+ROOT = TESTS.parent
 POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
 EXTENSIONS = sorted(path.parent.name for path in (ROOT / "mcaptrack" / "extensions").glob("*/__init__.py"))
 #: Groups of what users choose by name, beside commands and names in Python.
@@ -137,6 +139,13 @@ def test_entry_points_of_a_folder_that_is_gone_do_not_count(tmp_path):
 def test_every_extension_has_a_folder_of_tests_and_every_entry_point_a_folder():
     tested = {path.name for path in (ROOT / "tests" / "extensions").iterdir() if list(path.glob("test_*.py"))}
     assert set(EXTENSIONS) == tested == {room_of(value) for points in POINTS.values() for value in points.values()}
+
+
+def test_every_table_of_cases_is_one_that_a_test_of_the_core_gathers():
+    asked = {name for path in TESTS.rglob("*.py") for name in re.findall(r'of_extensions\("(\w+)"\)', path.read_text())}
+    for path in (TESTS / "extensions").glob("*/cases.py"):
+        tables = set(re.findall(r"^([A-Z]\w*)(?:: .*)? = ", path.read_text(), re.M))
+        assert tables <= asked, path
 
 
 def test_the_installed_entry_points_are_those_of_the_project():

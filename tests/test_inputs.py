@@ -12,20 +12,16 @@ import pytest
 
 from mcaptrack.cli.common import refuse_url
 from mcaptrack.errors import McaptrackError
-from mcaptrack.transforms import TRANSFORMS
 from tests.commands import GROUP, call
 
 COMMANDS = GROUP.commands
-#: Arguments that are words, some of which are paths.
-WORDS = {("query", "words"), ("train", "sources")}
-STAGES = TRANSFORMS
 
 
 def takes_paths(command: str) -> list[Any]:
     """Return the parameters of a command that have type Path, except config, which is read earlier."""
     parameters = inspect.signature(COMMANDS[command].callback).parameters
     paths = {name for name, one in parameters.items() if "Path" in str(one.annotation)} - {"config"}
-    return [p for p in COMMANDS[command].params if p.name in paths or (command, p.name) in WORDS]
+    return [p for p in COMMANDS[command].params if p.name in paths or (command, p.name) == ("query", "words")]
 
 
 PATHS = [(name, parameter) for name in COMMANDS for parameter in takes_paths(name)]
@@ -59,28 +55,8 @@ def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch):
         assert said == f"https://example.org/a/b?... {words}", (name, parameter.name)
 
 
-#: Arguments that are logs, which may be in a store.
-LOGS = {
-    (name, "logs")
-    for name in (
-        *STAGES,
-        *[
-            "run",
-            "fuse",
-            "calibrate",
-            "events",
-            "zones",
-            "recover",
-            "cut",
-            "render",
-            "info",
-            "check",
-            "export",
-            "report",
-        ],
-    )
-}
-LOGS |= {("query", "words"), ("evaluate", "inputs")}
+#: Arguments that are logs, which may be in a store, beside those that are called so.
+LOGS = {("query", "words"), ("evaluate", "inputs")}
 
 
 def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch):
@@ -88,7 +64,8 @@ def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "obstore", None)
     for name, parameter in PATHS:
         said = said_of(name, parameter, "s3://bucket/a/b.mcap")
-        where = "Amazon S3, which needs obstore, " if (name, parameter.name) in LOGS else "a store, "
+        is_log = (name, parameter.name) in LOGS or parameter.name == "logs"
+        where = "Amazon S3, which needs obstore, " if is_log and name != "drop" else "a store, "
         assert said.startswith(f"s3://bucket/a/b.mcap is in {where}"), (name, parameter.name)
 
 

@@ -1,4 +1,5 @@
-"""What commands print, as a whole: each command line and its lines are those in tests/printed.txt.
+"""What commands print, as a whole: each command line and its lines are those in tests/printed.txt,
+those of extensions in tests/extensions/NAME/printed.txt.
 
 A text that was changed on purpose is written anew by ``PRINTED=write pytest tests/test_printed.py``; the difference of
 the file is what changes for users. What varies between systems is replaced by #: times, bytes and versions.
@@ -33,9 +34,9 @@ from mcaptrack.notices import Notice
 from mcaptrack.pipeline.several import CameraResult
 from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores
 from tests.commands import call, run_result, zones_file
+from tests.extension_cases import EXTENSIONS, of_extensions
 from tests.worlds import write_clip
 
-SNAPSHOT = Path(__file__).parent / "printed.txt"
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
 #: What differs from system to system or from release to release, and isn't what a text is about.
@@ -270,37 +271,6 @@ def of_calibration(to: Transcript) -> None:
         to.run("calibrate x.mcap", calibrate=result)
 
 
-SCORES = {"IDF1": 0.75, "MOTA": 0.5, "HOTA": 0.25, "IDSW": 1, "FP": 2, "FN": 3}
-
-
-def tuned(best: int = 3, similarity: str = "iou", **changed: Any) -> mcaptrack.TuneResult:
-    given = {"stage": "track", "metric": "IDF1", "settings": {"max_age_s": 2.5}, "scores": SCORES, "trials": 7}
-    return mcaptrack.TuneResult(
-        **given | changed,
-        default_scores=SCORES | {"IDF1": 0.5},
-        best=best,
-        similarity=similarity,
-        notes=(),
-        warnings=(),
-    )
-
-
-def of_tuning(to: Transcript) -> None:
-    to.run("tune x.mcap", tune=tuned())
-    to.run("tune x.mcap -o b.toml --metric mota --stage sample", tune=tuned(metric="MOTA", stage="sample"))
-    to.lines += Path("mcaptrack.toml").read_text().splitlines() + Path("b.toml").read_text().splitlines()
-    to.run("tune x.mcap -o c.toml --json", tune=tuned(best=0))
-    for words, similarity in (
-        ("--gate-m 1 --min-iou 0.4", "iou"),
-        ("--gate-m 1 --min-iou 0.4", "metres"),
-        ("--tracker sort --stage sample", "iou"),
-        ("--fps 5 --camera c", "iou"),
-        ("--truth t.txt --fps 5 --camera c --topic /t", "iou"),
-        ("--truth t.txt --ground-plane p.txt", "iou"),
-    ):
-        to.run(f"tune x.mcap -o c.toml -q {words}", shows_answer=False, tune=tuned(best=0, similarity=similarity))
-
-
 def of_answers(to: Transcript) -> None:
     answer = pa.table({"n": [1, 1000], "word": ["a\x1b[31m", "x" * 70], "x": [0.5, None]})
     for more in ("", "--rows 1", "--rows 1 -q", "--rows 1 --format csv", "--format jsonl", "--json"):
@@ -363,14 +333,12 @@ def of_many_logs(to: Transcript) -> None:
 
 
 def of_mistakes(to: Transcript) -> None:
-    for command in ("detect", "track", "sample", "predict", "retrack", "run", "events", "render", "recover", "ingest"):
+    for command in ("detect", "track", "sample", "predict", "retrack", "run", "events", "recover", "ingest"):
         to.run(f"{command} x.mcap y.mcap -o z.mcap")
     for gates in ("0", "1,-1", "inf", "nan", "1,", "''"):
         to.run(f"evaluate x.mcap --gate-m {gates}")
     for limit in ("idf1", "idf1=", "luck=1"):
         to.run(f"evaluate x.mcap --fail-under {limit}")
-    for search in ("min-iou=0.1", "min-iou=1:2:3", "min-iou=", "min-iou=a:b"):
-        to.run(f"tune x.mcap --search {search}")
     for words in ("alpha", "alhpa=1", "alpha=x", "min_hits=1.5", "trim_ends=maybe", "alpha=1 --set alpha=2",
                   "link_s=1 --link-s 2", "alpha=2 --profile paper"):  # fmt: skip
         to.run(f"retrack a.mcap --set {words}")
@@ -388,21 +356,28 @@ def of_mistakes(to: Transcript) -> None:
 
 PARTS: Sequence[tuple[str, Callable[[Transcript], None]]] = (
     ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Zones", of_zones), ("Contents", of_contents),
-    ("Check and recover", of_upkeep), ("Calibrate", of_calibration), ("Tune", of_tuning), ("Query", of_answers),
+    ("Check and recover", of_upkeep), ("Calibrate", of_calibration), ("Query", of_answers),
     ("Many logs", of_many_logs), ("Mistakes", of_mistakes),
 )  # fmt: skip
 
 
-def test_commands_print_what_the_snapshot_has(tmp_path, monkeypatch):
+#: By the file with what they print: the parts of the core, and those of extensions.
+SNAPSHOTS = {Path(__file__).with_name("printed.txt"): PARTS} | {
+    EXTENSIONS / name / "printed.txt": [(name, part)] for name, part in of_extensions("PRINTED").items()
+}
+
+
+@pytest.mark.parametrize("snapshot", SNAPSHOTS, ids=lambda path: path.parent.name)
+def test_commands_print_what_the_snapshot_has(snapshot, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("x.mcap", "y.mcap", "z.mcap", "bad.sql"):
         Path(name).write_bytes(b"\xff")
     Path("q.sql").write_text("select 2")
     to = Transcript()
-    for title, part in PARTS:
+    for title, part in SNAPSHOTS[snapshot]:
         to.head(title)
         part(to)
     found = [*to.lines[1:], ""]
     if os.environ.get("PRINTED") == "write":
-        SNAPSHOT.write_text("\n".join(found), encoding="utf-8")
-    assert found == SNAPSHOT.read_text(encoding="utf-8").split("\n")
+        snapshot.write_text("\n".join(found), encoding="utf-8")
+    assert found == snapshot.read_text(encoding="utf-8").split("\n")

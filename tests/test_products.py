@@ -17,6 +17,7 @@ import pytest
 import mcaptrack
 from mcaptrack import fleet
 from mcaptrack.errors import McaptrackError
+from tests.extension_cases import of_extensions
 from tests.interrupted import CALLS, killed
 from tests.tiers import one_in, thorough
 
@@ -321,15 +322,11 @@ def test_scores_of_two_logs_of_one_name_are_not_mixed(finished, tmp_path):
 
 #: What writes a file or folder beside a log, as functions of the log and of what to write.
 WRITTEN: dict[str, Callable[[Path, Path], object]] = {
-    "a.mp4": lambda path, output: mcaptrack.render(path, output=output),
-    "a.gif": lambda path, output: mcaptrack.render(path, output=output),
-    "a.html": lambda path, output: mcaptrack.report(path, output=output),
     "bag": lambda path, output: mcaptrack.export(path, output, form="rosbag2"),
     "old bag": lambda path, output: mcaptrack.export(path, output, form="rosbag2-sqlite3"),
     "a.mot.txt": lambda path, output: mcaptrack.export(path, output, form="mot"),
     "a.mcap": lambda path, output: mcaptrack.drop(path, ["/camera/truth"], output=output),
-    "a.trials.jsonl": lambda path, output: mcaptrack.tune(path, study=output, trials=3),
-}
+} | of_extensions("WRITTEN")
 
 
 @pytest.mark.parametrize("name", WRITTEN)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import html
-import json
 import re
 import shutil
 import subprocess
@@ -26,6 +24,7 @@ from mcaptrack.viewing import serving
 from tests import places
 from tests.bags import bag1
 from tests.commands import GROUP, call, done, zones_file
+from tests.extension_cases import of_extensions
 from tests.interrupted import interrupt
 from tests.models import stocked
 from tests.robots import write_log
@@ -75,17 +74,6 @@ class Scene:
         """Add a file of 3D labels."""
         Path("cubes.csv").write_text("t,id,x_m,y_m\n0,1,2,3\n1,1,2,3\n")
         return self
-
-    def reviewed(self) -> str:
-        """Answer the first question."""
-        (name, *_) = mcaptrack.review(self.path, questions=1).questions
-        Path("answers.json").write_text(json.dumps({name: "yes"}))
-        return self.says("review", "LOG", "--answers", "answers.json")
-
-    def page(self) -> str:
-        """Return the text of a report."""
-        done("report", f"./{NAME}", "-o", "page.html")
-        return html.unescape(re.sub(r"<[^>]*>", "", re.sub(r"</?code>", "`", Path("page.html").read_text())))
 
     def damaged(self) -> str:
         """Change a byte of each chunk except the last."""
@@ -165,13 +153,6 @@ class Scene:
         path.write_bytes(b"damaged")
         return self.says("detect", "LOG", "--detector", "yolox-nano")
 
-    def to_train_on(self) -> str:
-        from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
-
-        with pytest.raises(McaptrackError) as refused:
-            read_scenes([self.path], SourceOptions(), 0.4)
-        return with_flags(str(refused.value))
-
     def followed(self) -> str:
         """A log without tracks, and one that follows it."""
         shutil.copy(self.path, "next.mcap")
@@ -203,12 +184,8 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/running.py:warn_stale:run": lambda s: s.says("detect", "LOG", "--detector", "knn"),
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:products:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
-    "extensions/training/command.py:show:predict": lambda s: s.says(
-        "train", "synthetic", "--walks", "1000", "--epochs", "1", "-o", "my net"
-    ),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
-    "extensions/report/figures.py:identity_events:view": Scene.page,
     "api/viewing.py:_note_trouble:ingest": lambda s: s.says("view", "LOG", "--links"),
     "api/viewing.py:view:run": lambda s: s.ingested("clip.mp4", "--truth", "truth.txt").says("view", "LOG", "--links"),
     "pipeline/views.py:with_views:run": Scene.without_temporary_folder,
@@ -245,19 +222,9 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
-    "pipeline/drawing.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
-    "extensions/render/blur/recording.py:blurrable:run": lambda s: s.ingested("clip.mp4").says(
-        "render", "LOG", "--blur", "people", "-o", "c.mcap"
-    ),
-    "extensions/render/comparing.py:find_panels:run": lambda s: s.untracked().says("render", "LOG", "--compare"),
-    "extensions/render/heat_map.py:_channel:run": lambda s: s.ingested("clip.mp4").says("render", "LOG", "--heatmap"),
     "viewing/zones_page.py:zones_page:run": lambda s: s.ingested("truth.txt", "--as", "detections", "--fps", "10").says(
         "zones", "draw", "LOG"
     ),
-    "extensions/report/contents.py:_score:ingest": lambda s: s.without("/camera/truth*").page(),
-    "extensions/report/page.py:_without_ground_truth:run": lambda s: s.ingested("clip.mp4").page(),
-    "extensions/report/sections.py:scores:run": lambda s: s.ingested("clip.mp4").page(),
-    "extensions/report/sections.py:forecasts:predict": lambda s: s.without("*predictions*").page(),
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(
         "evaluate", "tracks.csv", "--truth", "truth.txt"
     ),
@@ -266,13 +233,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "sources/ingest/job.py:read:ingest": lambda s: (
         s.without("/camera/truth*").cubes().says("ingest", "clip.mp4", "--truth", "cubes.csv")
     ),
-    "extensions/review/questions.py:solve:run": lambda s: s.untracked().says("review", "LOG"),
-    "extensions/review/command.py:show:review": Scene.reviewed,
-    "extensions/training/sources.py:_from_log:run": lambda s: s.ingested("clip.mp4").to_train_on(),
-}
-
-
-SCENES = {where: scene for where, scene in SCENES.items() if (PACKAGE / where.partition(":")[0]).exists()}
+} | of_extensions("PROPOSALS")
 
 
 def functions(tree: ast.AST) -> Iterator[tuple[str, ast.AST]]:
@@ -339,8 +300,6 @@ def words_of(line: str) -> list[str]:
 
 @pytest.mark.parametrize("where", one_in(6, SCENES))
 def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, request):
-    if where.startswith("cli/train"):
-        pytest.importorskip("torch", reason="training needs torch")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     verb = where.rpartition(":")[2]

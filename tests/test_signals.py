@@ -2,38 +2,44 @@
 
 from __future__ import annotations
 
-import shlex
 import shutil
 import signal
 import tempfile
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+from mcaptrack.cli.group import Commands
 from tests import bounded
-from tests.commands import GROUP, ONLY_READ, done
-from tests.effects.commands import line_of
+from tests.commands import ONLY_READ, done
+from tests.extension_cases import of_extensions
+from tests.logs import READING, on_a_log
 from tests.tiers import one_in
 
 #: Seconds of processor time that a command may still take: the time on a clock depends on what else the machine does.
 SOON_S = 2
 SIGNALS = {"Ctrl-C": signal.SIGINT, "kill": signal.SIGTERM}
+#: Command lines other than on a log with all results.
+LINES = {
+    "demo": "demo", "docs": "docs tables", "doctor": "doctor", "ingest": "ingest clip.mp4", "models": "models",
+    "run": "run fresh.mcap", "view": "view a.mcap",
+}  # fmt: skip
 #: What is looked at of a command, where it is not the reading, and the writing and publishing of those that write.
 DEEDS = {
     "demo": ["write"],
     "doctor": ["write"],
-    "calibrate": [],  # it has no log of several cameras here
     "fuse": [],  # it has no log of several cameras here
-    "models": ["read"],
-    "review": ["read"],
-    "tune": ["read", "write"],
     "view": ["read", "serve"],
-}
+} | of_extensions("DEEDS")
 MOMENTS = [
     (command, deed)
-    for command in GROUP.commands
-    for deed in DEEDS.get(command, ["read"] if command in ONLY_READ else ["read", "write", "publish"])
+    for command in sorted(LINES.keys() | READING.keys())
+    for deed in DEEDS.get(command)
+    or (
+        ["read"]
+        if command in ONLY_READ or "output" not in Commands()[command].settings
+        else ["read", "write", "publish"]
+    )
 ]
 #: Where these commands read or write; all others do so in the working folder.
 ELSEWHERE = {"docs": Path(__file__).parent.parent / "docs", "doctor": Path(tempfile.gettempdir())}
@@ -56,12 +62,11 @@ def folder(template, tmp_path_factory) -> Path:
 @pytest.mark.parametrize("number", one_in(3, range(len(MOMENTS))), ids=[" ".join(moment) for moment in MOMENTS])
 def test_a_signal_ends_a_command_and_leaves_the_files_unchanged(number, commands, folder):
     command, deed = MOMENTS[number]
-    if command == "train" and not find_spec("torch"):
-        pytest.skip("train needs torch")
     where = ELSEWHERE.get(command, folder)
     name = list(SIGNALS)[number // 2 % 2]
+    words = LINES[command].split() if command in LINES else [command, *on_a_log(command, folder / "a.mcap", folder)]
     before = contents(folder)
-    outcome = commands.end(bounded.Moment(deed, where, SIGNALS[name]), *shlex.split(line_of(command)))
+    outcome = commands.end(bounded.Moment(deed, where, SIGNALS[name]), *words)
     assert outcome.code == 128 + SIGNALS[name], outcome
     assert "Traceback" not in outcome.err
     assert outcome.cpu_s - outcome.signal_cpu_s < SOON_S

@@ -16,7 +16,7 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import find_topic
-from tests.commands import LACKS
+from tests.extension_cases import of_extensions
 
 
 def _results(path: Path) -> dict[str, tuple[int, ...]]:
@@ -65,22 +65,8 @@ FUNCTIONS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     "drop": ("decisions", _of_copy(lambda p, t, o: mcaptrack.drop(p, t, output=o))),
     "cut": ("tracks", lambda p, t, o: mcaptrack.cut(p, o / "copy.mcap", topic=t).messages),
     "export": ("tracks", lambda p, t, f: dict(mcaptrack.export(p, f / "a.txt", form="mot", topic=t).rows)),
-    "render": ("tracks", lambda p, t, f: mcaptrack.render(p, f / "a.mp4", topic=t, end_s=0.3).views),
     "evaluate": ("tracks", lambda p, t, _: repr(mcaptrack.evaluate(p, topic=t).rows)),
-    "tune": (
-        "detections",
-        lambda p, t, f: mcaptrack.tune(p, stage="track", topic=t, trials=1, study=f / "a.jsonl").scores,
-    ),
-    "train": ("tracks", lambda p, t, _: _scenes(p, t)),
-}
-
-
-def _scenes(path: Path, topic: str) -> list[bytes]:
-    from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
-
-    return [scene.xy_m.tobytes() for scene in read_scenes([path], SourceOptions(topic=topic), 0.4)]
-
-
+} | of_extensions("TOPICS")
 METHODS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     "table": ("tracks", _reads(lambda r, t: r.table("tracks", t).num_rows)),
     "array": ("tracks", _reads(lambda r, t: len(r.array("tracks", t)))),
@@ -108,7 +94,7 @@ def _taking(where: object) -> set[str]:
 
 
 def test_all_that_takes_a_topic_is_tried():
-    assert _taking(mcaptrack) == set(FUNCTIONS) - LACKS
+    assert _taking(mcaptrack) == set(FUNCTIONS)
     assert _taking(mcaptrack.Recording) == set(METHODS) | MAKES
 
 

@@ -19,12 +19,14 @@ from numpy import ndarray
 
 import mcaptrack
 from mcaptrack.log import CheckResult, Finding
+from tests.extension_cases import EXTENSIONS
 from tests.test_library import CLASSES, FUNCTIONS, METHODS
 from tests.tiers import thorough
 from tools import pages
 from tools.pages import ROOT
 
-EVERY_FUNCTION = ROOT / "tests" / "typed" / "every_function.py"
+#: Scripts that use every public name: of the core, and of extensions.
+SCRIPTS = [ROOT / "tests" / "typed" / "every_function.py", *EXTENSIONS.glob("*/typed.py")]
 #: What checkers must find in: a plug-in without outputs, misspelled names, arguments of another type.
 WRONG = """\
 import mcaptrack
@@ -100,7 +102,7 @@ CHECKERS = pytest.mark.parametrize(
 
 @thorough
 @CHECKERS
-def test_checkers_pass_over_the_documentation_and_over_a_script_that_uses_every_name(
+def test_checkers_pass_over_the_documentation_and_over_scripts_that_use_every_name(
     checker: Callable[[Path], list[str]], tmp_path
 ):
     for page in pages.pages():
@@ -113,7 +115,8 @@ def test_checkers_pass_over_the_documentation_and_over_a_script_that_uses_every_
         if text := "\n".join(block.text for block in blocks if "file" not in block.marks):
             (tmp_path / f"page_{page.stem.replace('-', '_').lower()}.py").write_text(text)
     assert len(list(tmp_path.glob("*.py"))) > 10
-    shutil.copy(EVERY_FUNCTION, tmp_path)
+    for script in SCRIPTS:
+        shutil.copy(script, tmp_path / f"{script.parent.name}_{script.name}")
     assert checker(tmp_path) == []
 
 
@@ -124,9 +127,9 @@ def test_checkers_find_what_is_wrong(checker: Callable[[Path], list[str]], tmp_p
     assert lines == set(range(2, len(WRONG.splitlines()) + 1)) - {4, 5}
 
 
-def test_the_script_uses_every_public_name():
-    tree = ast.parse(EVERY_FUNCTION.read_text())
-    used = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+def test_the_scripts_use_every_public_name():
+    nodes = [node for script in SCRIPTS for node in ast.walk(ast.parse(script.read_text()))]
+    used = {ast.unparse(node) for node in nodes if isinstance(node, ast.Attribute)}
     assert used >= {f"mcaptrack.{name}" for name in mcaptrack.__all__}
 
 

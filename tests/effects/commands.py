@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tests.extension_cases import of_extensions
+
 
 @dataclass(frozen=True)
 class Case:
@@ -47,9 +49,6 @@ def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
 
 
 SCORED = "evaluate tall.txt --truth truth.txt"
-
-
-TUNED = "tune tall.txt --truth truth.txt --trials 1 --fps 10"
 
 
 #: For every option of every command, but parameters of transforms: a command line that it changes.
@@ -199,28 +198,6 @@ CASES: dict[str, dict[str, Case]] = {
         output="-o scores.txt",
         force=("evaluate a.mcap -o clip.mp4", "--force"),
     ),
-    "tune": common(
-        "tune a.mcap --trials 2 --search min-iou",
-        truth=("tune truth.txt --trials 1", "--truth truth.txt"),
-        stage="--stage sample --search max-gap-s",
-        tracker="--tracker bytetrack",
-        metric="--metric mota",
-        trials=("tune tall.txt --truth truth.txt --fps 10 --search min-iou", "--trials 1"),
-        search="--search max-age-s",
-        seed="--seed 3",
-        study="--study b.jsonl",
-        similarity="--similarity metres",
-        gate_m=("tune a.mcap --trials 1 --similarity metres", "--gate-m 0.01"),
-        min_iou=("tune a.mcap --trials 1", "--min-iou 0.99"),
-        format=(TUNED, "--format kitti"),
-        classes=("tune kinds.csv --truth kinds.csv --trials 1 --fps 10", "--classes all"),
-        fps=("tune truth.txt --truth truth.txt --trials 1", "--fps 1"),
-        ground_plane=(f"{TUNED} --similarity metres", "--ground-plane plane.txt"),
-        topic="--topic /none",
-        camera="--camera other",
-        output="-o b.toml",
-        force=("tune a.mcap --trials 1 --study old.jsonl", "--force"),
-    ),
     "export": common(
         "export a.mcap",
         output="-o b",
@@ -258,24 +235,6 @@ CASES: dict[str, dict[str, Case]] = {
         layout="--layout tracking",
         open="--open",
     ),
-    "render": common(
-        "render a.mcap",
-        topic="--topic /camera/detections/view/image",
-        compare="--compare",
-        heatmap="--heatmap",
-        blur="--blur people",
-        width="--width 32",
-        max_fps="--max-fps 5",
-        start_s="--start-s 1",
-        end_s="--end-s 1",
-        gif="--gif",
-        camera="--camera other",
-        output="-o b.mp4",
-        force=("render a.mcap -o clip.mp4", "--force"),
-    ),
-    "report": common(
-        "report a.mcap", camera="--camera other", output="-o b.html", force=("report a.mcap -o old.html", "--force")
-    ),
     "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
     "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o fresh.mcap", "--force")),
     "cut": common(
@@ -303,18 +262,4 @@ CASES: dict[str, dict[str, Case]] = {
     ),
     "doctor": common("doctor"),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
-}
-
-
-#: Where the case without options of the other tests isn't what takes longest, or doesn't do all that a command does.
-LINES = {
-    "tune": "tune a.mcap --trials 1 --search min-iou -o b.toml",
-    "docs": "docs tables",
-    "review": "review a.mcap --print",
-    "run": "run fresh.mcap",
-    "train": "train a.mcap -o b --epochs 1 --device cpu",
-}
-
-
-def line_of(command: str) -> str:
-    return LINES.get(command) or CASES[command]["json"].base
+} | {name: common(seen[0], **seen[1]) for name, seen in of_extensions("EFFECTS").items() if seen}

@@ -48,12 +48,7 @@ def compute(log: str) -> mcaptrack.RunResult:
         mcaptrack.events(log, similarity="metres", gate_m=1.0),
         mcaptrack.zones(log, zones={"type": "FeatureCollection", "features": []}, max_gap_s=1.0),
     ]
-    best: mcaptrack.TuneResult = mcaptrack.tune([log], search={"min_iou": (0.1, 0.4)}, trials=2)
-    review: mcaptrack.Review = mcaptrack.review(log, questions=3)
-    changes: mcaptrack.ReviewResult = review.finish()
-    weights: mcaptrack.TrainResult = mcaptrack.train(["tracks.parquet"], "weights.safetensors", epochs=1)
-    steps.append(mcaptrack.track(log, output="tuned.mcap", **best.settings))
-    print(mcaptrack.draw_zones(log).name, weights, changes.rows)
+    print(mcaptrack.draw_zones(log).name)
     whole: mcaptrack.RunResult = mcaptrack.run(log, tracker=ByteTrack(), class_limits=None, tables=True, progress=say)
     people = 0 if whole.summary is None else whole.summary.tracks
     said: tuple[mcaptrack.Notice, ...] = tuple(notice for step in (*steps, whole) for notice in step.warnings)
@@ -70,7 +65,6 @@ def read(log: str) -> None:
         picture: Frame = next(opened.frames("video", times=[0], colour="rgb"))
         message: mcaptrack.FetchedMessage = opened.fetch(opened.table("frames").to_pylist()[0])
         boxes = [(t_ns, found.xyxy) for t_ns, found in opened.supervision("detections")]
-        player: mcaptrack.Player = opened.show(end_s=1.0)
         box: Frame = mcaptrack.detections([[10, 20, 30, 40]], [0.9], [1], picture.t_ns, box_format="xyxy")
         opened.write("/own/detections", [box])
         speeds = mcaptrack.schema_of("Speed", [("track_id", "i8"), ("speed", "f4")], units={"speed": "m/s"})
@@ -78,7 +72,7 @@ def read(log: str) -> None:
         decoded: list[mcaptrack.DecodedMessage] = list(opened.messages(["/own/speeds"], decoder_factories=[]))
         for schema, channel, newest, content in opened.messages("tracks", np.datetime64(0, "ns"), reverse=True):
             print(schema and schema.name, channel.topic, newest.log_time, content)
-        print(steps.max(), rows, message.payload, boxes, player.pictures, [each.decoded_message for each in decoded])
+        print(steps.max(), rows, message.payload, boxes, [each.decoded_message for each in decoded])
     about: mcaptrack.LogInfo = mcaptrack.info(log, frames=True)
     channels: list[mcaptrack.ChannelInfo] = list(about.channels)
     frames: list[mcaptrack.FrameInfo] = list(about.frames or ())
@@ -92,11 +86,9 @@ def use(log: str) -> None:
     scores: mcaptrack.Scores = mcaptrack.evaluate(log, similarity="metres", gate_m=1.0)
     idf1: float = scores.score("IDF1", "retracks")
     tables: mcaptrack.ExportResult = mcaptrack.export(log, form="parquet")
-    video: mcaptrack.RenderResult = mcaptrack.render(log, "walk.mp4", max_fps=5.0, compare=False)
-    page: mcaptrack.ReportResult = mcaptrack.report(log)
     server: mcaptrack.LogServer = mcaptrack.view(log).start()
     server.close()
-    print(idf1, [row["MOTA"] for row in scores.rows()], tables, video, page, server.links["Lichtblick"])
+    print(idf1, [row["MOTA"] for row in scores.rows()], tables, server.links["Lichtblick"])
 
 
 def repair(log: str) -> None:

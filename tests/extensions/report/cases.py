@@ -1,0 +1,31 @@
+"""Cases of ``report`` for the tests of the core."""
+
+import html
+import re
+from pathlib import Path
+
+import mcaptrack
+
+READING = {"report": lambda log, out: [log, "-o", out / "report.html"]}
+EFFECTS = {
+    "report": (
+        "report a.mcap",
+        {"camera": "--camera other", "output": "-o b.html", "force": ("report a.mcap -o clip.mp4", "--force")},
+    )
+}
+WRITTEN = {"a.html": lambda path, output: mcaptrack.report(path, output=output)}
+
+
+def _text(scene) -> str:
+    """The text of the page of the log of a scene."""
+    scene.says("report", "LOG", "-o", "page.html")
+    return html.unescape(re.sub(r"<[^>]*>", "", re.sub(r"</?code>", "`", Path("page.html").read_text())))
+
+
+PROPOSALS = {
+    "extensions/report/figures.py:identity_events:view": _text,
+    "extensions/report/contents.py:_score:ingest": lambda s: _text(s.without("/camera/truth*")),
+    "extensions/report/page.py:_without_ground_truth:run": lambda s: _text(s.ingested("clip.mp4")),
+    "extensions/report/sections.py:scores:run": lambda s: _text(s.ingested("clip.mp4")),
+    "extensions/report/sections.py:forecasts:predict": lambda s: _text(s.without("*predictions*")),
+}

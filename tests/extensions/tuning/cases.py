@@ -1,0 +1,78 @@
+"""Cases of ``tune`` for the tests of the core."""
+
+from pathlib import Path
+from typing import Any
+
+import mcaptrack
+
+READING = {"tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"]}
+DEEDS = {"tune": ["read", "write"]}
+_TALL = "tune tall.txt --truth truth.txt --fps 10"
+EFFECTS = {
+    "tune": (
+        "tune a.mcap --trials 2 --search min-iou",
+        {
+            "truth": ("tune truth.txt --trials 1", "--truth truth.txt"),
+            "stage": "--stage sample --search max-gap-s",
+            "tracker": "--tracker bytetrack",
+            "metric": "--metric mota",
+            "trials": (f"{_TALL} --search min-iou", "--trials 1"),
+            "search": "--search max-age-s",
+            "seed": "--seed 3",
+            "study": "--study b.jsonl",
+            "similarity": "--similarity metres",
+            "gate_m": ("tune a.mcap --trials 1 --similarity metres", "--gate-m 0.01"),
+            "min_iou": ("tune a.mcap --trials 1", "--min-iou 0.99"),
+            "format": (f"{_TALL} --trials 1", "--format kitti"),
+            "classes": ("tune kinds.csv --truth kinds.csv --trials 1 --fps 10", "--classes all"),
+            "fps": ("tune truth.txt --truth truth.txt --trials 1", "--fps 1"),
+            "ground_plane": (f"{_TALL} --trials 1 --similarity metres", "--ground-plane plane.txt"),
+            "topic": "--topic /none",
+            "camera": "--camera other",
+            "output": "-o b.toml",
+            "force": ("tune a.mcap --trials 1 -o query.sql", "--force"),
+        },
+    )
+}
+USES = {"tune": ["tune a.mcap --trials 1", f"{_TALL} --trials 1"]}
+TOPICS = {
+    "tune": (
+        "detections",
+        lambda p, t, f: mcaptrack.tune(p, stage="track", topic=t, trials=1, study=f / "a.jsonl").scores,
+    )
+}
+WRITTEN = {"a.trials.jsonl": lambda path, output: mcaptrack.tune(path, study=output, trials=3)}
+_SCORES = {"IDF1": 0.75, "MOTA": 0.5, "HOTA": 0.25, "IDSW": 1, "FP": 2, "FN": 3}
+
+
+def _tuned(best: int = 3, similarity: str = "iou", **changed: Any) -> mcaptrack.TuneResult:
+    given = {"stage": "track", "metric": "IDF1", "settings": {"max_age_s": 2.5}, "scores": _SCORES, "trials": 7}
+    return mcaptrack.TuneResult(
+        **given | changed,
+        default_scores=_SCORES | {"IDF1": 0.5},
+        best=best,
+        similarity=similarity,
+        notes=(),
+        warnings=(),
+    )
+
+
+def _printed(to: Any) -> None:
+    to.run("tune x.mcap", tune=_tuned())
+    to.run("tune x.mcap -o b.toml --metric mota --stage sample", tune=_tuned(metric="MOTA", stage="sample"))
+    to.lines += Path("mcaptrack.toml").read_text().splitlines() + Path("b.toml").read_text().splitlines()
+    to.run("tune x.mcap -o c.toml --json", tune=_tuned(best=0))
+    for words, similarity in (
+        ("--gate-m 1 --min-iou 0.4", "iou"),
+        ("--gate-m 1 --min-iou 0.4", "metres"),
+        ("--tracker sort --stage sample", "iou"),
+        ("--fps 5 --camera c", "iou"),
+        ("--truth t.txt --fps 5 --camera c --topic /t", "iou"),
+        ("--truth t.txt --ground-plane p.txt", "iou"),
+    ):
+        to.run(f"tune x.mcap -o c.toml -q {words}", shows_answer=False, tune=_tuned(best=0, similarity=similarity))
+    for search in ("min-iou=0.1", "min-iou=1:2:3", "min-iou=", "min-iou=a:b"):
+        to.run(f"tune x.mcap --search {search}")
+
+
+PRINTED = {"tuning": _printed}
