@@ -91,7 +91,6 @@ def _serve(lines: Iterable[str]) -> None:
     from mcaptrack.__main__ import main
     from mcaptrack.cli import app  # noqa: F401
     from mcaptrack.sources.ingest import ingest  # noqa: F401
-    from mcaptrack.sources.ingest.bags import plain_yaml, rosbag1, rosbag2, sqlite_tables  # noqa: F401
     from mcaptrack.tables import export  # noqa: F401
 
     for line in lines:

@@ -95,15 +95,18 @@ def refuse_non_mcap(path: Path) -> None:
     """
     try:
         what = _what(path) if path.is_dir() or path.is_file() else ""
+        if not what:
+            refuse_missing(path)
     except OSError:
         return
-    if not what:
-        refuse_missing(path)
-    else:
-        # the default output would have the same name
-        other_name = {"output": "OTHER.mcap"} if path.suffix == ".mcap" else {}
-        make = call("ingest", path, **other_name)
-        raise McaptrackError(f"{path} is {what}, not an MCAP file; {make} makes a log of it")
+    if what:
+        raise McaptrackError(not_mcap(path, what))
+
+
+def not_mcap(path: Path, what: str) -> str:
+    """Say that a recording is in another format, with the command that converts it to a log."""
+    other_name = {"output": "OTHER.mcap"} if path.suffix == ".mcap" else {}  # the default output has the same name
+    return f"{path} is {what}, not an MCAP file; {call('ingest', path, **other_name)} makes a log of it"
 
 
 def _what(path: Path) -> str:

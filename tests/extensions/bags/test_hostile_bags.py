@@ -26,8 +26,8 @@ from mcaptrack.extensions.bags import sqlite_tables as bag_database
 from mcaptrack.extensions.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest import IngestOptions, ingest, plain_yaml
 from tests import bounded
-from tests.bags import ROS2, STRING1, database
 from tests.commands import start
+from tests.extensions.bags.bags import ROS2, STRING1, database
 from tests.tiers import one_in
 
 TOPICS = [(1, "/a", STRING1, "cdr", "")]

@@ -25,11 +25,10 @@ from mcaptrack.extensions.bags import metadata_yaml
 from mcaptrack.schema import SCHEMAS, TRACKS
 from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
 from mcaptrack.schema.provenance import Provenance
-from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
+from tests.extensions.bags.bags import MOT, T0, bag1, bag2, record
 from tests.logs import recorder
 from tests.space_logs import WAYS, Robot, write
-from tests.test_ros_recordings import record
 
 Raw = tuple[str, int, bytes]
 
