@@ -16,6 +16,7 @@ from mcaptrack.location import sibling
 from mcaptrack.log import results_path
 from mcaptrack.log.journal import journal_of
 from tests.commands import call
+from tests.extension_cases import of_extensions
 from tests.tiers import one_in
 
 NAMES = {
@@ -43,7 +44,7 @@ def test_logs_of_all_names_are_used_as_others_are(template, tmp_path, monkeypatc
         ["run"],
         ["export", "--force"],
         ["query", "select count(*) > 0 as many from tracks", "--json"],
-        ["export", "--format", "rosbag2"],
+        *of_extensions("ODD_NAMES").values(),
         ["report"],
         ["zones", "draw"],
         ["recover"],

@@ -18,6 +18,7 @@ def _prepare(folder: Path) -> None:
     _export(folder)
 
 
+ODD_NAMES = {"rosbag2": ["export", "--format", "rosbag2"]}
 WORKS = {"export to a bag": (_prepare, _export, _export, 5)}
 WRITTEN = {
     name: partial(mcaptrack.export, form=form) for name, form in (("bag", "rosbag2"), ("old bag", "rosbag2-sqlite3"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import sqlite3
 import struct
 from collections import Counter
@@ -20,9 +21,10 @@ from rosbags.rosbag1 import Writer as Writer1
 from mcaptrack import log
 from mcaptrack.contracts import ReadingNotes
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.bags.metadata_yaml import names_file
+from mcaptrack.extensions.bags.metadata_yaml import names_file, read_metadata
 from mcaptrack.extensions.bags.rosbag2 import open_bag, open_files
 from mcaptrack.extensions.bags.sqlite_tables import SqliteTables
+from mcaptrack.extensions.bags.unpacking import decompress_steps
 from mcaptrack.notices import collected
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
@@ -640,3 +642,35 @@ def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeyp
     with closing(open_files([tmp_path / name], tmp_path / name)) as bag:
         assert bag.as_log is None
         assert [len(message.payload) for message in bag.messages(ReadingNotes())] == sizes
+
+
+def test_what_metadata_leaves_out_has_its_usual_value(tmp_path):
+    topic = "{topic_metadata: {name: /a, type: t/msg/T}, message_count: 3}"
+    path = tmp_path / "metadata.yaml"
+    path.write_text(
+        f"rosbag2_bagfile_information:\n  topics_with_message_count: [{topic}]\n  relative_file_paths: [x/a.db3]\n",
+    )
+    bag, names = read_metadata(path)
+    assert (names, list(bag.topics)) == (["a.db3"], [("/a", "t/msg/T", "cdr", "", "", 3)])
+    assert (bag.distro, bag.packed, bag.text) == ("", False, path.read_bytes())
+    more = "  ros_distro: jazzy\n  compression_mode: {}\n  compression_format: {}\n"
+    for mode, packing, is_packed in (
+        ("MESSAGE", "ZSTD", True),
+        ("file", "zstd", False),
+        ("none", "lz4", False),
+        ("FILE", "lz4", None),
+    ):
+        path.write_text(bag.text.decode() + more.format(mode, packing))
+        if is_packed is None:
+            with pytest.raises(McaptrackError, match="the bag is compressed with 'lz4'; zstd is read"):
+                read_metadata(path)
+            continue
+        found, _ = read_metadata(path)
+        assert (found.packed, found.distro) == (is_packed, "jazzy")
+
+
+def test_decompression_in_steps_ends_at_its_limit():
+    data = bytes(range(256)) * 20
+    steps = [decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data), most) for most in (0, 7, 10**6)]
+    assert steps == [b"", data[:7], data]
+    assert decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data)[:-9], 10**6) in (b"", data)
