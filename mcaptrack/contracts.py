@@ -174,7 +174,7 @@ class ReadingNotes:
     lost: list[str] = field(default_factory=list)
 
 
-class Recording:
+class RecordingReader:
     """A recording, open for reading: the base class of what recording formats open.
 
     Attributes
@@ -225,7 +225,7 @@ class RecordingFormat(Protocol):
         """Say what a file or folder is, as in "a ROS 1 bag", by its first bytes or its files; "" for others."""
         ...
 
-    def open(self, path: Path) -> Recording:
+    def open(self, path: Path) -> RecordingReader:
         """Open a recording. Raise McaptrackError or ValueError if it can't be read."""
         ...
 

@@ -19,15 +19,15 @@ _MATROSKA: Final = b"\x1a\x45\xdf\xa3"  # and WebM
 ZSTD: Final = b"\x28\xb5\x2f\xfd"
 
 
-class Recognised(NamedTuple):
-    """A recording format, as the registry found it, its object, and what it says that a file or folder is."""
+class FormatOfRecording(NamedTuple):
+    """A recording format, as the registry found it, its object, and how it describes a file or folder."""
 
     entry: Entry
     form: Any
-    what: str
+    description: str
 
 
-def format_of(path: Path) -> Recognised | None:
+def format_of(path: Path) -> FormatOfRecording | None:
     """The recording format of a file or folder; None for MCAP files and all else.
 
     One that can't say is named in a warning. Raises McaptrackError if several say so.
@@ -38,11 +38,11 @@ def format_of(path: Path) -> Recognised | None:
     for entry, form in _formats("recognises"):
         try:
             with blamed(entry, f"failed to look at {path}"):
-                what = str(form.recognises(path))
+                description = str(form.recognises(path))
         except McaptrackError as error:
             warn(str(error), "other")
             continue
-        recognised += [Recognised(entry, form, what)] if what else []
+        recognised += [FormatOfRecording(entry, form, description)] if description else []
     if len(recognised) > 1:
         raise McaptrackError(f"{path} is of the {' and '.join(str(format_.entry) for format_ in recognised)}")
     return next(iter(recognised), None)
@@ -94,22 +94,22 @@ def refuse_non_mcap(path: Path) -> None:
     Other files pass: opening them reports what is wrong.
     """
     try:
-        what = _what(path) if path.is_dir() or path.is_file() else ""
-        if not what:
+        description = _description(path) if path.is_dir() or path.is_file() else ""
+        if not description:
             refuse_missing(path)
     except OSError:
         return
-    if what:
-        raise McaptrackError(not_mcap(path, what))
+    if description:
+        raise McaptrackError(not_mcap(path, description))
 
 
-def not_mcap(path: Path, what: str) -> str:
+def not_mcap(path: Path, description: str) -> str:
     """Say that a recording is in another format, with the command that converts it to a log."""
     other_name = {"output": "OTHER.mcap"} if path.suffix == ".mcap" else {}  # the default output has the same name
-    return f"{path} is {what}, not an MCAP file; {call('ingest', path, **other_name)} makes a log of it"
+    return f"{path} is {description}, not an MCAP file; {call('ingest', path, **other_name)} makes a log of it"
 
 
-def _what(path: Path) -> str:
+def _description(path: Path) -> str:
     """The format of a recording or a video in words, "" for MCAP files, a folder with one of them, and all else."""
     if path.is_dir():
         logs = logs_in(path)
@@ -123,7 +123,7 @@ def _what(path: Path) -> str:
         if head[4:8] == b"ftyp" or head.startswith(_MATROSKA) or (head[:4], head[8:12]) == (b"RIFF", b"AVI "):
             return "a video"
     recognised = format_of(path)
-    return recognised.what if recognised else ""
+    return recognised.description if recognised else ""
 
 
 def refuse_missing(path: Path) -> None:

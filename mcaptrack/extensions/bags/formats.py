@@ -10,7 +10,7 @@ from mcaptrack.files import read_beginning, visible
 from mcaptrack.log.recording_files import ZSTD
 
 if TYPE_CHECKING:
-    from mcaptrack.contracts import Recording
+    from mcaptrack.contracts import RecordingReader
 
 _BEGIN: Final = {
     ROSBAG1: "a ROS 1 bag",
@@ -28,10 +28,10 @@ class RosBags:
         if path.is_dir():
             return _folder(path)
         head = read_beginning(path, 16)
-        by_bytes = next((what for begin, what in _BEGIN.items() if head.startswith(begin)), "")
+        by_bytes = next((description for begin, description in _BEGIN.items() if head.startswith(begin)), "")
         return by_bytes or (f"{_NAMES[path.suffix.lower()]} by its name" if path.suffix.lower() in _NAMES else "")
 
-    def open(self, path: Path) -> Recording:
+    def open(self, path: Path) -> RecordingReader:
         """Open a bag. Raises McaptrackError if it can't be read or is incomplete."""
         from mcaptrack.extensions.bags import metadata_yaml, rosbag1, rosbag2
         from mcaptrack.sources.ingest.recording import unlike

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 
-from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, Recording
+from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.bags.unpacking import decompress_steps
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -41,7 +41,7 @@ class _Record(NamedTuple):
     end: int
 
 
-class Bag1(Recording):
+class Bag1(RecordingReader):
     """A ROS 1 bag, open for reading."""
 
     profile = Profile.ROS1

@@ -16,7 +16,7 @@ from typing import Any, Final
 from mcap.well_known import SchemaEncoding
 
 from mcaptrack import log
-from mcaptrack.contracts import RecordedChannel, RecordedMessage, Recording
+from mcaptrack.contracts import RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.bags import unpacking
 from mcaptrack.extensions.bags.files import METADATA, SQLITE
@@ -39,7 +39,7 @@ _NEEDED: Final = {
 _TABLES: Final = ("topics", "messages", "metadata", "schema", "message_definitions")
 
 
-def open_bag(folder: Path) -> Recording:
+def open_bag(folder: Path) -> RecordingReader:
     """Open the bag in a folder with metadata.yaml. Raises McaptrackError if it can't be read or is incomplete."""
     bag, names = read_metadata(folder / METADATA)
     paths = [folder / name for name in names]
@@ -70,14 +70,14 @@ def open_bag(folder: Path) -> Recording:
     return source
 
 
-def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> Recording:
+def open_files(paths: Sequence[Path], whole: Path, bag: Bag | None = None) -> RecordingReader:
     """Open the files of a split recording as one; ``whole`` names it in messages."""
     if bag is None:
         bag = _own_metadata(paths)
     with ExitStack() as opened:
         parts = [_decompressed_file(path, opened) for path in paths]
         heads = [read_beginning(path, 16) for path in parts]
-        source: Recording
+        source: RecordingReader
         if all(head.startswith(SQLITE) for head in heads):
             source = Databases(parts, whole, bag)
         elif all(head.startswith(log.MAGIC) for head in heads):

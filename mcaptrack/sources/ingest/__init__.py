@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack import foxglove, log, notices
-from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, Recording
+from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, missing, refuse_special
 from mcaptrack.geometry.clocks import LAST_NS
@@ -346,7 +346,7 @@ class RecordingJob(IngestJob):
     """A recording, with labels for its pictures."""
 
     def __init__(
-        self, source: Path, options: IngestOptions, recorded: Recording, progress: Progress, into: log.Log | None
+        self, source: Path, options: IngestOptions, recorded: RecordingReader, progress: Progress, into: log.Log | None
     ) -> None:
         self._recorded, self._progress = recorded, progress
         try:

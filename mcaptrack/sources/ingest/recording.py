@@ -10,7 +10,7 @@ from typing import Any, Final
 from mcap.well_known import MessageEncoding, Profile
 
 from mcaptrack import log
-from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, Recording
+from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import visible
 from mcaptrack.notices import warn
@@ -29,7 +29,7 @@ _SUFFIX: Final = ".mcap"
 _MOST_LOOKED_AT: Final = 16
 
 
-def open_recording(path: Path) -> Recording | None:
+def open_recording(path: Path) -> RecordingReader | None:
     """Open the recording at ``path``; None if it is something else.
 
     Raises McaptrackError for a recording that can't be read, and if the extension that reads it is missing.
@@ -64,23 +64,23 @@ def unlike(path: Path, what: str) -> McaptrackError:
     return McaptrackError(f"{path} can't be read as {what}: it {why}")
 
 
-def _opened(entry: Entry, form: Any, path: Path) -> Recording:
+def _opened(entry: Entry, form: Any, path: Path) -> RecordingReader:
     """The recording that a format opens; that of another package is checked while it is read."""
     with blamed(entry, f"can't read {path}"):
         recording = form.open(path)
-    if not isinstance(recording, Recording):
-        raise McaptrackError(f"{entry} gave a {type(recording).__name__} of {path}; open has to give a Recording")
+    if not isinstance(recording, RecordingReader):
+        raise McaptrackError(f"{entry} gave a {type(recording).__name__} of {path}; open has to give a RecordingReader")
     return recording if entry.is_built_in else _OfPackage(entry, recording, path)
 
 
-class _OfPackage(Recording):
+class _OfPackage(RecordingReader):
     """A recording as another package reads it: what it raises names the format, and what it gives is checked."""
 
-    def __init__(self, entry: Entry, recording: Recording, path: Path) -> None:
+    def __init__(self, entry: Entry, recording: RecordingReader, path: Path) -> None:
         super().__init__()
         self._entry, self._recording, self._path, self._guard = entry, recording, path, Guard(str(entry))
         self.closing.callback(recording.close)
-        with self._blamed("gave what is no Recording"):
+        with self._blamed("gave what is no RecordingReader"):
             self.channels, self.findings = list(recording.channels), recording.findings
             self.profile, self.declared_counts = str(recording.profile), recording.declared_counts
 
@@ -100,7 +100,7 @@ class _OfPackage(Recording):
                 return
             is_own = isinstance(message, RecordedMessage) and message.channel in channels
             if not (is_own and isinstance(message.payload, bytes) and 0 <= message.t_ns < 2**63):
-                raise McaptrackError(f"{self._entry} gave {message!r:.60}, which is no message of a channel of its own")
+                raise McaptrackError(f"{self._entry} gave what is no message of a channel of its own: {message!r:.60}")
             yield message
 
     def extras(self, writer: Any, has_clock: bool, is_copied: bool) -> None:
@@ -109,7 +109,7 @@ class _OfPackage(Recording):
             self._recording.extras(writer, has_clock, is_copied)
 
 
-class Parts(Recording):
+class Parts(RecordingReader):
     """The files of a recording, read as one; ``whole`` names it in messages. They have the same channels.
 
     ``is_packed`` says that messages are compressed one by one, of whatever encoding they are.
