@@ -442,7 +442,7 @@ def test_a_broken_recording_format_is_named_and_the_others_work(site, code):
     assert "gone" not in done("info", "drive.mcap").err
 
 
-def test_an_mcap_file_that_a_format_lists_is_left_as_it_is_and_its_list_is_updated(site, tracked):
+def test_an_mcap_file_that_a_format_lists_is_left_as_it_is_and_its_list_is_updated(site):
     code = (
         "from pathlib import Path\n"
         "class Part:\n    def recognises(self, path):\n        return 'a list' * (path / 'list').is_file()\n"
@@ -454,10 +454,11 @@ def test_an_mcap_file_that_a_format_lists_is_left_as_it_is_and_its_list_is_updat
     )
     add(site, "recording", "lists", code)
     Path("lists").mkdir()
-    tracked.rename("lists/a.mcap")
+    robot("lists/a.mcap", "odd_msgs/Odd", [{"things": []}])
+    Path("b.csv").write_text(TABLE)
     Path("lists/list").write_text("a.mcap")
     assert "lists is a list, not an MCAP file; " in one_line("info", "lists")
-    labels = ("ingest", "b.csv", "--as", "truth", "--into", "lists/a.mcap", "--force")
+    labels = ("ingest", "b.csv", "--as", "truth", "--into", "lists/a.mcap", "--fps", "10", "--start-time", "1e9")
     outcome = done(*labels)
     assert f"a.mcap is named in {Path('lists/list')}" in outcome.err
     assert not Path("updated").exists()
