@@ -230,7 +230,7 @@ def _logs_in(folder: Path, leave_out: str, *, is_named: bool = False) -> Iterato
         names = [name for name in sorted(files) if name.lower().endswith(_SUFFIX) and not name.startswith(".")]
         if names and listing_of(Path(place, names[0])):
             recognised = format_of(Path(place))
-            text = not_mcap(Path(place), recognised.description if recognised else "a recording")
+            text = not_mcap(Path(place), str(recognised.answer) if recognised else "a recording")
             if is_named and Path(place) == folder:
                 raise McaptrackError(text)
             warn(f"{text}; its files are left out", "left-out")

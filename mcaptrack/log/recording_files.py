@@ -19,63 +19,51 @@ _MATROSKA: Final = b"\x1a\x45\xdf\xa3"  # and WebM
 ZSTD: Final = b"\x28\xb5\x2f\xfd"
 
 
-class FormatOfRecording(NamedTuple):
-    """A recording format, as the registry found it, its object, and how it describes a file or folder."""
+class Answer(NamedTuple):
+    """The answer of a recording format, as the registry found it, and its object."""
 
     entry: Entry
     form: Any
-    description: str
+    answer: Any
 
 
-def format_of(path: Path) -> FormatOfRecording | None:
-    """The recording format of a file or folder; None for MCAP files and all else.
+def format_of(path: Path) -> Answer | None:
+    """The recording format of a file or folder, and how it describes it; None for MCAP files and all else.
 
-    One that can't say is named in a warning. Raises McaptrackError if several say so.
+    Raises McaptrackError if several formats say so.
     """
-    if is_mcap(path):
-        return None
-    recognised = []
-    for entry, form in _formats("recognises"):
-        try:
-            with blamed(entry, f"failed to look at {path}"):
-                description = str(form.recognises(path))
-        except McaptrackError as error:
-            warn(str(error), "other")
-            continue
-        recognised += [FormatOfRecording(entry, form, description)] if description else []
-    if len(recognised) > 1:
-        raise McaptrackError(f"{path} is of the {' and '.join(str(format_.entry) for format_ in recognised)}")
-    return next(iter(recognised), None)
+    answers = [] if is_mcap(path) else [asked for asked in _asked("recognises", path) if asked.answer]
+    if len(answers) > 1:
+        raise McaptrackError(f"{path} is of the {' and '.join(str(asked.entry) for asked in answers)}")
+    return answers[0] if answers else None
 
 
 def listing_of(log: Path) -> Path | None:
     """The file beside a log that lists it as a part of a recording, such as the metadata.yaml of ROS 2, or None."""
-    for entry, form in _formats("listing"):
-        with blamed(entry, f"failed to look beside {log}"):
-            listing = form.listing(log)
-        if listing is not None:
-            return Path(listing)
-    return None
+    return next((Path(asked.answer) for asked in _asked("listing", log) if asked.answer), None)
 
 
 def update_listing(log: Path) -> None:
     """Bring the file that lists a log up to date, after the log has changed."""
-    for entry, form in _formats("listing", "update"):
-        with blamed(entry, f"failed to bring up to date what is beside {log}"):
-            form.update(log)
+    for _ in _asked("update", log):
+        pass
 
 
-def _formats(*methods: str) -> Iterator[tuple[Entry, Any]]:
-    """The recording formats that have these methods. One that can't be used is named in a warning."""
+def _asked(method: str, path: Path) -> Iterator[Answer]:
+    """Call a method of all recording formats that have it. One of a package that fails is named in a warning."""
     for name in others("recording"):
+        entry = None
         try:
             entry = find("recording", name)
             form = entry.made("recognises", "open")
+            with blamed(entry, f"failed to look at {path}"):
+                answer = getattr(form, method, lambda _: None)(path)
         except McaptrackError as error:
+            if entry and entry.is_built_in:
+                raise
             warn(str(error), "other")
-            continue
-        if all(hasattr(form, method) for method in methods):
-            yield entry, form
+        else:
+            yield Answer(entry, form, answer)
 
 
 def is_mcap(path: Path) -> bool:
@@ -123,7 +111,7 @@ def _description(path: Path) -> str:
         if head[4:8] == b"ftyp" or head.startswith(_MATROSKA) or (head[:4], head[8:12]) == (b"RIFF", b"AVI "):
             return "a video"
     recognised = format_of(path)
-    return recognised.description if recognised else ""
+    return str(recognised.answer) if recognised else ""
 
 
 def refuse_missing(path: Path) -> None:

@@ -24,6 +24,7 @@ from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.boxes import iou
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.log.recording_files import is_mcap
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
@@ -69,7 +70,7 @@ def pair_files(tracks: Sequence[Path], ground_truths: Sequence[Path]) -> tuple[l
     their own ground truth.
     """
     for path in tracks:
-        if log.is_mcap(path):
+        if is_mcap(path):
             labels = ground_truths[0] if len(ground_truths) == 1 else "LABELS"
             add = call("ingest", labels, role="truth", into=path)
             raise McaptrackError(

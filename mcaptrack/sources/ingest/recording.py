@@ -13,17 +13,16 @@ from mcaptrack import log
 from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import visible
+from mcaptrack.log.recording_files import format_of, is_mcap, logs_in, refuse_missing
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, blamed
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema.provenance import CLOCK
-from mcaptrack.sources.foreign.definitions import Defined, MessageType, defined, is_defined, is_packed
+from mcaptrack.sources.foreign.definitions import Defined, MessageType, defined, is_defined, is_packed, unpacked
 from mcaptrack.sources.ingest import decompression
 from mcaptrack.sources.sidecar import holds_packed
 from mcaptrack.sources.video import IMAGE_SUFFIXES
 
-#: A message that is larger decompressed is not read.
-_MAX_MESSAGE_BYTES: Final = 2**28
 _SUFFIX: Final = ".mcap"
 #: So many files of a folder are looked at, to say whether it holds recordings.
 _MOST_LOOKED_AT: Final = 16
@@ -34,27 +33,27 @@ def open_recording(path: Path) -> RecordingReader | None:
 
     Raises McaptrackError for a recording that can't be read, and if the extension that reads it is missing.
     """
-    recognised = log.format_of(path)
+    recognised = format_of(path)
     if recognised:
         return _opened(recognised.entry, recognised.form, path)
     if path.is_dir():
         entries = sorted(visible(path.iterdir()))
         if any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in entries):
             return None
-        logs = log.logs_in(path)
+        logs = logs_in(path)
         if len(logs) == 1:
             return open_recording(logs[0])
         files = (entry for entry in entries[:_MOST_LOOKED_AT] if entry.is_file())
-        first = logs[0] if logs else next((file for file in files if log.format_of(file)), None)
+        first = logs[0] if logs else next((file for file in files if format_of(file)), None)
         if first:
             raise McaptrackError(
                 f"{path} holds several recordings, which are no parts of one; give {first.name} and so on by name"
             )
-    elif log.is_mcap(path):
+    elif is_mcap(path):
         return McapRecording([path], path)
     elif path.suffix.lower() == _SUFFIX:
         raise unlike(path, "an MCAP file")
-    log.refuse_missing(path)
+    refuse_missing(path)
     return None
 
 
@@ -235,6 +234,6 @@ class McapRecording(Parts):
 def _unpack_message(data: bytes, path: Path, t_ns: int, left: int) -> bytes:
     """Decompress a single message; ``left`` is the limit for all remaining messages together."""
     try:
-        return decompression.unzstd(data, min(left, _MAX_MESSAGE_BYTES))
+        return unpacked(data, left)
     except decompression.NotUnpackedError as error:
         raise McaptrackError(f"{path}: the message at {t_ns} ns can't be decompressed: {error}") from None

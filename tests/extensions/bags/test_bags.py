@@ -28,6 +28,7 @@ from mcaptrack.extensions.bags.unpacking import decompress_steps
 from mcaptrack.notices import collected
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.sources.foreign import definitions
 from mcaptrack.sources.ingest import IngestOptions, decompression, ingest, recording
 from tests.extensions.bags.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
 from tests.logs import plain, recorder
@@ -463,7 +464,7 @@ def test_real_recordings_are_kept_whole(data, tmp_path):
 
 @pytest.mark.parametrize(("left", "most"), [(1000, 2000), (2000, 1000)])
 def test_a_packed_message_is_within_what_is_left_and_within_the_limit_of_one(left, most, monkeypatch):
-    monkeypatch.setattr(recording, "_MAX_MESSAGE_BYTES", most)
+    monkeypatch.setattr(definitions, "_MAX_MESSAGE_BYTES", most)
     pack = zstandard.ZstdCompressor().compress
     assert recording._unpack_message(pack(bytes(1000)), Path("a"), 7, left) == bytes(1000)
     with pytest.raises(McaptrackError, match="a: the message at 7 ns can't be decompressed: it says that it has 1001 "):
