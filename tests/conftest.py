@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import re
 import shutil
 import signal
 import sys
@@ -20,7 +19,7 @@ from mcaptrack import log
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from tests import bounded
-from tests.commands import LACKS, done, made_log
+from tests.commands import done, made_log
 from tests.worlds import small_scene
 
 # The same examples each time, so that a failure comes from a change; `--hypothesis-profile search` tries many new ones.
@@ -48,16 +47,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
-    """Let reports hold UTF-8 only, as they have to between processes: names of files in captured output may not be.
-
-    A test that fails because an extension was taken away is skipped.
-    """
+    """Let reports hold UTF-8 only, as they have to between processes: names of files in captured output may not be."""
     report = yield
-    text = str(call.excinfo.value) if LACKS and report.failed and call.excinfo else ""
-    if lacks := re.search(
-        r"(\w+ is an extension that isn't installed|No module named 'mcaptrack\.extensions\S*')", text
-    ):
-        report.outcome, report.longrepr = "skipped", (str(item.path), item.location[1], f"Skipped: {lacks[0]}")
     report.sections = [
         tuple(text.encode("utf-8", "backslashreplace").decode() for text in part) for part in report.sections
     ]

@@ -84,6 +84,7 @@ def template(template, tmp_path_factory) -> Path:
         words = ("--as", "detections", "--fps", 10, "--camera", camera, "--ground-plane", folder / "plane.txt")
         done("ingest", folder / "truth.txt", *words, where, folder / "two.mcap")
     (folder / "walk.txt").write_text("\n".join(walk) + "\n")
+    (folder / "old.html").write_text("")
     with log.create(folder / "things.mcap") as writer:
         channel = writer.add_channel("/things", ("my_msgs/Things", "jsonschema", b"{}"), "json", {})
         for number in range(40):

@@ -21,7 +21,7 @@ from tests.tiers import thorough
 
 MUTANTS = int(os.environ.get("MUTANTS", "0"))
 FIRST = int(os.environ.get("FIRST_MUTANT", "0"))
-COMMANDS = sorted(READING.keys() - {"train"})
+COMMANDS = sorted(READING)
 
 
 @pytest.fixture(scope="module")

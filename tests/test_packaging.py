@@ -23,8 +23,10 @@ from mcaptrack import __version__
 from mcaptrack.cli import app
 from tests.commands import call
 from tests.sources import PACKAGE, texts
+from tools.pages import with_links_that_lead
 
 ROOT = Path(__file__).parent.parent
+PAGES = [path for folder in ("docs", "docs/extensions") for path in (ROOT / folder).glob("*.md")]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 HOME = "https://github.com/mcaptrack/mcaptrack"
 
@@ -81,8 +83,8 @@ def test_the_wheel_has_all_that_is_needed_and_nothing_else(shipped):
     }
     schemas = {f"mcaptrack/schemas/{path.name}" for path in (ROOT / "schemas").glob("*.proto")}
     pages = {
-        f"mcaptrack/docs/{path.name}"
-        for path in [*(ROOT / "docs").glob("*.md"), *map(Path, ("README.md", "CHANGELOG.md"))]
+        f"mcaptrack/docs/{path.relative_to(ROOT / 'docs') if path.is_absolute() else path}"
+        for path in [*PAGES, *map(Path, ("README.md", "CHANGELOG.md"))]
     }
     about = {name for name in shipped if name.startswith(f"mcaptrack-{__version__}.dist-info/")}
     assert shipped == package | schemas | pages | about
@@ -155,7 +157,7 @@ def test_the_pages_are_listed_and_printed_as_they_were_written(tmp_path):
     code, out, _ = call("docs")
     listed = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert (code, next(iter(listed))) == (0, "readme")
-    assert set(listed) == {path.stem for path in (ROOT / "docs").glob("*.md")} | {"readme", "changelog"}
+    assert set(listed) == {path.stem for path in PAGES} | {"readme", "changelog"}
     assert listed["sql"] == "SQL"
     said = json.loads(call("docs", "--json")[1])
     assert {page["name"]: page["title"] for page in said["pages"]} == listed
@@ -181,8 +183,8 @@ def test_a_page_that_is_not_there_is_said_with_those_that_are():
 
 def test_links_of_the_pages_lead_somewhere():
     lost = []
-    for path in [*(ROOT / "docs").glob("*.md"), ROOT / "README.md"]:
-        text = path.read_text()
+    for path in [*PAGES, ROOT / "README.md"]:
+        text = with_links_that_lead(path.read_text())
         targets = [target for target in re.findall(r"\]\(([^)#][^)]*)\)", text) if not target.startswith("https://")]
         lost += [(path.name, one) for one in targets if not (path.parent / one.partition("#")[0]).exists()]
         heads = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")]

@@ -344,9 +344,9 @@ def crowds(count: int, steps: int, seed: int) -> list[Rows]:
     The place is the middle of the square in which they walk, so that people enter and leave it; a person who comes back
     is another one.
     """
-    from mcaptrack.extensions.training import walks
+    from mcaptrack.sources import walks
 
-    people, parts = walks._PEOPLE, walks._WALKS_EACH  # consecutive walks of one person follow each other
+    people, parts = walks.PEOPLE, walks.WALKS_EACH  # consecutive walks of one person follow each other
     paths, _ = walks.walks(count * people * parts, -(-steps // parts), STEP_S, seed)
     out = []
     for places in paths.reshape(count, people, -1, 2)[:, :, :steps]:

@@ -21,16 +21,16 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from corruptions import STEP_S, Corruption, Rows
 
-from mcaptrack.extensions.training import walks
+from mcaptrack.sources import walks
 
-SCENES, PEOPLE = walks._SCENES, walks._PEOPLE
+SCENES, PEOPLE = walks.SCENES, walks.PEOPLE
 SHAPES = ("square", "street", "crossing", "open")
 SQUARE, STREET, CROSSING, OPEN = range(4)
 #: How far outside people turn round, in metres; how many gates a square has; and the shortest presence, in steps.
 OUTSIDE_M, GATES, SHORTEST = 2.0, 6, 8
 
 
-class Crowd(walks._Crowd):
+class Crowd(walks.Crowd):
     """S scenes of M people, the ``kind`` (S, 1) of each, and who has just come in (S, M): somebody else left."""
 
     @classmethod
@@ -122,7 +122,7 @@ def scenes(seed: int, steps: int, count: int = SCENES) -> list[Rows]:
     crowd = Crowd.begin(rng)
     for _ in range(60):
         crowd.step()
-    fine = round(STEP_S / walks._FINE_S)
+    fine = round(STEP_S / walks.FINE_S)
     path, entered, came = [], [], np.zeros(crowd.pace.shape, bool)
     for number in range(steps * fine):
         crowd.step()

@@ -27,7 +27,6 @@ from reproduce import on_clock
 
 from mcaptrack import __version__
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Forecasts, Positions, pair_forecasts
-from mcaptrack.extensions.training.walks import walks
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
@@ -36,6 +35,7 @@ from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, Predictor, make, p
 from mcaptrack.predictors.tail_calibration import TABLES, counts_of
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.framing import JoinedFrames, join_frames
+from mcaptrack.sources.walks import walks
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
 

@@ -56,6 +56,15 @@ def pages() -> list[Path]:
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
+def with_links_that_lead(text: str) -> str:
+    """A page in which links to pages of extensions that aren't there are text."""
+
+    def link(match: re.Match[str]) -> str:
+        return match[0] if (ROOT / "docs" / "extensions" / match[2]).exists() else match[1]
+
+    return re.sub(r"\[([^\]]+)\]\((?:[\w./]*/)?extensions/(\w+\.md)[^)]*\)", link, text)
+
+
 def blocks(path: Path) -> list[Block]:
     """The fenced blocks of a page, in order. Raises ValueError for a fence without an end or a mark without a block."""
     name = path.relative_to(ROOT).as_posix()

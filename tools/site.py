@@ -1,6 +1,6 @@
 """The generated parts of the site: commands, library, parts of the pipeline, answers to queries.
 
-MkDocs calls ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
+MkDocs calls ``on_config``, then ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
 ``<!-- generated: NAME -->`` where a part belongs: one of ``GENERATED``, or of those that `mcaptrack docs` prints, too
 (``mcaptrack.cli.generated.PARTS``). Below each query of docs/sql.md stands what the tables of `mcaptrack demo` answer:
 those in the folder that the environment variable DEMO names, or those of one that is made for it (a minute).
@@ -37,12 +37,22 @@ class Completed(griffe.Extension):
             func.docstring = griffe.Docstring(doc, parent=func, parser=griffe.Parser.numpy)
 
 
+def on_config(config: Any) -> Any:
+    """The settings, with the pages of the extensions that are there in the list of pages."""
+    pages = [path.relative_to(ROOT / "docs").as_posix() for path in sorted((ROOT / "docs").glob("extensions/*.md"))]
+    named = {"Extensions": pages}
+    config.nav = [named if entry == {"Extensions": "EXTENSIONS"} else entry for entry in config.nav]
+    config.nav = [entry for entry in config.nav if entry != {"Extensions": []}]
+    return config
+
+
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """The page, without the marks of its blocks, with what is generated."""
     sys.path[:0] = [path for path in (str(ROOT),) if path not in sys.path]
-    text = re.sub(r"^ *<!-- (?:not run|file|exit): .+? -->\n", "", markdown, flags=re.M)
     from mcaptrack.cli.generated import PARTS, with_parts
+    from tools.pages import with_links_that_lead
 
+    text = re.sub(r"^ *<!-- (?:not run|file|exit): .+? -->\n", "", with_links_that_lead(markdown), flags=re.M)
     text = with_parts(text, PARTS | GENERATED)
     return with_answers(text) if page.file.src_uri == "sql.md" else text
 

@@ -27,15 +27,15 @@ import torch
 from torch import nn
 
 from mcaptrack import __version__
-from mcaptrack.extensions.training import walks
 from mcaptrack.extensions.training.windows import ar1
 from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import social
 from mcaptrack.predictors.forecast import PeopleSeen
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
+from mcaptrack.sources import walks
 
 STEPS, PAST, STEP_S = 12, 8, 0.4
-SCENES, PEOPLE, K = walks._SCENES, walks._PEOPLE, social.MOST_PEOPLE
+SCENES, PEOPLE, K = walks.SCENES, walks.PEOPLE, social.MOST_PEOPLE
 #: Steps of 0.4 s that a crowd is recorded, and how often a frame of them is taken.
 LENGTH, STRIDE = 110, 4
 HIDDEN, DENSE = 48, 64
@@ -43,7 +43,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 RED = load(SHIPPED / "red.safetensors")
 
 
-class Crowd(walks._Crowd):
+class Crowd(walks.Crowd):
     """S scenes of M people: of each scene a share of groups, and a kind: anywhere, gates, two flows."""
 
     @classmethod

@@ -48,10 +48,11 @@ def documentation(
         mcaptrack docs tables
     """
     package = Path(__file__).resolve().parent.parent
-    inside = package / "docs"
-    beside = [path for path in package.parent.glob("*.md") if path.stem in ("README", "CHANGELOG")]
-    shown = inside.glob("*.md") if inside.is_dir() else [*beside, *(package.parent / "docs").glob("*.md")]
-    paths = sorted(shown, key=lambda path: (path.stem != "README", path.stem.lower()))
+    folder, beside = package / "docs", []
+    if not folder.is_dir():
+        folder, beside = package.parent / "docs", [package.parent / f"{name}.md" for name in ("README", "CHANGELOG")]
+    paths = [*beside, *folder.glob("*.md"), *folder.glob("extensions/*.md")]
+    paths.sort(key=lambda path: (path.stem != "README", path.stem.lower()))
     pages = {path.stem.lower(): path for path in paths}
     if page is None:
         return pages

@@ -114,7 +114,8 @@ def questions(solved: Solved, answered: Sequence[Frame], count: int) -> list[Que
     rows, begins = worlds.rows[first], worlds.row_ns[first]
     tracks = join_frames(TRACKS, solved.tracks)
     at = find_rows((tracks.row_ns, tracks.rows["source_id"]), (begins, rows["source_id"]))
-    decided = np.where(at >= 0, tracks.rows["track_id"][at], -1 - np.arange(len(at)))  # those left out have no other's
+    decided = -1 - np.arange(len(at))  # those left out have no other's
+    decided[at >= 0] = tracks.rows["track_id"][at[at >= 0]]
     is_certain = np.isin(join_frames(DECISIONS, answered).rows["probability"], (0, 1))
     done = {*compress(keys_of(answered), is_certain)}
     asked = _asked(track, decided, _tracklets(solved.samples, rows, begins), rows["frames"].astype(np.int64))

@@ -3,15 +3,20 @@
 import json
 from pathlib import Path
 
+import numpy as np
+
 import mcaptrack
+from tests.worlds import noisy_tracks, write_channels
 
 READING = {"review": lambda log, out: [log, "--print"]}
 EFFECTS = {"review": None}  # its options are seen where tracks are doubtful: test_review
 
 
 def _answered(scene) -> str:
-    """Answer the first question."""
-    (name, *_) = mcaptrack.review(scene.path, questions=1).questions
+    """Answer the only question about people who were occluded."""
+    walks = noisy_tracks(np.random.default_rng(2), people=2, ticks=20, hidden=0.05)
+    mcaptrack.retrack(write_channels(scene.path, samples=walks))
+    (name,) = mcaptrack.review(scene.path).questions
     Path("answers.json").write_text(json.dumps({name: "yes"}))
     return scene.says("review", "LOG", "--answers", "answers.json")
 

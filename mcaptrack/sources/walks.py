@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Bools, Floats
 
 #: Time step of the simulation, and how long it runs before walks are recorded, in seconds.
-_FINE_S: Final = 0.2
+FINE_S: Final = 0.2
 _SETTLE_S: Final = 8.0
-_SCENES, _PEOPLE = 48, 24
-_WALKS_EACH: Final = 5
+SCENES, PEOPLE = 48, 24
+WALKS_EACH: Final = 5
 #: Share of scenes with up to seven times as frequent changes of direction.
 _RESTLESS: Final = 0.1
 #: Shares of people who mostly stand, stroll, walk, and run or ride.
@@ -30,7 +30,7 @@ _PACES: Final = (0.24, 0.12, 0.61, 0.03)
 
 
 @dataclass
-class _Crowd:
+class Crowd:
     """The state of S scenes with M people each."""
 
     rng: np.random.Generator
@@ -48,9 +48,9 @@ class _Crowd:
     offset: Floats  # (S, M, 2) place in the group, metres sideways and back
 
     @classmethod
-    def start(cls, rng: np.random.Generator) -> _Crowd:
-        shape = (_SCENES, _PEOPLE)
-        side = np.exp(rng.uniform(np.log(30), np.log(150), (_SCENES, 1)))
+    def start(cls, rng: np.random.Generator) -> Crowd:
+        shape = (SCENES, PEOPLE)
+        side = np.exp(rng.uniform(np.log(30), np.log(150), (SCENES, 1)))
         kind = rng.choice(4, shape, p=_PACES)
         pace = np.select(
             [kind == 1, kind == 3],
@@ -58,11 +58,11 @@ class _Crowd:
             np.clip(rng.normal(1.3, 0.26, shape), 0.6, 2.2),
         )
         place = rng.uniform(0, 1, (*shape, 2)) * side[..., None]
-        leader = np.tile(np.arange(_PEOPLE), (_SCENES, 1))
+        leader = np.tile(np.arange(PEOPLE), (SCENES, 1))
         offset = np.zeros((*shape, 2))
         # A quarter joins the person before, with its speed, beside or a little behind.
-        joins = (rng.random(shape) < 0.25) & (np.arange(_PEOPLE) > 0)
-        for person in range(1, _PEOPLE):
+        joins = (rng.random(shape) < 0.25) & (np.arange(PEOPLE) > 0)
+        for person in range(1, PEOPLE):
             ahead = leader[:, person - 1]
             leader[:, person] = np.where(joins[:, person], ahead, person)
         offset[joins] = np.stack(
@@ -72,13 +72,13 @@ class _Crowd:
             ],
             -1,
         )
-        scene = np.arange(_SCENES)[:, None]
+        scene = np.arange(SCENES)[:, None]
         place = np.where(joins[..., None], place[scene, leader] + offset, place)
         crowd = cls(
             rng=rng,
             side_m=side,
             restless=np.exp(
-                rng.choice([0.0, 1.0], (_SCENES, 1), p=(1 - _RESTLESS, _RESTLESS)) * rng.uniform(0, 2, (_SCENES, 1))
+                rng.choice([0.0, 1.0], (SCENES, 1), p=(1 - _RESTLESS, _RESTLESS)) * rng.uniform(0, 2, (SCENES, 1))
             ),
             place=place,
             speed=np.zeros((*shape, 2)),
@@ -95,9 +95,9 @@ class _Crowd:
         return crowd
 
     def step(self) -> None:
-        """Advance by ``_FINE_S``."""
-        rng, dt = self.rng, _FINE_S
-        scene = np.arange(_SCENES)[:, None]
+        """Advance by ``FINE_S``."""
+        rng, dt = self.rng, FINE_S
+        scene = np.arange(SCENES)[:, None]
         shape = self.pace.shape
         self.haste += dt / 3 * (1 - self.haste) + 0.08 * np.sqrt(2 * dt / 3) * rng.normal(size=shape)
         veer = 0.12 * np.sqrt(self.restless)
@@ -111,7 +111,7 @@ class _Crowd:
         going = (self.rest_s <= 0) * self.pace * self.haste
         wish = way / np.maximum(away, 0.1)[..., None] * going[..., None]
         # Members of a group keep their place beside the leader.
-        follows = self.leader != np.arange(_PEOPLE)
+        follows = self.leader != np.arange(PEOPLE)
         first, along = self.place[scene, self.leader], self.speed[scene, self.leader]
         pace = np.hypot(along[..., 0], along[..., 1])
         ahead = along / np.maximum(pace, 0.2)[..., None]
@@ -139,7 +139,7 @@ class _Crowd:
         """Choose a new goal, mostly ahead, after reaching one and at random times."""
         away = np.hypot(*np.moveaxis(self.goal - self.place, -1, 0))
         shape = away.shape
-        self._new_goal((away < 1.0) | (self.rng.random(shape) < self.restless * _FINE_S / 140), spread=0.35)
+        self._new_goal((away < 1.0) | (self.rng.random(shape) < self.restless * FINE_S / 140), spread=0.35)
 
     def _new_goal(self, which: Bools, spread: float) -> None:
         rng, shape = self.rng, which.shape
@@ -156,7 +156,7 @@ class _Crowd:
         east, north = (self.place[:, :, None, axis] - self.place[:, None, :, axis] for axis in (0, 1))
         near = np.sqrt(east**2 + north**2) + 1e-6
         strength = np.minimum(2.0 * np.exp((0.5 - near) / 0.35), 3.0)
-        strength[:, np.arange(_PEOPLE), np.arange(_PEOPLE)] = 0
+        strength[:, np.arange(PEOPLE), np.arange(PEOPLE)] = 0
         strength *= np.where(self.leader[:, :, None] == self.leader[:, None], 0.3, 1.0)
         ahead = self.speed / np.maximum(np.hypot(self.speed[..., 0], self.speed[..., 1]), 0.3)[..., None]
         facing = -(east * ahead[:, :, None, 0] + north * ahead[:, :, None, 1]) / near
@@ -170,24 +170,24 @@ def walks(count: int, steps: int, step_s: float, seed: int) -> tuple[Floats, NDA
     The same seed gives the same walks.
     """
     rng = np.random.default_rng(seed)
-    every = step_s / _FINE_S
+    every = step_s / FINE_S
     out: list[Floats] = []
     count_done = 0
     while count_done < count:
-        crowd = _Crowd.start(rng)
-        for _ in range(round(_SETTLE_S / _FINE_S)):
+        crowd = Crowd.start(rng)
+        for _ in range(round(_SETTLE_S / FINE_S)):
             crowd.step()
         # Several consecutive walks of each person.
         path = []
-        for _ in range(int(np.ceil(_WALKS_EACH * steps * every)) + 2):
+        for _ in range(int(np.ceil(WALKS_EACH * steps * every)) + 2):
             path.append(crowd.place)
             crowd.step()
-        places = np.stack(path, axis=2).reshape(_SCENES * _PEOPLE, -1, 2)
-        at = np.arange(_WALKS_EACH * steps) * every
+        places = np.stack(path, axis=2).reshape(SCENES * PEOPLE, -1, 2)
+        at = np.arange(WALKS_EACH * steps) * every
         low = at.astype(int)
         share = (at - low)[:, None]
         sampled = (1 - share) * places[:, low] + share * places[:, low + 1]
         out.append(sampled.reshape(-1, steps, 2))
         count_done += len(out[-1])
-    scene = np.arange(len(out) * _SCENES).repeat(_PEOPLE * _WALKS_EACH)
+    scene = np.arange(len(out) * SCENES).repeat(PEOPLE * WALKS_EACH)
     return np.concatenate(out)[:count], scene[:count]
