@@ -207,7 +207,9 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
         members = list(_logs_in(argument, leave_out, is_named=True))
         if not members:
             refuse_non_mcap(argument)
-            raise McaptrackError(f"the folder {argument} has no log: no file in it ends with {_SUFFIX}")
+            raise McaptrackError(
+                f"the folder {argument} has no log, which is a file that ends with {_SUFFIX} and no part of a recording"
+            )
         yield from members
     elif _is_no_pattern(argument):
         yield NamedLog(argument, Path(argument.name))
