@@ -38,6 +38,8 @@ from typing import (
 
 from mcaptrack.errors import McaptrackError, offer
 
+__all__ = ["Argument", "Option", "checked", "declared"]
+
 P = ParamSpec("P")
 T = TypeVar("T")
 

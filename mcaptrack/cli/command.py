@@ -19,6 +19,8 @@ from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.errors import similar
 from mcaptrack.notices import warn
 
+__all__ = ["warn_unused"]
+
 #: The exception of Typer for a command line that it can't parse.
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
 
