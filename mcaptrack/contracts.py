@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
     from mcaptrack.api.reading import LogReader
 
+__all__ = [
+    "UNKNOWN_VECTOR", "Box", "Box3d", "Exporter", "LabelBoxes", "LabelFormat", "MessageReader", "ReadingNotes",
+    "RecordedChannel", "RecordedMessage", "RecordingFormat", "RecordingReader",
+]  # fmt: skip
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
