@@ -101,3 +101,9 @@ SCHEMA_VERSION: int
 # fuser feet: mcaptrack.extensions.cameras
 # report_section zones: mcaptrack.extensions.zones
 # scene fused: mcaptrack.extensions.cameras
+# exporter rosbag2: mcaptrack.extensions.bags
+# exporter rosbag2-sqlite3: mcaptrack.extensions.bags
+# recording rosbag: mcaptrack.extensions.bags
+# ending .bag: mcaptrack.extensions.bags
+# ending .db3: mcaptrack.extensions.bags
+# ending metadata.yaml: mcaptrack.extensions.bags

@@ -22,9 +22,8 @@ Similarity = Literal["iou", "metres", "bev-iou", "3d-iou"]
 Mode = Literal["both", "offline", "online"]
 #: Whether tracks are compensated for the motion of the camera.
 CameraMotionUse = Literal["auto", "on", "off"]
-#: Formats of tables, of ROS 2 bags, and of files with the boxes of one channel; the registry has more of these.
+#: Formats of tables, and of files with the boxes of one channel; the registry has more of these.
 TableFormat = Literal["parquet", "arrow", "csv", "jsonl"]
-BagFormat = Literal["rosbag2", "rosbag2-sqlite3"]
 BoxFormat = Literal["mot"]
 #: The layouts of a log for viewers, and the end of the name of each file; the first one is the default.
 LAYOUTS: Final[Mapping[str, str]] = {

@@ -1,4 +1,4 @@
-"""Contracts of label formats, readers of messages and exporters of other packages, and the types that they give.
+"""Contracts of label formats, readers of messages, recording formats and exporters of packages, and what they give.
 
 Each is a class that is made without arguments; finishers and sections of the report are functions. Detectors, trackers
 and so on are in ``mcaptrack.transforms.protocol``, predictors in ``mcaptrack.predictors.forecast``; a command is a
@@ -9,8 +9,9 @@ Letters: N boxes, F frames.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -23,19 +24,10 @@ if TYPE_CHECKING:
     from mcaptrack.api.reading import LogReader
 
 __all__ = [
-    "UNKNOWN_VECTOR",
-    "Box",
-    "Box3d",
-    "Exporter",
-    "Finished",
-    "LabelBoxes",
-    "LabelFormat",
-    "MessageReader",
-    "Quaternion",
-    "ReportSection",
-    "SectionTable",
-    "Vector",
-]
+    "UNKNOWN_VECTOR", "Box", "Box3d", "Exporter", "Finished", "LabelBoxes", "LabelFormat", "MessageReader",
+    "Quaternion", "ReadingNotes", "RecordedChannel", "RecordedMessage", "RecordingFormat", "RecordingReader", "ReportSection",
+    "SectionTable", "Vector",
+]  # fmt: skip
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -148,11 +140,109 @@ class MessageReader(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class RecordedChannel:
+    """A topic of a recording, which becomes a channel.
+
+    Attributes
+    ----------
+    topic : str
+    schema : tuple of (str, str, bytes)
+        Name, encoding and data of the schema record; empty for messages without one.
+    encoding : str
+        The encoding of its messages, as the MCAP registry names it: "cdr", "ros1", "protobuf", "json", ...
+    metadata : mapping of str to str
+    """
+
+    topic: str
+    schema: tuple[str, str, bytes] = ("", "", b"")
+    encoding: str = ""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+class RecordedMessage(NamedTuple):
+    """A message of a recording; times in nanoseconds since 1970.
+
+    By default it was published at ``t_ns``, and ``sequence`` counts the messages of its channel.
+    """
+
+    channel: RecordedChannel
+    t_ns: int
+    payload: bytes
+    publish_ns: int | None = None
+    sequence: int | None = None
+
+
+@dataclass
+class ReadingNotes:
+    """Remarks about a recording (``notes``), and the parts that can't be read (``lost``)."""
+
+    notes: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+
+
+class RecordingReader:
+    """A recording, open for reading: the base class of what recording formats open.
+
+    Attributes
+    ----------
+    channels : sequence of RecordedChannel
+        All channels, including those without messages.
+    profile : str
+        That of the MCAP registry, such as "ros2".
+    declared_counts : mapping of RecordedChannel to int, optional
+        The numbers of messages that the recording states. Fewer are an error, unless something was lost.
+    findings : ReadingNotes
+        What is found before any message is read.
+    closing : contextlib.ExitStack
+        Closes its files.
+    as_log : Log, optional
+        The recording as a log, if it is a single MCAP file.
+    """
+
+    channels: Sequence[RecordedChannel] = ()
+    profile: str = ""
+    declared_counts: Mapping[RecordedChannel, int] | None = None
+    as_log: Any = None
+
+    def __init__(self) -> None:
+        self.findings = ReadingNotes()
+        self.closing = ExitStack()
+
+    def close(self) -> None:
+        """Close its files."""
+        self.closing.close()
+
+    def messages(self, report: ReadingNotes) -> Iterator[RecordedMessage]:
+        """All messages in the order of the recording, from the beginning in every call."""
+        raise NotImplementedError
+
+    def extras(self, writer: Any, has_clock: bool, is_copied: bool) -> None:
+        """Write attachments and metadata by a ``LogWriter``; if ``is_copied``, those that ``as_log`` doesn't hold."""
+
+
+class RecordingFormat(Protocol):
+    """A format of recordings that are no MCAP files.
+
+    A method ``listing(path)`` may be left out: it gives the file beside an MCAP file that lists it as a part of a
+    recording, or None. A format that has it has ``update(path)``, too, which is called when that MCAP file has changed.
+    """
+
+    def recognises(self, path: Path) -> str:
+        """Say what a file or folder is, as in "a ROS 1 bag", by its first bytes or its files; "" for others."""
+        ...
+
+    def open(self, path: Path) -> RecordingReader:
+        """Open a recording. Raise McaptrackError or ValueError if it can't be read."""
+        ...
+
+
 class Exporter(Protocol):
     """A format of ``export``.
 
     Class attributes may be left out: ``end`` is the end of the names of files, as in ".speeds.csv"; ``is_folder`` is
-    True if it writes a folder.
+    True if it writes a folder, and ``marker`` names a file that each of its folders has: by it, or else by ``end``,
+    folders are known that may be replaced.
     """
 
     def write(self, recording: LogReader, path: Path) -> Mapping[str, int]:

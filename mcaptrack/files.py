@@ -22,7 +22,10 @@ from mcaptrack.errors import McaptrackError, list_names, similar
 from mcaptrack.location import SCHEMES, Location, Url, hide_secrets, shortened
 from mcaptrack.processes import MARK_DIGITS, has_ended, mark_of
 
-__all__ = ["is_same_file", "place_of", "publish_bytes", "read_json", "refuse_overwrite"]
+__all__ = [
+    "follow_links", "is_same_file", "place_of", "publish_bytes", "read_beginning", "read_json", "refuse_overwrite",
+    "refuse_special", "temporary_folder", "unreadable", "visible",
+]  # fmt: skip
 
 
 @contextmanager

@@ -18,6 +18,8 @@ from typing import Final, NamedTuple
 
 _OWN: Final = "mcaptrack."
 _EXTENSIONS: Final = f"{_OWN}extensions"
+#: How the stub names an extension.
+_PLACE: Final = rf"{re.escape(_EXTENSIONS)}\.(\w+)"
 #: A folder with what pip says of a package, and the name of the package in it.
 _INFO: Final = re.compile(r"(.+?)(-.*)?\.(dist|egg)-info")
 _FILES: Final = ("METADATA", "PKG-INFO")
@@ -61,19 +63,29 @@ def declared() -> Declared:
     return _declared(_places())
 
 
-def missing_extension(name: str, kind: str = "name") -> str:
+def missing_extension(name: str, kind: str = "name", what: str = "") -> str:
     """Say what to do about a name that is of an extension which isn't installed; "" for other names.
 
     The stub for type checkers says which names those are, in Python and, in comments, of other kinds: it alone names
-    extensions from outside.
+    extensions from outside. ``what`` is said in place of the name.
     """
-    stub = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
-    place, own = rf"{re.escape(_EXTENSIONS)}\.(\w+)", re.escape(name)
-    in_python = kind in ("name", "command")
-    match = re.search(rf"^from {place}\S* import {own} as" if in_python else rf"^# {kind} {own}: {place}$", stub, re.M)
+    own, in_python = re.escape(name), kind in ("name", "command")
+    pattern = rf"^from {_PLACE}\S* import {own} as" if in_python else rf"^# {kind} {own}: {_PLACE}$"
+    match = re.search(pattern, _stub(), re.M)
     if not match or any(point.is_own and point.value.split(".")[2] == match[1] for point in declared().points):
         return ""
-    return f"{name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/{match[1]}"
+    text = f"{what or name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/"
+    return f"{text}{match[1]}"
+
+
+def missing_names(kind: str) -> list[str]:
+    """The names of a kind that are of extensions which aren't installed, by the comments of the stub."""
+    names = re.findall(rf"^# {kind} (\S+): {_PLACE}$", _stub(), re.M)
+    return [name for name, extension in names if not _is_extension(extension)]
+
+
+def _stub() -> str:
+    return Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
 
 
 def _is_extension(name: str) -> bool:

@@ -13,9 +13,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from shutil import rmtree
 from typing import NamedTuple
 
 #: Seconds of processor time, and bytes beyond what the loaded program takes.
@@ -86,12 +87,49 @@ def on_disk(*folders: Path) -> dict[str, tuple[int, bytes]]:
     return {str(entry): (entry.lstat().st_mtime_ns, entry.read_bytes() if entry.is_file() else b"") for entry in found}
 
 
+#: A command, and what has to hold of what it wrote, by the exit code.
+Work = tuple[list[object], Callable[[int], bool]]
+
+
+def _fault(commands: Commands, words: list[object], inside: Path, holds: Callable[[int], bool]) -> str:
+    """What goes wrong with a command that reads from a folder, "" if nothing does."""
+    before = on_disk(inside)
+    outcome = commands.run(*words)
+    lines = outcome.err.splitlines()
+    if on_disk(inside) != before:
+        return f"what it reads was changed: {outcome}"
+    if outcome.code not in (0, 1, 2, 3) or outcome.peak_bytes > MEMORY_BYTES or "Traceback" in outcome.err:
+        return str(outcome)
+    is_said = bool(lines) and lines[-1].startswith("mcaptrack: ") and max(map(len, lines)) < 2000
+    if outcome.code in (1, 2) and words[0] != "check" and not is_said:
+        return f"no reason: {outcome}"
+    if any(not character.isprintable() and character != "\n" for character in outcome.err):
+        return f"unescaped: {outcome}"
+    return "" if holds(outcome.code) else f"what it wrote does not add up: {outcome}"
+
+
+def faults(
+    commands: Commands, seeds: Iterable[int], folder: Path, make: Callable[[int, Path, Path], Iterator[Work]]
+) -> list[str]:
+    """What goes wrong with the commands on what ``make`` makes by each seed, in one folder, for output in another."""
+    found = []
+    for seed in seeds:
+        inside, out = folder / str(seed), folder / f"{seed}.out"
+        inside.mkdir()
+        out.mkdir()
+        for words, holds in make(seed, inside, out):
+            if said := _fault(commands, words, inside, holds):
+                found.append(f"{seed} {words[0]}: {said[:3000]}")
+            rmtree(out)
+            out.mkdir()
+    return found
+
+
 def _serve(lines: Iterable[str]) -> None:
     from mcaptrack import pipeline  # noqa: F401
     from mcaptrack.__main__ import main
     from mcaptrack.cli import app  # noqa: F401
     from mcaptrack.sources.ingest import ingest  # noqa: F401
-    from mcaptrack.sources.ingest.bags import plain_yaml, rosbag1, rosbag2, sqlite_tables  # noqa: F401
     from mcaptrack.tables import export  # noqa: F401
 
     for line in lines:

@@ -192,3 +192,10 @@ def flat_table(rows: Sequence[Mapping[str, object]], blobs: bool) -> tuple[Table
     source = messages.MessageSource("/a", "A", "a.mcap", 0, len(rows), "a.mcap: /a", lambda _: iter([data]), flatten)
     table = messages.inferred_table(source, lambda _: True, blobs)
     return table.pieces, [name for (name,) in table.left_out]
+
+
+def plain(path: Path, profile: str, library: str = "robot") -> Path:
+    """A log with one channel of JSON."""
+    with recorder(path, profile, library) as writer:
+        writer.add_message(writer.register_channel("/a", "json", 0), 1, b"{}", 1)
+    return path

@@ -84,7 +84,7 @@ class TestErrors:
         "ingest clip.mp4 -o clip.mp4 --force": "clip.mp4 is both input and output",
         "run a.mcap -o a.mcap --force": "a.mcap is both input and output",
         "run text.mp4": "text.mp4 can't be read as an MCAP file",
-        "info folder": "the folder folder has no log: no file in it ends with .mcap",
+        "info folder": "the folder folder has no log, which is a file that ends with .mcap and no part of a recording",
         "run clip.mp4": "clip.mp4 is a video, not an MCAP file; `mcaptrack ingest clip.mp4`",
         "evaluate a.mcap --truth good.txt": "add it with `mcaptrack ingest good.txt --as truth --into a.mcap`",
         "track a.mcap --topic /none": "has no channel /none for track; it has /camera/video",

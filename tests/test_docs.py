@@ -163,9 +163,10 @@ def test_every_guarantee_of_the_map_names_test_files_that_exist():
     guarantees = re.split(r"^- ", listed, flags=re.M)[1:]
     assert len(guarantees) > 10
     for guarantee in guarantees:
-        files = re.findall(r"`(test_\w+)`", guarantee)
+        files = [ROOT / "tests" / f"{name}.py" for name in re.findall(r"`([\w/]*test_\w+)`", guarantee)]
         assert files, guarantee
-        assert all((ROOT / "tests" / f"{name}.py").exists() for name in files), guarantee
+        of_missing = [path for path in files if path.parents[1].name == "extensions" and not path.parent.exists()]
+        assert all(path.exists() for path in files if path not in of_missing), guarantee
 
 
 def test_the_floors_on_the_map_are_those_that_are_held():

@@ -29,10 +29,10 @@ from mcaptrack.cli.many import NAMES
 from mcaptrack.sources import demo
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.serving import Server
-from tests.bags import plain
 from tests.commands import GROUP, call, done, press_ctrl_c
 from tests.effects.commands import CASES
 from tests.extension_cases import of_extensions
+from tests.logs import plain
 from tests.models import DATA, stocked
 from tests.tiers import one_in
 from tests.undefined import write_undefined

@@ -21,12 +21,13 @@ import numpy as np
 import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from google.protobuf.message_factory import GetMessages
+from mcap.reader import make_reader
 
 import mcaptrack
 from mcaptrack import log, testing
 from mcaptrack.api.declared import declared
 from mcaptrack.api.finishing import Finishers
-from mcaptrack.choices import BagFormat, BoxFormat, TableFormat
+from mcaptrack.choices import BoxFormat, TableFormat
 from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import BUILT_IN, KINDS, others
@@ -109,7 +110,7 @@ def test_every_kind_stands_on_the_page_with_an_example_of_at_most_40_lines():
 def test_the_names_of_options_are_those_of_the_registry():
     from typing import get_args
 
-    exporters = (*get_args(TableFormat), *get_args(BagFormat), *get_args(BoxFormat))
+    exporters = (*get_args(TableFormat), *get_args(BoxFormat))
     assert exporters == tuple(BUILT_IN["exporter"])
 
 
@@ -372,6 +373,103 @@ def test_built_in_readers_are_not_replaced(site):
     robot("a.mcap", "vision_msgs/Detection2DArray", [{"detections": [vision(1)]}])
     done("track", "a.mcap", "--topic", "/robot/things")
     assert not is_imported("another")
+
+
+# Recording formats
+
+
+TEXT = '#recording\n/b 20 {"x": 1}\n/a 10 {}\n/b 30 {"x": 2}\n'
+
+
+def test_a_recording_of_a_format_of_a_package_becomes_a_log_with_all_of_its_messages(site):
+    Path("drive.text").write_text(TEXT)
+    assert "drive.text is a recording as text, not an MCAP file; " in one_line("info", "drive.text")
+    done("ingest", "drive.text")
+    with Path("drive.mcap").open("rb") as stream:
+        found = [(c.topic, c.message_encoding, m.log_time, m.publish_time, m.sequence, m.data)
+                 for _, c, m in make_reader(stream).iter_messages(log_time_order=False)]  # fmt: skip
+    assert found == [
+        ("/b", "json", 20, 20, 0, b'{"x": 1}'), ("/a", "json", 10, 10, 0, b"{}"), ("/b", "json", 30, 30, 1, b'{"x": 2}'),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("opens", "said"),
+    [
+        ("raise OSError('gone')", "can't read drive.odd: OSError: gone"),
+        ("return 3", "gave a int of drive.odd; open has to give a RecordingReader"),
+        ("return Odd([3])", "gave what is no message of a channel of its own: 3"),
+        (
+            "return Odd([RecordedMessage(RecordedChannel('/a'), 1, b'')])",
+            "gave what is no message of a channel of its own: Rec",
+        ),
+        (
+            "return Odd([RecordedMessage(Odd.channels[0], -1, b'')])",
+            "gave what is no message of a channel of its own: Rec",
+        ),
+        ("return Odd(1 / 0 for _ in '1')", "can't read drive.odd: ZeroDivisionError"),
+    ],
+)
+def test_a_recording_format_that_fails_is_named_and_leaves_nothing(site, opens, said):
+    code = (
+        "from mcaptrack.contracts import RecordedChannel, RecordedMessage, RecordingReader\n"
+        "class Odd(RecordingReader):\n    channels = [RecordedChannel('/a')]\n"
+        "    def __init__(self, given):\n        super().__init__()\n        self.given = given\n"
+        "    def messages(self, report):\n        yield from self.given\n"
+        "class Part:\n    def recognises(self, path):\n        return 'odd' * (path.suffix == '.odd')\n"
+        f"    def open(self, path):\n        {opens}\n"
+    )
+    add(site, "recording", "odd", code)
+    Path("drive.odd").write_text("x")
+    assert f"recording odd (another 2.0) {said}" in one_line("ingest", "drive.odd")
+    assert [path.name for path in Path().iterdir()] == ["drive.odd"]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "raise ImportError('gone')",
+        "class Part:\n    def recognises(self, path): raise OSError('gone')\n    def open(self, path): ...",
+    ],
+)
+def test_a_broken_recording_format_is_named_and_the_others_work(site, code):
+    add(site, "recording", "broken", code)
+    Path("drive.text").write_text(TEXT)
+    outcome = done("ingest", "drive.text")
+    assert "gone" in outcome.err
+    assert "gone" not in done("info", "drive.mcap").err
+
+
+def test_an_mcap_file_that_a_format_lists_is_left_as_it_is_and_its_list_is_updated(site):
+    code = (
+        "from pathlib import Path\n"
+        "class Part:\n    def recognises(self, path):\n        return 'a list' * (path / 'list').is_file()\n"
+        "    def open(self, path): ...\n"
+        "    def listing(self, path):\n"
+        "        list_ = path.with_name('list')\n"
+        "        return list_ if list_.is_file() and path.name in list_.read_text() else None\n"
+        "    def update(self, path):\n        Path('updated').write_text(path.name)\n"
+    )
+    add(site, "recording", "lists", code)
+    Path("lists").mkdir()
+    robot("lists/a.mcap", "odd_msgs/Odd", [{"things": []}])
+    Path("b.csv").write_text(TABLE)
+    Path("lists/list").write_text("a.mcap")
+    assert "lists is a list, not an MCAP file; " in one_line("info", "lists")
+    labels = ("ingest", "b.csv", "--as", "truth", "--into", "lists/a.mcap", "--fps", "10", "--start-time", "1e9")
+    outcome = done(*labels)
+    assert f"a.mcap is named in {Path('lists/list')}" in outcome.err
+    assert not Path("updated").exists()
+    Path("lists/a.results.mcap").unlink()
+    done(*labels, "--in-place")
+    assert Path("updated").read_text() == "a.mcap"
+    Path("b").mkdir()
+    Path("lists").rename("b/lists")
+    Path("b/c.mcap").write_bytes(Path("b/lists/a.mcap").read_bytes())
+    outcome = done("info", "b", "--json")
+    assert [result["log"] for result in json.loads(outcome.out)["results"]] == ["b/c.mcap"]
+    assert "b/lists is a list, not an MCAP file; " in outcome.err
+    assert "its files are left out" in outcome.err
 
 
 # Exporters

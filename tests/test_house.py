@@ -175,6 +175,11 @@ def test_the_core_names_no_extension():
 
 #: Modules of the core that aren't public, and the one extension that needs them.
 DEEP = {
+    "bags": (
+        "it reads recordings within the limits of `ingest`, and writes what views draw",
+        "foxglove.views.ground foxglove.views.people log.recording_files schema.encodings sources.fixed_frame "
+        "sources.foreign.definitions sources.ingest.decompression sources.ingest.plain_yaml sources.ingest.recording",
+    ),
     "notebook": ("the player shows what `view` shows", "foxglove.messages viewing.links"),
     "render": (
         "it writes pictures as their channel says, and draws what views draw",

@@ -27,7 +27,6 @@ from mcaptrack.sources.ingest.labels.timeline import timeline_of
 from mcaptrack.sources.video import H264Encoder
 from mcaptrack.sources.video.codecs import CODECS
 from mcaptrack.tables.compared import compare_files, detections_and_ground_truth
-from tests.bags import camera_bag
 from tests.logs import recorder
 from tests.robots import FPS, PICTURES, ROBOT_NS, lines, robot_log
 from tests.tiers import one_in
@@ -115,7 +114,6 @@ def stock(tmp_path_factory) -> Path:
     ingest(folder / "clip.mp4", folder / "clip.mcap", IngestOptions())
     ingest(folder / "clip.mp4", folder / "late.mcap", IngestOptions(start_ns=ns(77), camera="gate/east"))
     ingest(folder / "jumps.mkv", folder / "jumps.mcap", IngestOptions())
-    camera_bag(folder / "a.bag", "/front/image_raw", frames=PICTURES)
     robot_log(folder / "robot.mcap", "/front/image_raw")
     robot_log(folder / "raw.mcap", "/front/image_raw", "/front/image_raw/compressed")
     shutil.copy(folder / "robot.mcap", folder / "beside.mcap")
@@ -139,7 +137,7 @@ def beside(name: str, **options) -> Way:
         prefix = "/camera"
         if source.suffix in (".mp4", ".mkv") and "fps" not in options:
             times = by_ffmpeg(source)
-        if source.suffix in (".mcap", ".bag"):
+        if source.suffix == ".mcap":
             prefix, topic = "/front", "/front/image_raw"
             times = by_the_stock_library(out, topic)
         start = options.get("start_ns", 0)
@@ -224,7 +222,6 @@ WAYS: dict[str, Way] = {
     "beside a video of a variable rate": beside("jumps.mkv"),
     "beside a video, evenly spaced": beside("jumps.mkv", fps=Fraction(FPS)),
     "beside images": beside("images", fps=Fraction(FPS)),
-    "beside a bag": beside("a.bag"),
     "beside a robot's log": beside("robot.mcap"),
     "beside a robot's log, by name": beside("robot.mcap", camera="front"),
     "beside a robot's log, by topic": beside("robot.mcap", camera="front/image_raw"),

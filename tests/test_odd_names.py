@@ -44,7 +44,6 @@ def test_logs_of_all_names_are_used_as_others_are(template, tmp_path, monkeypatc
         ["run"],
         ["export", "--force"],
         ["query", "select count(*) > 0 as many from tracks", "--json"],
-        ["export", "--format", "rosbag2"],
         *of_extensions("NAMED").values(),
         ["recover"],
         ["track", "--sidecar", "--force"],

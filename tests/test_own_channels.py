@@ -28,10 +28,8 @@ from mcaptrack.schema import DETECTIONS, EVENTS, PREDICTIONS, SCHEMAS, TRACKS, V
 from mcaptrack.schema.own import columns_in_metadata
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import cameras as cameras_of
-from tests.bags import T0
 from tests.commands import done
 from tests.logs import recorder
-from tests.test_ros_in_place import check_whole, drive, raw
 from tests.worlds import write_clip
 
 DTYPES = ["f8", ">f4", "f2", "i8", ">i4", "i2", "i1", "u8", "u4", "u2", "u1", "?"]
@@ -186,26 +184,6 @@ class TestRoundTrip:
             assert next(opened.frames("/camera/video")).rows.ndim == 3
             assert next(opened.frames()).rows.ndim == 3
             assert list(opened.frames("/x/video")) == []
-
-    def test_the_whole_recording_of_ros_2_is_still_read_by_ros_tools(self, tmp_path):
-        path = drive(tmp_path / "drive", shots=4)
-        recorded = raw(path)
-        with mcaptrack.open(path) as opened:
-            opened.write("/wheels/speed", [Fix(T0, 1.0), Fix(T0 + 5, 2.0)], sidecar=False)
-            opened.write("/wheels/predictions", TestOwnForecasts.steps(t_ns=[T0, T0]), sidecar=False)
-        check_whole(path, recorded)
-
-    def test_a_bag_has_them_as_messages(self, tmp_path):
-        path = tmp_path / "a.mcap"
-        with mcaptrack.open(path, create=True) as opened:
-            for topic in ("/gps/a", "/gps/b"):
-                opened.write(topic, [Fix(T0, 1.0), Fix(T0 + 5, 2.0, 3.0)], schema=mcaptrack.schema_of("Fix", Fix))
-        bag = mcaptrack.export(path, form="rosbag2", output=tmp_path / "bag").folder
-        with AnyReader([bag]) as reader:
-            found = [(c.topic, t, reader.deserialize(content, c.msgtype).rows) for c, t, content in reader.messages()]
-        for topic in ("/gps/a", "/gps/b"):
-            mine = [(t_ns, row.lat, row.lon) for name, t_ns, rows in found if name == topic for row in rows]
-            np.testing.assert_array_equal(mine, [(T0, 1, np.nan), (T0 + 5, 2, 3)])
 
 
 def _without_class(rows: Any) -> Any:

@@ -48,11 +48,12 @@ def contents(folder: Path) -> dict[str, bytes | None]:
 
 
 class Work(NamedTuple):
-    """What is done in a folder; ``again`` is the command that follows a kill."""
+    """What is done in a folder; ``again`` is the command that follows a kill, which is at each ``step``-th call."""
 
     prepare: Callable[[Path], object]
     do: Callable[[Path], object]
     again: Callable[[Path], object]
+    step: int = 41
 
 
 def ingest_once(folder: Path) -> None:
@@ -62,10 +63,6 @@ def ingest_once(folder: Path) -> None:
 
 def run(folder: Path, **options: object) -> None:
     mcaptrack.run(folder / "a.mcap", **options)
-
-
-def bag(folder: Path) -> None:
-    mcaptrack.export(folder / "a.mcap", folder / "bag", form="rosbag2", force=True)
 
 
 def retrack(folder: Path) -> None:
@@ -90,15 +87,15 @@ WORKS = {
         lambda folder: run(folder, retracker="consistency"),
         lambda folder: run(folder, retracker="consistency"),
     ),
-    "retrack": Work(prepare_run, retrack, retrack),
+    "retrack": Work(prepare_run, retrack, retrack, 11),
     "run after re-tracking": Work(prepare_tables, run, run),
     "export": Work(
         lambda folder: log_of(folder / "a.mcap"),
         *[lambda folder: mcaptrack.export(folder / "a.mcap", folder / "T", topic="/camera/tracks")] * 2,
+        step=29,
     ),
-    "export to a bag": Work(lambda folder: bag(run(log_of(folder / "a.mcap").parent) or folder), bag, bag),
-    "ingest": Work(labels, ingest_once, ingest_once),
-}
+    "ingest": Work(labels, ingest_once, ingest_once, 2),
+} | {name: Work(*work) for name, work in of_extensions("WORKS").items()}
 
 
 def restore(folder: Path, kept: Path) -> None:
@@ -129,9 +126,7 @@ def leave_nothing_undone(work: Work, tmp_path: Path, step: int) -> None:
 
 @pytest.mark.parametrize("name", one_in(2, sorted(WORKS.keys() - {"run with another re-tracker"})))
 def test_killed_at_some_calls_the_next_command_completes_what_is_owed(name, tmp_path):
-    leave_nothing_undone(
-        WORKS[name], tmp_path, {"ingest": 2, "export": 29, "export to a bag": 5, "retrack": 11}.get(name, 41)
-    )
+    leave_nothing_undone(WORKS[name], tmp_path, WORKS[name].step)
 
 
 def fleet_over(folder: Path) -> None:
@@ -312,8 +307,6 @@ def test_scores_of_two_logs_of_one_name_are_not_mixed(finished, tmp_path):
 
 #: What writes a file or folder beside a log, as functions of the log and of what to write.
 WRITTEN: dict[str, Callable[[Path, Path], object]] = {
-    "bag": lambda path, output: mcaptrack.export(path, output, form="rosbag2"),
-    "old bag": lambda path, output: mcaptrack.export(path, output, form="rosbag2-sqlite3"),
     "a.mot.txt": lambda path, output: mcaptrack.export(path, output, form="mot"),
     "a.mcap": lambda path, output: mcaptrack.drop(path, ["/camera/truth"], output=output),
 } | of_extensions("WRITTEN")

@@ -21,7 +21,6 @@ from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import serving
-from tests.bags import bag1
 from tests.commands import GROUP, call, done
 from tests.extension_cases import of_extensions
 from tests.interrupted import interrupt
@@ -133,10 +132,9 @@ class Scene:
         Path(name).write_text("t,id,x,y,w,h\n" + rows)
         return self
 
-    def bag(self) -> str:
-        """Replace the log by a recording of another kind."""
-        self.path.unlink()
-        bag1(self.path, 3, 10)
+    def video(self) -> str:
+        """Replace the log by a video."""
+        shutil.copy("clip.mp4", self.path)
         return self.says("info", "LOG")
 
     def with_other_weights(self) -> str:
@@ -191,7 +189,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     ),
     "log/journal.py:recover_command:recover": Scene.damaged,
     "log/reader.py:reporting_bad_times:drop": Scene.late,
-    "log/recording_files.py:refuse_non_mcap:ingest": Scene.bag,
+    "log/recording_files.py:not_mcap:ingest": Scene.video,
     "transforms/detect/onnx/session.py:check:get_model": Scene.with_other_weights,
     "transforms/detect/onnx/session.py:stored:get_model": lambda s: s.says("detect", "LOG", "--detector", "yolox-nano"),
     "api/catalogue.py:get_model:get_model": lambda s: s.says(

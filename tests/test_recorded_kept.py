@@ -15,7 +15,6 @@ from mcaptrack.choices import Role
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.transforms import TRANSFORMS
-from tests.bags import camera_bag
 from tests.commands import call
 from tests.logs import recorder
 from tests.robots import lines, robot_log
@@ -68,7 +67,6 @@ def stock(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("stock")
     write_clip(folder / "clip.mp4", 12, options={"bf": "0", "g": "10"})
     (folder / "plane.txt").write_text("0.1 0 0\n0 0.1 0\n0 0 1\n")
-    camera_bag(folder / "a.bag", "/camera/image", frames=3)
     robot_log(folder / "robot.mcap", "/camera/image")
     (folder / "det.txt").write_text("".join(f"{k + 1},-1,{k},9,9,20\n" for k in range(12)))
     ingest(folder / "clip.mp4", folder / "boxes.mcap", IngestOptions(labels={"detections": folder / "det.txt"}))
@@ -124,9 +122,8 @@ WAYS = {
     **{f"{role} beside a video": ("clip.mp4", [f"--{role}", f"{role}.txt"], f"/camera/{role}") for role in ROLES},
     "a video": ("clip.mp4", [], "/camera/video"),
     "a ground plane": ("clip.mp4", ["--ground-plane", "plane.txt"], "/camera/ground_plane"),
-    "a bag": ("a.bag", [], "/camera/image"),
     "an mcap file": ("robot.mcap", [], "/camera/image"),
-    **{f"{role} beside a bag": ("a.bag", [f"--{role}", f"{role}.txt"], f"/camera/{role}") for role in ROLES},
+    **{f"{role} beside a recording": ("robot.mcap", [f"--{role}", f"{role}.txt"], f"/camera/{role}") for role in ROLES},
 }
 
 
@@ -136,7 +133,7 @@ def test_nothing_that_is_ingested_takes_the_place_of_a_recorded_channel(
 ):
     """And what the refusal proposes works, and keeps the channel too."""
     monkeypatch.chdir(tmp_path)
-    for name in ("clip.mp4", "plane.txt", "a.bag", "robot.mcap"):
+    for name in ("clip.mp4", "plane.txt", "robot.mcap"):
         shutil.copy(stock / name, name)
     lines(Path("truth.txt"), 1, 2)
     lines(Path("tracks.txt"), 1, 2)

@@ -10,7 +10,6 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.bags import database
 from tests.logs import recorder
 
 T0 = 1_700_000_000_000_000_000
@@ -132,16 +131,10 @@ def package(folder: Path) -> tuple[Path, str, list[bytes]]:
 
 
 def write_undefined(folder: Path) -> None:
-    """Messages whose definition is that of the workspace ``src`` alone: a log, and a database."""
+    """A log of messages whose definition is that of the workspace ``src`` alone."""
     place, name, payloads = package(folder)
     place.rename(folder / "src")
     with recorder(folder / "bare.mcap", "ros2") as writer:
         channel = writer.add_channel("/t", (name, "ros2msg", b""), "cdr")
         for number, payload in enumerate(payloads):
             writer.add_message(channel, T0 + number, payload, T0)
-    database(
-        folder / "bare.db3",
-        2,
-        [(1, T0 + n, payload) for n, payload in enumerate(payloads)],
-        [(1, "/t", name, "cdr", "")],
-    )

@@ -24,7 +24,7 @@ from mcaptrack.api.options import (
     no_progress,
     output,
 )
-from mcaptrack.choices import BagFormat, BoxFormat, TableFormat
+from mcaptrack.choices import BoxFormat, TableFormat
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of, publish, publish_folder, refuse_overwrite
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -36,11 +36,6 @@ if TYPE_CHECKING:
     from mcaptrack.log import Log
     from mcaptrack.registry import Entry
     from mcaptrack.tables.export.contents import MessagesPart
-    from mcaptrack.tables.rosbag2 import Storage
-
-#: ROS 2 bags by the format of ``export``.
-_BAGS: Mapping[str, Storage] = {"rosbag2": "mcap", "rosbag2-sqlite3": "sqlite3"}
-_OF_TABLES = (*get_args(TableFormat), *get_args(BagFormat))
 
 
 @dataclass(frozen=True)
@@ -134,8 +129,8 @@ def export(
     output: Annotated[PathLike | None, output("LOG.tables, LOG.rosbag2, LOG.cvat.xml, ... beside the log")] = None,
     *,
     form: Annotated[
-        TableFormat | BagFormat | BoxFormat | str,
-        named("exporter", (*_OF_TABLES, *get_args(BoxFormat)), FILES, "format"),
+        TableFormat | BoxFormat | str,
+        named("exporter", (*get_args(TableFormat), *get_args(BoxFormat)), FILES, "format"),
     ] = "parquet",
     topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
     all_topics: Annotated[bool, Option(FILES, flag="all")] = False,
@@ -224,8 +219,6 @@ def export(
     path = log_location(log)
     part = _Part(names_of(topic), all_topics, split_names("columns", columns), blobs, start_s, end_s)
     with definitions_of(definitions):
-        if form in _BAGS:
-            return _export_bag(path, optional_path(output), _BAGS[form], part, force, progress)
         if form not in get_args(TableFormat):
             return _export_by(_exporter(form), path, optional_path(output), part, force, progress)
         folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
@@ -242,30 +235,6 @@ def export(
         return ExportResult(path, folder, done.rows, tuple(done.written), tuple(dict.fromkeys(warnings)), owed, spare)
 
 
-def _export_bag(
-    path: Location,
-    output: Path | None,
-    storage: Storage,
-    part: _Part,
-    force: bool,
-    progress: Progress,
-) -> ExportResult:
-    """Write a log as a ROS 2 bag."""
-    from mcaptrack import log as logs
-    from mcaptrack.tables.rosbag2 import default_folder, write_bag
-
-    with warnings_about(path) as warnings:
-        part.warn_unused("a bag has no tables", has_topic=True)
-        folder = output or default_folder(path)
-        with logs.read(path) as opened:
-            done = write_bag(opened, folder, progress, storage=storage, force=force)
-        for note in done.notes:
-            warn(note, "left-out")
-    return ExportResult(
-        path, folder, done.messages, tuple(done.messages), tuple(dict.fromkeys(warnings)), files=(folder,)
-    )
-
-
 class FoundExporter(NamedTuple):
     """An exporter as the registry found it, its object, and what its class says of it.
 
@@ -276,12 +245,13 @@ class FoundExporter(NamedTuple):
     exporter: Any
     end: str
     is_folder: bool
+    marker: str
     options: frozenset[str]
 
 
 def file_exporter(form: str) -> FoundExporter | None:
-    """The exporter of a format; None for tables and bags. Raises McaptrackError if none works."""
-    return None if form in _OF_TABLES else _exporter(form)
+    """The exporter of a format; None for tables. Raises McaptrackError if none works."""
+    return None if form in get_args(TableFormat) else _exporter(form)
 
 
 def _exporter(form: str) -> FoundExporter:
@@ -302,7 +272,8 @@ def exporter_for(entry: Entry, exporter: Any) -> FoundExporter:
         )
     with blamed(entry, "has a method write without a signature that can be read"):
         options = {"topic", "progress"} & inspect.signature(exporter.write).parameters.keys()
-    return FoundExporter(entry, exporter, end, bool(getattr(exporter, "is_folder", False)), frozenset(options))
+    is_folder, marker = bool(getattr(exporter, "is_folder", False)), str(getattr(exporter, "marker", ""))
+    return FoundExporter(entry, exporter, end, is_folder, marker, frozenset(options))
 
 
 def _export_by(
@@ -319,6 +290,7 @@ def _export_by(
         part.warn_unused(f"the {by.entry} has no tables of channels", has_topic=not takes_topic)
         target = output or local_name(path, by.end)
         if by.is_folder:
+            target = output or local_name(path, f"{by.end}.mcap").with_suffix("")  # room for files of its name
             _refuse_folder(by, target, force)
         else:
             refuse_overwrite(target, force)
@@ -333,11 +305,13 @@ def _export_by(
 
 
 def _refuse_folder(by: FoundExporter, folder: Path, force: bool) -> None:
-    """Raise McaptrackError for a folder that an exporter may not replace: it may one with the end of its names."""
+    """Raise McaptrackError for a folder that an exporter may not replace: it may its own, by their file or name."""
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
-    if not (folder.is_dir() and folder.name.endswith(by.end)):
-        raise McaptrackError(f"{folder} exists, and only folders named *{by.end} are replaced; name another folder")
+    is_own = (folder / by.marker).is_file() if by.marker else folder.is_dir() and folder.name.endswith(by.end)
+    if not is_own:
+        which = f"with {by.marker}" if by.marker else f"named *{by.end}"
+        raise McaptrackError(f"{folder} exists, and only folders {which} are replaced; name another folder")
     if not force:
         raise McaptrackError(f"{folder} exists; `force=True` replaces it")
 

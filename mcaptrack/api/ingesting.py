@@ -298,7 +298,6 @@ def _new_log(source: Path, output: PathLike | None, force: bool) -> Path:
 def _add_to(log: Path, sidecar: bool | None, make: Callable[..., IngestReport]) -> IngestReport:
     """Add what is made of an input to a log, or to the results beside it, and say where it is."""
     from mcaptrack import log as logs
-    from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
     from mcaptrack.sources.sidecar import SidecarChoice
 
     place = SidecarChoice(sidecar)
@@ -309,7 +308,7 @@ def _add_to(log: Path, sidecar: bool | None, make: Callable[..., IngestReport]) 
     if place.why:
         report.remarks.append(place.words(written_to))
     if written_to == log:
-        update_metadata(log)
+        logs.update_listing(log)
     return report
 
 

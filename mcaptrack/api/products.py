@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING
 from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.options import Progress
-from mcaptrack.files import follow_links, publish_bytes, sweep
+from mcaptrack.files import publish_bytes, sweep
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
-from mcaptrack.sources.sidecar import METADATA
 
 if TYPE_CHECKING:
     from mcaptrack.sources.fixed_frame import BoxesRead
@@ -61,10 +60,8 @@ def write_products(
     if not isinstance(log, Path):
         return done
     with logs.read(log) as opened:
-        if opened.results is None and any(file.with_name(METADATA).exists() for file in (log, follow_links(log))):
-            from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
-
-            update_metadata(log)
+        if opened.results is None:
+            logs.update_listing(log)
         for path, content in _layouts(opened, log):
             done.owed.append(path)
             sweep(path.parent, path.name)

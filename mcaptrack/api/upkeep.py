@@ -274,7 +274,6 @@ def _refuse_recorded(opened: logs.Log, dropped: set[str]) -> None:
 def _remove(topics: set[str], part: Path, target: Path) -> int:
     """Write a file without some topics to ``target``, which may be the file itself; return the messages removed."""
     from mcaptrack import log as logs
-    from mcaptrack.sources.ingest.bags.metadata_yaml import update_metadata
 
     with logs.read(part, sidecar=False) as opened:
         channels = [channel for channel in opened.recorded if channel.topic in topics]
@@ -282,7 +281,7 @@ def _remove(topics: set[str], part: Path, target: Path) -> int:
             return 0
         with logs.extend(opened, None if target == part else target, drop=topics):
             pass
-    update_metadata(target)
+    logs.update_listing(target)
     return sum(channel.messages for channel in channels)
 
 

@@ -61,18 +61,18 @@ class Export(EachLog["ExportResult"]):
 
     @property
     def makes_folders(self) -> bool:  # type: ignore[override]
-        """Whether a log becomes a folder: a bag, or what a package makes."""
+        """Whether a log becomes a folder, as the exporter says."""
         from mcaptrack.api.exporting import file_exporter
 
         by = file_exporter(self.values["form"])
-        return self.values["form"].startswith("rosbag2") or (by is not None and by.is_folder)
+        return by is not None and by.is_folder
 
     def suffix(self) -> str:
-        """Return the end of the names of bags and files."""
+        """Return the end of the names of files and folders."""
         from mcaptrack.api.exporting import file_exporter
 
         by = file_exporter(self.values["form"])
-        return by.end if by is not None else ".rosbag2" if self.values["form"].startswith("rosbag2") else ""
+        return by.end if by is not None else ""
 
     def show(self, log: Location, done: ExportResult, talk: common.Talk) -> None:
         """Print what was written."""

@@ -18,7 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, sibling
 from mcaptrack.log import results_path
-from mcaptrack.log.recording_files import refuse_non_mcap
+from mcaptrack.log.recording_files import format_of, listing_of, not_mcap, refuse_non_mcap
 from mcaptrack.notices import warn
 
 #: The argument that stands for a list of names on standard input.
@@ -166,7 +166,7 @@ def _without_results(named_logs: Sequence[NamedLog]) -> list[NamedLog]:
 
 
 def _has_logs(folder: Path) -> bool:
-    return next(_logs_in(folder, ""), None) is not None
+    return next(_logs_in(folder, "", is_named=True), None) is not None
 
 
 def _is_no_pattern(path: Path) -> bool:
@@ -204,11 +204,12 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
     refuse_url(argument)
     refuse_special(argument)
     if argument.is_dir():
-        members = list(_logs_in(argument, leave_out))
-        if not members or (argument / "metadata.yaml").is_file():
-            refuse_non_mcap(argument)  # a bag is one recording, whatever number of files it has
+        members = list(_logs_in(argument, leave_out, is_named=True))
         if not members:
-            raise McaptrackError(f"the folder {argument} has no log: no file in it ends with {_SUFFIX}")
+            refuse_non_mcap(argument)
+            raise McaptrackError(
+                f"the folder {argument} has no log, which is a file that ends with {_SUFFIX} and no part of a recording"
+            )
         yield from members
     elif _is_no_pattern(argument):
         yield NamedLog(argument, Path(argument.name))
@@ -216,20 +217,28 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
         yield from _matching(argument, leave_out)
 
 
-def _logs_in(folder: Path, leave_out: str) -> Iterator[NamedLog]:
-    """Yield all logs in a folder and below it, in order of their names."""
+def _logs_in(folder: Path, leave_out: str, *, is_named: bool = False) -> Iterator[NamedLog]:
+    """Yield all logs in a folder and below it, in order of their names.
+
+    A folder with files that are listed as parts of one recording holds no logs: it is left out with a warning, or
+    refused if a user named it.
+    """
 
     def unreadable(error: OSError) -> None:
         warn(f"{error.filename} can't be listed ({error.strerror}); logs in it are left out", "left-out")
 
     for place, folders, files in os.walk(folder, onerror=unreadable):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in sorted(files):
-            if (
-                name.lower().endswith(_SUFFIX)
-                and not name.startswith(".")
-                and not (leave_out and name.endswith(leave_out))
-            ):
+        names = [name for name in sorted(files) if name.lower().endswith(_SUFFIX) and not name.startswith(".")]
+        if names and listing_of(Path(place, names[0])):
+            recognised = format_of(Path(place))
+            text = not_mcap(Path(place), str(recognised.answer) if recognised else "a recording")
+            if is_named and Path(place) == folder:
+                raise McaptrackError(text)
+            warn(f"{text}; its files are left out", "left-out")
+            continue
+        for name in names:
+            if not (leave_out and name.endswith(leave_out)):
                 path = Path(place, name)
                 yield NamedLog(path, path.relative_to(folder))
 

@@ -24,7 +24,7 @@ from mcaptrack.log.cut import Part, copy_messages, private_records
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
 from mcaptrack.log.messages import Message
 from mcaptrack.log.reader import Channel, Log, find_topic
-from mcaptrack.log.recording_files import RESULTS_SUFFIX, refuse_non_mcap, results_path, split_files_in
+from mcaptrack.log.recording_files import RESULTS_SUFFIX, listing_of, refuse_non_mcap, results_path, update_listing
 from mcaptrack.log.records import MAGIC, Bytes, Record, walk
 from mcaptrack.log.recover import recover
 from mcaptrack.log.writer import LIBRARY, LogWriter, create

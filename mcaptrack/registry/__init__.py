@@ -50,6 +50,7 @@ Kind = Literal[
     "stage",
     "label_format",
     "message_reader",
+    "recording",
     "exporter",
     "judge",
     "finisher",
@@ -76,16 +77,8 @@ _COMMANDS: Final = (
 )
 #: Kinds that only entry points name.
 _BY_ENTRY_POINT: Final = (
-    "stage",
-    "message_reader",
-    "finisher",
-    "report_section",
-    "command",
-    "page",
-    "player",
-    "viewer",
-    "name",
-    "scene",
+    *("stage", "message_reader", "recording", "finisher", "report_section", "command", "page", "player", "viewer"),
+    *("name", "scene"),
 )
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
@@ -163,9 +156,10 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "visualization_msgs/MarkerArray": f"{_SOLIDS}:marker_solids",
             "visualization_msgs/Marker": f"{_SOLIDS}:marker_solids",
         },
+        # Of other containers than MCAP, by what their names or first bytes say.
+        "recording": {},
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
-            **dict.fromkeys(("rosbag2", "rosbag2-sqlite3"), "mcaptrack.tables.rosbag2:write_bag"),
             "mot": "mcaptrack.tables.box_files:MotFile",
         },
         "judge": {},

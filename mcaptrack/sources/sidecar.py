@@ -23,8 +23,6 @@ from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR, PROTOBUF, Encoding, is_ros_topic
 from mcaptrack.schema.provenance import Provenance
 
-#: The file beside the logs of a rosbag2 folder that counts their messages.
-METADATA: Final = "metadata.yaml"
 #: The profiles of the MCAP registry that ROS tools read, and their names in messages.
 _PROFILES: Final = {Profile.ROS1: "ROS 1", Profile.ROS2: "ROS 2"}
 
@@ -154,12 +152,9 @@ def recording_of(opened: log.Log) -> str:
     for path in (opened.path, opened.real_path):
         if isinstance(path, Url):
             continue
-        metadata = path.with_name(METADATA)
-        if metadata.exists():
-            from mcaptrack.sources.ingest.bags.metadata_yaml import names_file
-
-            if names_file(metadata, path.name):
-                return f"named in {metadata}"
+        listing = log.listing_of(path)
+        if listing is not None:
+            return f"named in {listing}"
     profile, library = log.header(opened)
     if profile in _PROFILES and not library.startswith(log.LIBRARY):
         return f"a {_PROFILES[profile]} recording"

@@ -24,11 +24,11 @@ from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.boxes import iou
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.log.recording_files import is_mcap
 from mcaptrack.notices import warn
 from mcaptrack.schema import Frame
 from mcaptrack.schema.classes import PERSON
 from mcaptrack.schema.framing import split_rows
-from mcaptrack.sources.ingest.bags.rosbag2 import is_mcap
 from mcaptrack.sources.ingest.job import IngestOptions, fitted
 from mcaptrack.sources.ingest.label_job import FRAME, Boxes3DJob, LabelJob
 from mcaptrack.sources.ingest.labels.frames import Described, described, share_numbers, warn_of_firsts

@@ -83,7 +83,7 @@ CASES: dict[str, dict[str, Case]] = {
         frames=("ingest truth.txt --fps 10", "--frames 500"),
         **{"as": ("ingest truth.txt --fps 10", "--as truth")},
         into=("ingest truth.txt --fps 10 --as tracks", "--into a.mcap"),
-        definitions=("ingest bare.db3 -o b.mcap", "--definitions src"),
+        definitions=("ingest bare.mcap -o b.mcap", "--definitions src"),
         sidecar=("ingest truth.txt --fps 10 --as truth --camera left --into a.mcap", "--sidecar"),
         force=("ingest clip.mp4 -o a.mcap", "--force"),
     ),

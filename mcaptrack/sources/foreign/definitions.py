@@ -494,10 +494,10 @@ def is_packed(payload: bytes) -> bool:
     return payload.startswith(ZSTD)
 
 
-def unpacked(payload: bytes) -> bytes:
-    """A CDR message, decompressed if it is compressed. Raises ValueError."""
+def unpacked(payload: bytes, most: int = _MAX_MESSAGE_BYTES) -> bytes:
+    """A CDR message, decompressed to at most ``most`` bytes if it is compressed. Raises ValueError."""
     if not is_packed(payload):
         return payload
-    from mcaptrack.sources.ingest.bags.decompression import unzstd
+    from mcaptrack.sources.ingest.decompression import unzstd
 
-    return unzstd(payload, _MAX_MESSAGE_BYTES)
+    return unzstd(payload, min(most, _MAX_MESSAGE_BYTES))

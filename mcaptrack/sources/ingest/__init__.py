@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from mcaptrack import foxglove, log, notices
+from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, missing, refuse_special
 from mcaptrack.geometry.clocks import LAST_NS
@@ -27,9 +28,8 @@ from mcaptrack.schema.provenance import CLOCK, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, frame_named
+from mcaptrack.sources.foreign.definitions import MessageType
 from mcaptrack.sources.foreign.flatten import frame_of
-from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
-from mcaptrack.sources.ingest.bags.rosbag2 import open_recording
 from mcaptrack.sources.ingest.calibration import is_calibration
 from mcaptrack.sources.ingest.job import (
     CALIBRATION,
@@ -53,6 +53,7 @@ from mcaptrack.sources.ingest.labels.timeline import (
     picture_size,
     timeline_of,
 )
+from mcaptrack.sources.ingest.recording import open_recording
 from mcaptrack.sources.pictures import size_of
 from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import IMAGE_SUFFIXES, EncodedPicture, Video, open_video
@@ -356,9 +357,9 @@ class RecordingJob(IngestJob):
             super().__init__(source, options, into)
             #: The MCAP file that is copied as a whole, if the recording is one.
             self._copied_log: log.Log | None = None
-            #: The connections of the pictures that labels belong to.
-            self._connections: list[Connection] = []
-            self._channels: dict[Connection, int] = {}
+            #: The channels of the pictures that labels belong to.
+            self._picture_channels: list[RecordedChannel] = []
+            self._channels: dict[RecordedChannel, int] = {}
             self._written: dict[int, int] = {}
             if self.labels or self.has_ground_given or self.motions is not None:
                 self._find_pictures()
@@ -370,11 +371,11 @@ class RecordingJob(IngestJob):
 
     def _find_pictures(self) -> None:
         """Find the camera that labels belong to: the only one with pictures, or the one that ``camera`` names."""
-        by_topic: dict[str, list[Connection]] = {}
-        for connection in self._recorded.connections:
-            is_empty = self._recorded.declared_counts is not None and not self._recorded.declared_counts[connection]
-            if foreign.is_picture(connection.schema[0]) and not is_empty:
-                by_topic.setdefault(connection.topic, []).append(connection)
+        by_topic: dict[str, list[RecordedChannel]] = {}
+        for channel in self._recorded.channels:
+            is_empty = self._recorded.declared_counts is not None and not self._recorded.declared_counts.get(channel)
+            if foreign.is_picture(channel.schema[0]) and not is_empty:
+                by_topic.setdefault(channel.topic, []).append(channel)
         self.prefix, self.pictures = choose_camera(self.source, self.options.camera, by_topic)
         if not self.pictures:
             raise McaptrackError(
@@ -382,12 +383,12 @@ class RecordingJob(IngestJob):
                 f"{', '.join(sorted(by_topic)) or 'none'}. Choose one with `camera=`, the part of its topic before the "
                 "last /"
             )
-        self._connections = by_topic[self.pictures]
+        self._picture_channels = by_topic[self.pictures]
 
     def topics(self) -> Iterator[str]:
         """The new topics: only those of labels, if an MCAP file is copied."""
         if not self._copied_log:
-            yield from {connection.topic: None for connection in self._recorded.connections}
+            yield from {channel.topic: None for channel in self._recorded.channels}
         yield from super().topics()
 
     def opened(self, output: Path, into: log.Log | None, force: bool) -> AbstractContextManager[log.LogWriter]:
@@ -402,7 +403,7 @@ class RecordingJob(IngestJob):
         if self._copied_log is not None:
             self.encoding = encoding_for(self._copied_log)
             return log.extend(self._copied_log, output, drop=self.topics_to_replace(self._copied_log, force))
-        recorded = {connection.topic for connection in self._recorded.connections}
+        recorded = {channel.topic for channel in self._recorded.channels}
         doubled = recorded & set(super().topics())
         if doubled:
             raise McaptrackError(
@@ -412,7 +413,7 @@ class RecordingJob(IngestJob):
 
     def _warn_encodings(self, into: log.Log) -> None:
         """Warn if a recording of ROS 2 gets messages that ROS 2 can't read."""
-        odd = sorted({connection.encoding or "none" for connection in self._recorded.connections} - {CDR})
+        odd = sorted({channel.encoding or "none" for channel in self._recorded.channels} - {CDR})
         if self.encoding == CDR and odd:
             text = f"{into.path} gets messages that are not of ROS 2 (encoding: {', '.join(odd)})"
             warn(f"{text}; ROS tools may stumble over them", "other")
@@ -423,7 +424,7 @@ class RecordingJob(IngestJob):
         self.report.lost += self._recorded.findings.lost
         timeline = self._count_copied(writer) if self._copied_log else self._write_messages(writer)
         self._recorded.extras(writer, has_clock, self._copied_log is not None)
-        if self._connections:
+        if self._picture_channels:
             if not len(timeline.t_ns):
                 raise McaptrackError(f"{self.source}: {self.pictures} has no pictures that labels could be of")
             plane = self._plane()
@@ -459,10 +460,10 @@ class RecordingJob(IngestJob):
             if not self._written[number]:  # some writers write channels without messages only to the summary
                 writer.write_description(number)
         self._report({number: channel.topic for number, channel in writer.channels.items()})
-        if len(self._connections) == 1:
+        if len(self._picture_channels) == 1:
             return timeline_of(opened, self.pictures)
         holds_picture = self._holds_picture()
-        return self._timeline(m.t_ns for c, m in self._recorded.messages(ReadingNotes()) if holds_picture(c, m.payload))
+        return self._timeline(m.t_ns for m in self._recorded.messages(ReadingNotes()) if holds_picture(m))
 
     def _timeline(self, t_ns: Iterable[int]) -> Timeline:
         in_order = sorted(t_ns)
@@ -474,28 +475,30 @@ class RecordingJob(IngestJob):
         times = np.array(in_order, np.int64)
         return Timeline(np.arange(len(times)), times, f"the pictures of {self.pictures}", not self.report.lost)
 
-    def _holds_picture(self) -> Callable[[Connection, bytes], bool]:
+    def _holds_picture(self) -> Callable[[RecordedMessage], bool]:
         """A predicate: whether a message is one of the pictures that labels belong to."""
-        kinds = {connection: picture_predicate(connection.kind) for connection in self._connections}
-        return lambda connection, payload: connection in kinds and kinds[connection](payload)
+        kinds = {channel: picture_predicate(_type_of(channel)) for channel in self._picture_channels}
+        return lambda message: message.channel in kinds and kinds[message.channel](message.payload)
 
     def _write_messages(self, writer: log.LogWriter) -> Timeline:
         """Write all channels and messages; returns the pictures that labels belong to."""
         reading_notes, done, times, holds_picture = ReadingNotes(), 0, array("Q"), self._holds_picture()
-        for connection in self._recorded.connections:
-            self._channel(writer, connection)
+        for channel in self._recorded.channels:
+            self._add_channel(writer, channel)
         total = sum((self._recorded.declared_counts or {}).values())
-        for connection, message in self._recorded.messages(reading_notes):
-            number = self._channels[connection]
-            if len(message.payload) > _MAX_MESSAGE_BYTES:
+        for message in self._recorded.messages(reading_notes):
+            channel, t_ns, payload, publish_ns, sequence = message
+            number = self._channels[channel]
+            if len(payload) > _MAX_MESSAGE_BYTES:
                 raise McaptrackError(
-                    f"{self.source}: {connection.topic} at {message.t_ns} ns: "
-                    f"a message of {len(message.payload)} bytes; at most {_MAX_MESSAGE_BYTES} go into a log"
+                    f"{self.source}: {channel.topic} at {t_ns} ns: "
+                    f"a message of {len(payload)} bytes; at most {_MAX_MESSAGE_BYTES} go into a log"
                 )
-            writer.add_message(number, message.t_ns, message.sequence, message.payload, message.publish_ns)
+            sequence = self._written[number] % 2**32 if sequence is None else sequence
+            writer.add_message(number, t_ns, sequence, payload, t_ns if publish_ns is None else publish_ns)
             self._written[number] += 1
-            if holds_picture(connection, message.payload):
-                times.append(message.t_ns)
+            if holds_picture(message):
+                times.append(t_ns)
             done += 1
             if done % _PROGRESS_EVERY == 0:
                 self._progress("ingest", done, max(total, done))
@@ -503,30 +506,30 @@ class RecordingJob(IngestJob):
         self.report.notes += reading_notes.notes
         self.report.lost += reading_notes.lost
         self._compare()
-        self._report({number: connection.topic for connection, number in self._channels.items()})
+        self._report({number: channel.topic for channel, number in self._channels.items()})
         return self._timeline(times)
 
-    def _channel(self, writer: log.LogWriter, connection: Connection) -> None:
+    def _add_channel(self, writer: log.LogWriter, channel: RecordedChannel) -> None:
         number = writer.add_channel(
-            connection.topic,
-            connection.schema,
-            connection.encoding,
-            connection.metadata,
-            kind="media" if foreign.is_compressed(connection.schema[0]) else "rows",
+            channel.topic,
+            channel.schema,
+            channel.encoding,
+            channel.metadata,
+            kind="media" if foreign.is_compressed(channel.schema[0]) else "rows",
             another=True,
         )
-        self._channels[connection] = number
+        self._channels[channel] = number
         self._written[number] = 0
 
     def _compare(self) -> None:
         """Compare the messages read with the counts that the recording declares."""
-        for connection, declared in (self._recorded.declared_counts or {}).items():
-            count = self._written[self._channels[connection]]
+        for channel, declared in (self._recorded.declared_counts or {}).items():
+            count = self._written[self._channels[channel]]
             if count < declared and self.report.lost:
-                self.report.lost.append(f"{connection.topic}: {declared - count} of {declared} messages")
+                self.report.lost.append(f"{channel.topic}: {declared - count} of {declared} messages")
             elif count != declared:
                 raise McaptrackError(
-                    f"{self.source} does not add up: its index counts {declared} messages of {connection.topic}, "
+                    f"{self.source} does not add up: its index counts {declared} messages of {channel.topic}, "
                     f"and {count} are there"
                 )
 
@@ -546,10 +549,9 @@ class RecordingJob(IngestJob):
 
     def _picture_frame(self) -> str:
         """The frame of reference of the pictures that labels belong to, by the first of them; "" if it names none."""
-        for connection, message in self._recorded.messages(ReadingNotes()):
-            if connection in self._connections:
-                kind = connection.kind
-                return str(decoder_with_errors(kind, frame_named)(message.payload))
+        for message in self._recorded.messages(ReadingNotes()):
+            if message.channel in self._picture_channels:
+                return str(decoder_with_errors(_type_of(message.channel), frame_named)(message.payload))
         return ""
 
     def _picture_size(self) -> tuple[int, int]:
@@ -561,11 +563,15 @@ class RecordingJob(IngestJob):
 
     def _encoded(self) -> Iterator[EncodedPicture]:
         """The pictures that labels belong to, lazily."""
-        decoders = {connection: foreign.picture_decoder(connection.kind) for connection in self._connections}
-        for index, (connection, message) in enumerate(self._recorded.messages(ReadingNotes())):
-            if connection in decoders:
+        decoders = {channel: foreign.picture_decoder(_type_of(channel)) for channel in self._picture_channels}
+        for index, message in enumerate(self._recorded.messages(ReadingNotes())):
+            if message.channel in decoders:
                 where = f"{self.source}: {self.pictures} at {message.t_ns} ns"
-                yield decoders[connection](message.payload).encoded(message.t_ns, index, where)
+                yield decoders[message.channel](message.payload).encoded(message.t_ns, index, where)
+
+
+def _type_of(channel: RecordedChannel) -> MessageType:
+    return MessageType(*channel.schema, channel.encoding)
 
 
 def _job(source: Path, options: IngestOptions, progress: Progress, into: log.Log | None) -> IngestJob:

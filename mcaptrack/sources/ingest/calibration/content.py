@@ -24,7 +24,7 @@ from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
 from mcaptrack.sources.calibrations import calibration_of
-from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError, XmlReader, load
+from mcaptrack.sources.ingest.plain_yaml import UnsupportedYamlError, XmlReader, load
 
 #: Names of values in files of OpenCV, in small letters and without "_", "-" and blanks.
 _MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1")

@@ -25,10 +25,10 @@ import numpy as np
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, is_count
+from mcaptrack.sources.ingest.plain_yaml import XmlReader
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Final, TypeVar
 from mcaptrack.errors import McaptrackError, call, list_names
 from mcaptrack.files import read_json, visible
 from mcaptrack.registry import names
-from mcaptrack.sources.ingest.bags.decompression import opened
+from mcaptrack.sources.ingest.decompression import opened
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
 from mcaptrack.sources.ingest.labels.text import MAX_ROW, Lines, lines_of, split
 from mcaptrack.sources.video.image_folder import IMAGE_SUFFIXES, instead_of_images, natural_order

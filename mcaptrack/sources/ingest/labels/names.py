@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import visible
-from mcaptrack.sources.ingest.bags import plain_yaml
+from mcaptrack.sources.ingest import plain_yaml
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.text import MAX_NAME, is_count, lines_of
 

@@ -19,7 +19,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.sources.ingest.bags.decompression import opened
+from mcaptrack.sources.ingest.decompression import opened
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID
 
 #: Line numbers and lines, without empty lines and comments.

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
-from mcaptrack.sources.ingest.bags.decompression import opened
+from mcaptrack.sources.ingest.decompression import opened
 from mcaptrack.sources.ingest.labels.format import LabelFile
 from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around, files_in
 

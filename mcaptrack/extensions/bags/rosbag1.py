@@ -13,11 +13,11 @@ from typing import Final, NamedTuple
 
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 
-from mcaptrack import log
+from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.bags.unpacking import decompress_steps
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.sources.ingest.bags import decompression
-from mcaptrack.sources.ingest.bags.recording import Connection, ReadingNotes, RecordingReader
+from mcaptrack.sources.ingest.decompression import limit_of, too_large
 
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
 _MAGIC: Final = b"#ROSBAG V2.0\n"
@@ -51,7 +51,7 @@ class Bag1(RecordingReader):
         self.path = path
         self._file = self.closing.enter_context(path.open("rb"))
         self._size = path.stat().st_size
-        self._known: dict[int, Connection] = {}
+        self._known: dict[int, RecordedChannel] = {}
         try:
             self._end, self._why_unindexed = self._read_index()
             if self._why_unindexed:
@@ -63,11 +63,11 @@ class Bag1(RecordingReader):
         except BaseException:
             self.close()
             raise
-        self.connections = list(self._known.values())
+        self.channels = list(self._known.values())
 
-    def messages(self, report: ReadingNotes) -> Iterator[tuple[Connection, log.Message]]:
+    def messages(self, report: ReadingNotes) -> Iterator[RecordedMessage]:
         """All messages in the order of the bag. Parts that can't be read are reported in ``report``."""
-        at, sequence = self._start, dict[int, int]()
+        at = self._start
         if self._why_unindexed:  # without an index there is no way to tell whether messages are missing
             lines = report.lost if self._index_at else report.notes
             lines.append(f"{self.path} {self._why_unindexed}; what is complete in it is read")
@@ -79,13 +79,11 @@ class Bag1(RecordingReader):
                 return
             parts = self._chunk(record, report) if record.op == _CHUNK else self._unchunked(record, report)
             for number, t_ns, payload in parts:
-                connection = self._known.get(number)
-                if connection is None:
+                channel = self._known.get(number)
+                if channel is None:
                     report.lost.append(f"{self.path}: a message of connection {number}, which is not described")
                     continue
-                count = sequence.get(number, 0)
-                sequence[number] = count + 1
-                yield connection, log.Message(t_ns, count % 2**32, t_ns, payload)
+                yield RecordedMessage(channel, t_ns, payload)
             at = record.end
 
     # The file
@@ -252,7 +250,7 @@ def _op(fields: Fields) -> int:
     return value[0]
 
 
-def _connection(fields: Fields, published: Mapping[bytes, bytes]) -> Connection:
+def _connection(fields: Fields, published: Mapping[bytes, bytes]) -> RecordedChannel:
     """Parse a connection: ``fields`` is the header of the record, ``published`` that of the publisher."""
     topic = _text(fields.get(b"topic", b""))
     if not topic or not published.get(b"type"):
@@ -267,7 +265,7 @@ def _connection(fields: Fields, published: Mapping[bytes, bytes]) -> Connection:
     }
     if "latching" in metadata:  # as the ros1 profile of the MCAP registry has it
         metadata["latching"] = "true" if metadata["latching"].strip() == "1" else "false"
-    return Connection(topic, schema, MessageEncoding.ROS1, metadata)
+    return RecordedChannel(topic, schema, MessageEncoding.ROS1, metadata)
 
 
 def _text(data: bytes) -> str:
@@ -280,20 +278,20 @@ def _text(data: bytes) -> str:
 
 def _decompress(data: bytes, compression: bytes, size: int) -> bytes:
     """Decompress to at most ``size`` + 1 bytes; to less if ``data`` is cut off."""
-    most = decompression.limit_of(len(data))
+    most = limit_of(len(data))
     if size > most:
-        raise _InvalidRecord(str(decompression.too_large(size, most)))
+        raise _InvalidRecord(str(too_large(size, most)))
     try:
         if compression == b"none":
             return data
         if compression == b"bz2":
             import bz2
 
-            return decompression.decompress_steps(bz2.BZ2Decompressor(), data, size + 1)
+            return decompress_steps(bz2.BZ2Decompressor(), data, size + 1)
         if compression == b"lz4":
             import lz4.frame
 
-            return decompression.decompress_steps(lz4.frame.LZ4FrameDecompressor(), data, size + 1)
+            return decompress_steps(lz4.frame.LZ4FrameDecompressor(), data, size + 1)
     except (OSError, ValueError, RuntimeError, EOFError) as error:
         raise _InvalidRecord(f"it can't be decompressed ({error})") from None
     raise _InvalidRecord(f"it is compressed with {compression.decode('utf-8', 'replace')!r}; bz2 and lz4 are read")

@@ -17,7 +17,7 @@ import zstandard
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from tests.bags import QOS, ROS2, STRING1
+from tests.extensions.bags.bags import QOS, ROS2, STRING1
 
 #: Numbers at the edges of what fields hold.
 EDGES = (0, 1, 2, 3, 7, 127, 128, 255, 256, 65535, 2**16, 2**24, 2**31 - 1, 2**31, 2**32 - 1)

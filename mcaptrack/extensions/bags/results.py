@@ -11,22 +11,21 @@ from __future__ import annotations
 import heapq
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import cache
 from math import cos, sin
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish_folder
+from mcaptrack.extensions.bags.files import METADATA
 from mcaptrack.foxglove.views import ground
 from mcaptrack.foxglove.views.people import base_heights, bodies_of
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.location import Location, local_name
+from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import class_name, class_names
 from mcaptrack.schema.encodings import CDR, encoded, ros_definition, ros_name
@@ -35,22 +34,11 @@ from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.fixed_frame import transforms_of
 from mcaptrack.sources.foreign.definitions import typestore_of
 
-__all__ = ["Storage", "WrittenBag", "default_folder", "write_bag"]
-
-Storage = Literal["mcap", "sqlite3"]
+Progress = Callable[[str, int, int], None]
 #: The version of the format of metadata.yaml: readers accept earlier ones, not later ones.
 _VERSION: Final = 8
-_METADATA: Final = "metadata.yaml"
 #: ROS stamps have seconds of 32 bits.
 _LAST_S: Final = 2**31
-
-
-@dataclass
-class WrittenBag:
-    """The messages of a bag by topic, and notes for people."""
-
-    messages: dict[str, int] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
 
 
 class _Stream(NamedTuple):
@@ -63,68 +51,37 @@ class _Stream(NamedTuple):
     definition: str = ""
 
 
-#: How much of a name the name of a temporary folder begins with, in bytes; files in it have longer ones.
+class Rosbag2:
+    """A ROS 2 bag in MCAP, as an exporter."""
 
+    end, is_folder, marker = ".rosbag2", True, METADATA
+    storage: ClassVar[str] = "MCAP"
 
-def default_folder(path: Location) -> Path:
-    """The default folder for the bag of a log: log.mcap -> log.rosbag2 beside it."""
-    return local_name(path, ".rosbag2.mcap").with_suffix("")  # a file in it has its name, and a suffix
+    def write(self, recording: Any, path: Path, progress: Progress = lambda *_: None) -> dict[str, int]:
+        """Write detections, tracks and forecasts of a log as a folder; returns the number of messages of each topic.
 
-
-def write_bag(
-    opened: log.Log,
-    folder: Path,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
-    *,
-    storage: Storage = "mcap",
-    force: bool = False,
-) -> WrittenBag:
-    """Write detections, tracks and forecasts of a log as a ROS 2 bag.
-
-    Parameters
-    ----------
-    opened : Log
-    folder : Path
-        The folder of the bag. It appears when it is complete.
-    progress : callable
-        Called with a text, the number of finished messages and their total.
-    storage : {"mcap", "sqlite3"}
-    force : bool
-        Whether to replace a bag that is there.
-
-    Returns
-    -------
-    WrittenBag
-
-    Raises
-    ------
-    McaptrackError
-        If the log has nothing to write, if the folder exists or can't be written, and if a time is later than ROS can
+        Raises McaptrackError if the log has none, if the folder can't be written, and if a time is later than ROS can
         express.
-    """
-    _refuse_folder(folder, force)
-    done = WrittenBag()
-    job = _Job(opened, done.notes)
-    streams = [stream for topic, schema in job.channels() for stream in job.streams(topic, schema)]
-    if not streams:
-        raise McaptrackError(f"{opened.path} has no detections, tracks or predictions to write as ROS messages")
-    streams += job.transforms()
-    try:
-        with publish_folder(folder) as part:  # the file of messages has the name of its folder
-            _write(part, streams, storage, done, lambda count: progress("export", count, job.total))
-    except sqlite3.Error as error:
-        raise McaptrackError(f"{folder} can't be written: {error}") from error
-    return done
+        """
+        with log.read(recording.path) as opened:
+            job = _Job(opened)
+            streams = [stream for topic, schema in job.channels() for stream in job.streams(topic, schema)]
+            if not streams:
+                raise McaptrackError(f"{opened.path} has no detections, tracks or predictions to write as ROS messages")
+            streams += job.transforms()
+            try:
+                counts = _write(path, streams, self.storage, lambda count: progress("export", count, job.total))
+            except sqlite3.Error as error:
+                raise McaptrackError(f"{path.name} can't be written: {error}") from error
+        for note in job.notes:
+            warn(note, "left-out")
+        return counts
 
 
-def _refuse_folder(folder: Path, force: bool) -> None:
-    """Raise McaptrackError if a bag can't get this folder."""
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    if not (folder.is_dir() and (folder / _METADATA).is_file()):
-        raise McaptrackError(f"{folder} exists and is no bag; name another folder with `output=`")
-    if not force:
-        raise McaptrackError(f"{folder} exists; `force=True` replaces it")
+class Rosbag2Sqlite3(Rosbag2):
+    """A ROS 2 bag in a database, as an exporter."""
+
+    storage = "SQLITE3"
 
 
 # Frames as ROS messages: detections and tracks as arrays of vision_msgs, drawings as markers, forecasts as paths.
@@ -349,9 +306,7 @@ def _by_track(rows: Rows) -> Iterator[tuple[int, Rows]]:
         yield number, rows[begin:end]
 
 
-def _write(
-    folder: Path, streams: Sequence[_Stream], storage: Storage, done: WrittenBag, progress: Callable[[int], None]
-) -> None:
+def _write(folder: Path, streams: Sequence[_Stream], storage: str, progress: Callable[[int], None]) -> dict[str, int]:
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import get_types_from_msg
@@ -362,8 +317,8 @@ def _write(
         QosLiveliness.AUTOMATIC, forever, False,
     )  # fmt: skip
     store = typestore()
-    count = 0
-    with Writer(folder, version=_VERSION, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+    counts: dict[str, int] = {}
+    with Writer(folder, version=_VERSION, storage_plugin=StoragePlugin[storage]) as writer:
         pending = []
         for stream in streams:
             if stream.definition:
@@ -372,14 +327,15 @@ def _write(
             connection = writer.add_connection(
                 stream.topic, stream.kind, typestore=store, offered_qos_profiles=profiles
             )
-            done.messages[stream.topic] = 0
+            counts[stream.topic] = 0
             pending.append(_with(stream, connection))
-        for t_ns, stream, connection, content in heapq.merge(*pending, key=lambda item: item[0]):
+        merged = heapq.merge(*pending, key=lambda item: item[0])
+        for count, (t_ns, stream, connection, content) in enumerate(merged, start=1):
             payload = content if stream.definition else store.serialize_cdr(content, stream.kind)
             writer.write(connection, t_ns, payload)
-            done.messages[stream.topic] += 1
-            count += 1
+            counts[stream.topic] += 1
             progress(count)
+    return counts
 
 
 def _with(stream: _Stream, connection: Any) -> Iterator[tuple[int, _Stream, Any, Any]]:
@@ -387,10 +343,10 @@ def _with(stream: _Stream, connection: Any) -> Iterator[tuple[int, _Stream, Any,
 
 
 class _Job:
-    """The streams of a log for a bag. ``total`` is the number of their messages so far."""
+    """The streams of a log for a bag: ``total`` counts their messages so far, ``notes`` say what is left out."""
 
-    def __init__(self, opened: log.Log, notes: list[str]) -> None:
-        self._opened, self._notes = opened, notes
+    def __init__(self, opened: log.Log) -> None:
+        self._opened, self.notes = opened, list[str]()
         self._prefixes = {topic: camera.prefix for camera in cameras(opened) for topic in camera.topics}
         self.total = 0
 
@@ -432,7 +388,7 @@ class _Job:
         lost = int((~pixels if is_flat else ~places).sum())
         if lost:
             lacking = "box in pixels" if is_flat else "position in metres"
-            self._notes.append(f"{topic}: {lost:,} rows without a {lacking} are not in the bag")
+            self.notes.append(f"{topic}: {lost:,} rows without a {lacking} are not in the bag")
         if is_flat:
             flat = prefix.strip("/")
             boxes = ((frame.t_ns, boxes_2d(frame, flat, names)) for frame in frames)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import zlib
 from functools import partial
 from io import BytesIO
@@ -19,13 +18,9 @@ ENVIRONMENT: Final = "MCAPTRACK_MAX_UNPACKED_MIB"
 _RATIO, _MIN_MIB = 64, 64
 #: The first bytes of what gzip has compressed.
 _GZIP: Final = b"\x1f\x8b"
-#: Small enough that Python handles signals between two pieces.
-_PIECE_BYTES: Final = 2**20
 #: One byte of zstd can expand to 32 KiB: without a declared size the input is fed in small pieces.
 _FED_BYTES: Final = 2**10
-_WINDOW_BYTES: Final = 2**27
-#: The share of the free disk space that temporary files may use.
-_DISK_SHARE: Final = 0.9
+WINDOW_BYTES: Final = 2**27
 
 
 class NotUnpackedError(ValueError):
@@ -54,7 +49,7 @@ def unzstd(data: bytes, most: int) -> bytes:
         if size > most:
             raise too_large(size, most)
         if size >= 0:
-            return zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompress(data)
+            return zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES).decompress(data)
     except zstandard.ZstdError as error:
         raise NotUnpackedError(str(error)) from None
     return _unpacked(data, True, most)
@@ -83,7 +78,7 @@ def _unpacked(data: bytes, is_zstd: bool, most: int) -> bytes:
     import zstandard
 
     def unpackers() -> Any:
-        return zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES).decompressobj()
+        return zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES).decompressobj()
 
     new = unpackers if is_zstd else partial(zlib.decompressobj, zlib.MAX_WBITS + 16)
     parts, size, unpacker = list[bytes](), 0, new()
@@ -102,68 +97,3 @@ def _unpacked(data: bytes, is_zstd: bool, most: int) -> bytes:
     if not unpacker.eof:
         raise NotUnpackedError("it is cut off")
     return b"".join(parts)
-
-
-def decompress_steps(unpacker: Any, data: bytes, most: int) -> bytes:
-    """Decompress ``data`` to at most ``most`` bytes; ``unpacker`` has the interface of bz2.BZ2Decompressor.
-
-    In steps, because Python handles signals only between them.
-    """
-    parts, size = [], 0
-    while size < most and not unpacker.eof and (data or not unpacker.needs_input):
-        parts.append(unpacker.decompress(data, min(_PIECE_BYTES, most - size)))
-        size += len(parts[-1])
-        data = b""
-    return b"".join(parts)
-
-
-def unzstd_file(path: Path, out: Path) -> None:
-    """Decompress a file. Raises McaptrackError."""
-    import zstandard
-
-    most = limit_of(path.stat().st_size)
-    try:
-        with path.open("rb") as packed:
-            size = zstandard.frame_content_size(packed.read(18))
-            if size > most:
-                raise too_large(size, most)
-            packed.seek(0)
-            unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
-            with unpacker.stream_reader(packed, read_across_frames=True, closefd=False) as stream:
-                _write(stream, out, max(size, 0), most)
-    except (zstandard.ZstdError, NotUnpackedError) as error:
-        raise McaptrackError(f"{path} can't be decompressed: {error}") from None
-
-
-def copy(path: Path, out: Path) -> None:
-    """Copy a file to a temporary folder. Raises McaptrackError if there is not enough space."""
-    size = path.stat().st_size
-    try:
-        with path.open("rb") as stream:
-            _write(stream, out, size, size)
-    except NotUnpackedError:
-        raise McaptrackError(f"{path} grows while it is being read; is it still being recorded?") from None
-    except OSError as error:
-        raise unreadable(path, error) from None
-
-
-def _write(stream: Any, out: Path, expected: int, most: int) -> None:
-    """Write a stream to a file, limited to ``most`` bytes and the free disk space."""
-    free = int(shutil.disk_usage(out.parent).free * _DISK_SHARE)
-    size = expected
-    try:
-        with out.open("wb") as file:
-            done = 0
-            while size <= min(most, free) and (piece := stream.read(_PIECE_BYTES)):
-                done += len(piece)
-                size = max(done, expected)
-                file.write(piece)
-    except OSError as error:
-        raise McaptrackError(f"{out} can't be written: {error.strerror or error}") from None
-    if size > most:
-        raise too_large(None, most)
-    if size > free:
-        raise McaptrackError(
-            f"{out.name} needs {size} bytes or more in {out.parent.parent}, where {free} are free; TMPDIR sets "
-            "another folder"
-        )

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.bags.unpacking import copy
 from mcaptrack.files import follow_links, refuse_special, temporary_folder
-from mcaptrack.sources.ingest.bags import decompression
 
 #: Virtual machine steps of SQLite between two checks for signals: a few milliseconds.
 _STEPS: Final = 100_000
@@ -89,7 +89,7 @@ class SqliteTables:
         if left:
             folder = Path(self._close.enter_context(temporary_folder()))
             for other in (path, *left):
-                decompression.copy(other, folder / other.name)
+                copy(other, folder / other.name)
                 if other.name.endswith("-journal"):
                     with (folder / other.name).open("ab") as stream:
                         stream.write(_JOURNAL_END)

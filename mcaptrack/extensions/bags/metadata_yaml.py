@@ -11,13 +11,13 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.bags.files import METADATA
 from mcaptrack.files import follow_links, publish_bytes, read_beginning
 from mcaptrack.notices import warn
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bags import plain_yaml
-from mcaptrack.sources.ingest.bags.plain_yaml import UnsupportedYamlError, field
-from mcaptrack.sources.sidecar import METADATA
+from mcaptrack.sources.ingest import plain_yaml
+from mcaptrack.sources.ingest.plain_yaml import UnsupportedYamlError, field
 
 ROOT: Final = "rosbag2_bagfile_information"
 _TOPIC: Final = "topic_metadata"

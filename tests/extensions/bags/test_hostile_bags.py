@@ -22,13 +22,12 @@ import zstandard
 from mcap.reader import make_reader
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.bags import plain_yaml
-from mcaptrack.sources.ingest.bags import sqlite_tables as bag_database
-from mcaptrack.sources.ingest.bags.metadata_yaml import read_metadata
+from mcaptrack.extensions.bags import sqlite_tables as bag_database
+from mcaptrack.extensions.bags.metadata_yaml import read_metadata
+from mcaptrack.sources.ingest import IngestOptions, ingest, plain_yaml
 from tests import bounded
-from tests.bags import ROS2, STRING1, database
 from tests.commands import start
+from tests.extensions.bags.bags import ROS2, STRING1, database
 from tests.tiers import one_in
 
 TOPICS = [(1, "/a", STRING1, "cdr", "")]

@@ -6,9 +6,9 @@ import json
 import shutil
 import sys
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pytest
@@ -21,15 +21,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.schema import SCHEMAS, TRACKS
+from mcaptrack.extensions.bags import metadata_yaml
+from mcaptrack.schema import PREDICTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.sources.ingest.bags import metadata_yaml
-from tests.bags import MOT, T0, bag1, bag2
 from tests.commands import call, done
+from tests.extensions.bags.bags import MOT, T0, bag1, bag2, record
 from tests.logs import recorder
 from tests.space_logs import WAYS, Robot, write
-from tests.test_ros_recordings import record
 
 Raw = tuple[str, int, bytes]
 
@@ -416,3 +415,30 @@ def test_a_recording_with_compressed_messages_is_not_mixed_with_others(tmp_path)
     assert "compressed one by one; results in bag.mcap would not be" in result.err
     assert "leave --in-place out, or use --sidecar" in result.err
     assert (path.read_bytes(), metadata(path)) == before
+
+
+@dataclass
+class Fix:
+    """A position of a receiver."""
+
+    t_ns: int
+    lat: Annotated[float, "deg"]
+    lon: float | None = None
+
+
+def test_rows_of_a_schema_of_the_user_are_messages_of_the_recording_and_of_a_bag(tmp_path):
+    path = drive(tmp_path / "drive", shots=4)
+    recorded = raw(path)
+    steps = {"track_id": [3], "step": [1], "ahead_s": [0.4], "x_m": [1.0], "y_m": [2.0]}
+    forecasts = PREDICTIONS.rows(**{name: np.array(values) for name, values in steps.items()})
+    with mcaptrack.open(path) as opened:
+        for topic in ("/gps/a", "/gps/b"):
+            opened.write(topic, [Fix(T0, 1.0), Fix(T0 + 5, 2.0, 3.0)], sidecar=False)
+        opened.write("/gps/predictions", [Frame(T0, 0, forecasts)], sidecar=False)
+    check_whole(path, recorded)
+    bag = mcaptrack.export(path, form="rosbag2", output=tmp_path / "bag").folder
+    with AnyReader([bag]) as reader:
+        found = [(c.topic, t, reader.deserialize(content, c.msgtype)) for c, t, content in reader.messages()]
+    for topic in ("/gps/a", "/gps/b"):
+        mine = [(t_ns, row.lat, row.lon) for name, t_ns, message in found if name == topic for row in message.rows]
+        np.testing.assert_array_equal(mine, [(T0, 1, np.nan), (T0 + 5, 2, 3)])

@@ -13,8 +13,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from tests.logs import recorder
-
 T0 = 1_700_000_000_123_456_789
 
 
@@ -117,8 +115,22 @@ def camera_bag(path: Path, *topics: str, frames: int = 30) -> list[int]:
 MOT = "".join(f"{frame},7,{1 + frame},20,10,16,1,-1,-1,-1\n" for frame in range(1, 21))
 
 
-def plain(path: Path, profile: str, library: str = "robot") -> Path:
-    """A log with one channel of JSON."""
-    with recorder(path, profile, library) as writer:
-        writer.add_message(writer.register_channel("/a", "json", 0), 1, b"{}", 1)
-    return path
+#: The pictures of ``record``.
+FRAMES = 24
+
+
+def record(folder: Path) -> Path:
+    """A rosbag2 folder whose only file is an MCAP file with pictures; returns that file."""
+    kind, header, time = (
+        ROS2.types[name]
+        for name in ("sensor_msgs/msg/CompressedImage", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    with Writer2(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/robot/front/image", kind.__msgtype__, typestore=ROS2)
+        for number in range(FRAMES):
+            stamp = time(sec=1000 + number // 10, nanosec=number % 10 * 100_000_000)
+            data = np.frombuffer(picture(number), np.uint8)
+            message = kind(header=header(stamp=stamp, frame_id="cam"), format="jpeg", data=data)
+            payload = bytes(ROS2.serialize_cdr(message, kind.__msgtype__))
+            writer.write(connection, T0 + number * 100_000_000, payload)
+    return folder / f"{folder.name}.mcap"

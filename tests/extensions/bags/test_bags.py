@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bz2
 import sqlite3
 import struct
 from collections import Counter
@@ -18,18 +19,19 @@ from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag1 import Writer as Writer1
 
 from mcaptrack import log
+from mcaptrack.contracts import ReadingNotes
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.bags.metadata_yaml import names_file, read_metadata
+from mcaptrack.extensions.bags.rosbag2 import open_bag, open_files
+from mcaptrack.extensions.bags.sqlite_tables import SqliteTables
+from mcaptrack.extensions.bags.unpacking import decompress_steps
 from mcaptrack.notices import collected
 from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
-from mcaptrack.sources.ingest import IngestOptions, ingest
-from mcaptrack.sources.ingest.bags import decompression, rosbag2
-from mcaptrack.sources.ingest.bags.metadata_yaml import names_file
-from mcaptrack.sources.ingest.bags.recording import ReadingNotes
-from mcaptrack.sources.ingest.bags.rosbag2 import open_bag, open_files
-from mcaptrack.sources.ingest.bags.sqlite_tables import SqliteTables
-from tests.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database, plain
-from tests.logs import recorder
+from mcaptrack.sources.foreign import definitions
+from mcaptrack.sources.ingest import IngestOptions, decompression, ingest, recording
+from tests.extensions.bags.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
+from tests.logs import plain, recorder
 
 
 def recorded(path: Path) -> list[tuple[str, int, int, bytes]]:
@@ -337,7 +339,10 @@ class TestRosbag2:
         (tmp_path / "g").mkdir()
         for name in ("one.mcap", "two.mcap"):
             (tmp_path / "g" / name).write_bytes(b"")
-        with pytest.raises(McaptrackError, match=r"has no metadata\.yaml, and its 2 logs are no parts of one"):
+        with pytest.raises(
+            McaptrackError,
+            match=r"holds several recordings, which are no parts of one; give one.mcap and so on by name",
+        ):
             make(tmp_path / "g", tmp_path / "out.mcap")
         assert not (tmp_path / "out.mcap").exists()
 
@@ -459,11 +464,11 @@ def test_real_recordings_are_kept_whole(data, tmp_path):
 
 @pytest.mark.parametrize(("left", "most"), [(1000, 2000), (2000, 1000)])
 def test_a_packed_message_is_within_what_is_left_and_within_the_limit_of_one(left, most, monkeypatch):
-    monkeypatch.setattr(rosbag2, "_MAX_MESSAGE_BYTES", most)
+    monkeypatch.setattr(definitions, "_MAX_MESSAGE_BYTES", most)
     pack = zstandard.ZstdCompressor().compress
-    assert rosbag2._unpack_message(pack(bytes(1000)), Path("a"), 7, left) == bytes(1000)
+    assert recording._unpack_message(pack(bytes(1000)), Path("a"), 7, left) == bytes(1000)
     with pytest.raises(McaptrackError, match="a: the message at 7 ns can't be decompressed: it says that it has 1001 "):
-        rosbag2._unpack_message(pack(bytes(1001)), Path("a"), 7, left)
+        recording._unpack_message(pack(bytes(1001)), Path("a"), 7, left)
 
 
 def test_a_database_may_run_nothing_of_its_own(tmp_path, monkeypatch):
@@ -528,13 +533,17 @@ def test_files_of_a_folder_are_one_recording(folder):
     assert not warnings
     counts = [(one.topic, count) for one, count in bag.declared_counts.items()]
     assert counts == [("/talk", 2), ("/talk", 3), ("/other", 1)]
-    assert bag.connections == list(bag.declared_counts)
-    first, second, other = bag.connections
+    assert bag.channels == list(bag.declared_counts)
+    first, second, other = bag.channels
     found = list(bag.messages(ReadingNotes()))
-    assert [(known, message.t_ns, message.publish_ns) for known, message in found] == [
-        (first, 10, 10), (second, 20, 20), (first, 30, 30), (second, 40, 40), (second, 50, 50), (other, 60, 60),
+    assert [(message.channel, message.t_ns) for message in found] == [
+        (first, 10), (second, 20), (first, 30), (second, 40), (second, 50), (other, 60),
     ]  # fmt: skip
-    assert [message.sequence for _, message in found] == [0, 0, 1, 1, 2, 0]
+    make(folder, folder / "out.mcap")
+    with (folder / "out.mcap").open("rb") as stream:
+        messages = [message for _, _, message in make_reader(stream).iter_messages()]
+    assert [message.sequence for message in messages] == [0, 0, 1, 1, 2, 0]
+    assert [message.publish_time for message in messages] == [10, 20, 30, 40, 50, 60]
     assert bag.findings.lost == []
     (note,) = bag.findings.notes
     assert note.startswith(f"{folder} does not say what std_msgs/msg/String is; its definition is that of ")
@@ -583,7 +592,7 @@ def test_a_compressed_file_is_found_without_its_ending(folder):
     (folder / "b.db3.zstd").write_bytes(zstandard.compress(whole))
     (folder / "b.db3").unlink()
     bag = open_bag(folder)
-    assert [message.t_ns for _, message in bag.messages(ReadingNotes())] == [10, 20, 30, 40, 50, 60]
+    assert [message.t_ns for message in bag.messages(ReadingNotes())] == [10, 20, 30, 40, 50, 60]
     assert [path.name for path in bag.paths] == ["a.db3", "b.db3"]
     bag.close()
     assert not bag.paths[1].exists()  # the decompressed copy
@@ -624,7 +633,7 @@ def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeyp
         own = (tmp_path / name).stat().st_size
         monkeypatch.setattr(decompression, "limit_of", lambda size: limit if size == own else 0)
         with closing(open_bag(tmp_path)) as bag:
-            return [len(message.payload) for _, message in bag.messages(ReadingNotes())]
+            return [len(message.payload) for message in bag.messages(ReadingNotes())]
 
     assert read(600) == sizes
     with pytest.raises(McaptrackError, match=f"{name}: the message at 2 ns can't be decompressed"):
@@ -633,4 +642,36 @@ def test_messages_that_are_compressed_one_by_one_share_a_limit(tmp_path, monkeyp
     monkeypatch.undo()
     with closing(open_files([tmp_path / name], tmp_path / name)) as bag:
         assert bag.as_log is None
-        assert [len(message.payload) for _, message in bag.messages(ReadingNotes())] == sizes
+        assert [len(message.payload) for message in bag.messages(ReadingNotes())] == sizes
+
+
+def test_what_metadata_leaves_out_has_its_usual_value(tmp_path):
+    topic = "{topic_metadata: {name: /a, type: t/msg/T}, message_count: 3}"
+    path = tmp_path / "metadata.yaml"
+    path.write_text(
+        f"rosbag2_bagfile_information:\n  topics_with_message_count: [{topic}]\n  relative_file_paths: [x/a.db3]\n",
+    )
+    bag, names = read_metadata(path)
+    assert (names, list(bag.topics)) == (["a.db3"], [("/a", "t/msg/T", "cdr", "", "", 3)])
+    assert (bag.distro, bag.packed, bag.text) == ("", False, path.read_bytes())
+    more = "  ros_distro: jazzy\n  compression_mode: {}\n  compression_format: {}\n"
+    for mode, packing, is_packed in (
+        ("MESSAGE", "ZSTD", True),
+        ("file", "zstd", False),
+        ("none", "lz4", False),
+        ("FILE", "lz4", None),
+    ):
+        path.write_text(bag.text.decode() + more.format(mode, packing))
+        if is_packed is None:
+            with pytest.raises(McaptrackError, match="the bag is compressed with 'lz4'; zstd is read"):
+                read_metadata(path)
+            continue
+        found, _ = read_metadata(path)
+        assert (found.packed, found.distro) == (is_packed, "jazzy")
+
+
+def test_decompression_in_steps_ends_at_its_limit():
+    data = bytes(range(256)) * 20
+    steps = [decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data), most) for most in (0, 7, 10**6)]
+    assert steps == [b"", data[:7], data]
+    assert decompress_steps(bz2.BZ2Decompressor(), bz2.compress(data)[:-9], 10**6) in (b"", data)

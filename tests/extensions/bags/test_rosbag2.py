@@ -207,7 +207,7 @@ class TestFolders:
         (tmp_path / "mine").mkdir()
         (tmp_path / "mine" / "notes.txt").write_text("keep")
         for force in (False, True):
-            with pytest.raises(McaptrackError, match="is no bag"):
+            with pytest.raises(McaptrackError, match=r"only folders with metadata\.yaml are replaced"):
                 mcaptrack.export(path, tmp_path / "mine", form="rosbag2", force=force)
         assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
 

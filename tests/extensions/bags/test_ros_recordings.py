@@ -11,35 +11,17 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Writer as Writer2
 
 from mcaptrack import log
 from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import TRACKS
-from tests.bags import ROS2, T0, bag1, bag2, picture, plain
 from tests.commands import GROUP, call, done
-from tests.logs import READING, on_a_log
+from tests.extensions.bags.bags import FRAMES, ROS2, T0, bag1, bag2, record
+from tests.logs import READING, on_a_log, plain
 
 COMMANDS = GROUP.commands
-FRAMES = 24
-
-
-def record(folder: Path) -> Path:
-    """A rosbag2 folder whose only file is an MCAP file with pictures; returns that file."""
-    kind, header, time = (
-        ROS2.types[name]
-        for name in ("sensor_msgs/msg/CompressedImage", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
-    )
-    with Writer2(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connection = writer.add_connection("/robot/front/image", kind.__msgtype__, typestore=ROS2)
-        for number in range(FRAMES):
-            stamp = time(sec=1000 + number // 10, nanosec=number % 10 * 100_000_000)
-            data = np.frombuffer(picture(number), np.uint8)
-            message = kind(header=header(stamp=stamp, frame_id="cam"), format="jpeg", data=data)
-            payload = bytes(ROS2.serialize_cdr(message, kind.__msgtype__))
-            writer.write(connection, T0 + number * 100_000_000, payload)
-    return folder / f"{folder.name}.mcap"
 
 
 def by_rosbags(folder: Path) -> list[tuple[str, int, bytes]]:
