@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "UNKNOWN_VECTOR", "Box", "Box3d", "Exporter", "Finished", "LabelBoxes", "LabelFormat", "MessageReader",
-    "Quaternion", "ReadingNotes", "RecordedChannel", "RecordedMessage", "RecordingFormat", "RecordingReader", "ReportSection",
-    "SectionTable", "Vector",
+    "Quaternion", "ReadingNotes", "RecordedChannel", "RecordedMessage", "RecordingFormat", "RecordingReader",
+    "ReportSection", "SectionTable", "Vector",
 ]  # fmt: skip
 
 Vector = tuple[float, float, float]
