@@ -67,12 +67,26 @@ def missing_extension(name: str, kind: str = "name") -> str:
     The stub for type checkers says which names those are, in Python and, in comments, of other kinds: it alone names
     extensions from outside.
     """
-    stub = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
     place, own = rf"{re.escape(_EXTENSIONS)}\.(\w+)", re.escape(name)
     in_python = kind in ("name", "command")
-    match = re.search(rf"^from {place}\S* import {own} as" if in_python else rf"^# {kind} {own}: {place}$", stub, re.M)
+    match = re.search(
+        rf"^from {place}\S* import {own} as" if in_python else rf"^# {kind} {own}: {place}$", _stub(), re.M
+    )
     folder = f"mcaptrack/extensions/{match[1]}" if match else ""
     return f"{name} is an extension that isn't installed; install mcaptrack again, with {folder}" if folder else ""
+
+
+def missing_parts(kind: str) -> str:
+    """Say which names of a kind extensions have that aren't installed, and what to do; "" if there are none."""
+    parts = re.findall(rf"^# {kind} (\S+): {re.escape(_EXTENSIONS)}\.(\w+)$", _stub(), re.M)
+    missing = [(name, extension) for name, extension in parts if not _is_extension(extension)]
+    folders = " and ".join(sorted({f"mcaptrack/extensions/{extension}" for _, extension in missing}))
+    names = ", ".join(name for name, _ in missing)
+    return f"{names} are of an extension that isn't installed; install mcaptrack again, with {folders}" if names else ""
+
+
+def _stub() -> str:
+    return Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
 
 
 def _is_extension(name: str) -> bool:

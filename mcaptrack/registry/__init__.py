@@ -116,31 +116,10 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         },
         "label_format": {
             "mot": f"{_LABELS}.mot:Mot",
-            "kitti": f"{_LABELS}.kitti:Kitti",
             "sdd": f"{_LABELS}.sdd:Sdd",
             "trajnet": f"{_LABELS}.positions:Trajnet",
             "obsmat": f"{_LABELS}.positions:Obsmat",
-            "youtube-vis": f"{_LABELS}.youtube_vis:YoutubeVis",
-            "coco": f"{_LABELS}.coco:Coco",
-            "voc": f"{_LABELS}.voc:Voc",
-            "cvat": f"{_LABELS}.cvat:Cvat",
-            "trajnet++": f"{_LABELS}.trajnetpp:TrajnetPP",
-            "bdd": f"{_LABELS}.bdd:Bdd",
-            "jrdb": f"{_LABELS}.jrdb:Jrdb",
-            "label-studio": f"{_LABELS}.label_studio:LabelStudio",
-            "labelme": f"{_LABELS}.labelme:Labelme",
-            "via": f"{_LABELS}.via:Via",
-            "datumaro": f"{_LABELS}.datumaro:Datumaro",
-            "darknet": f"{_LABELS}.darknet:Darknet",
-            "mots": f"{_LABELS}.masks:Mots",
-            "levelx": f"{_LABELS}.levelx:LevelX",
-            "supervision": f"{_LABELS}.delimited:Supervision",
             "csv": f"{_LABELS}.delimited:Csv",
-            "kitti-frames": f"{_LABELS}.kitti:KittiFrames",
-            "kitti-3d": f"{_LABELS}.kitti:Kitti3d",
-            "nuscenes": f"{_LABELS}.nuscenes:NuScenes",
-            "argoverse": f"{_LABELS}.argoverse:Argoverse",
-            "yolo": f"{_LABELS}.yolo:Yolo",
             "records": f"{_LABELS}.records:Records",
         },
         # By the name of the type of message, as in ROS 1 and Foxglove: drawings. Others are read by their fields.
@@ -234,6 +213,11 @@ def _group(kind: str) -> str:
 def names(kind: Kind) -> tuple[str, ...]:
     """All names of a kind: built-in ones, then those of entry points. Imports nothing."""
     return (*BUILT_IN[kind], *sorted({point.name for point in points(kind)}))
+
+
+def own_names(kind: Kind) -> tuple[str, ...]:
+    """The names of what mcaptrack itself has of a kind, in the core and in extensions. Imports nothing."""
+    return (*BUILT_IN[kind], *sorted({point.name for point in points(kind) if point.is_own}))
 
 
 def points(kind: Kind) -> list[Point]:

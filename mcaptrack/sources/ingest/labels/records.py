@@ -37,6 +37,7 @@ class Records(Format):
     title = "tables in Parquet, Arrow, Feather or JSON"
     row = "the same columns in Parquet, Arrow or Feather, in JSON lines, or in a JSON list of objects"
     takes = ("columns",)
+    rank = 1
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a file begins so, or is JSON of rows with a place in each."""
@@ -55,10 +56,8 @@ class Records(Format):
         """The rows of a table."""
         table = _table(file)
         if are_metres(table.header, asked.columns):
-            rows = read_table_3d(table, asked.columns)
-            rows.facts.format = "records"
-            return rows
-        return read_table(table, "records", asked.columns)
+            return read_table_3d(table, asked.columns)
+        return read_table(table, asked.columns)
 
 
 def _table(file: LabelFile) -> Opened:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat, around
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around
 
 
 class Datumaro(PictureFormat):
     """Boxes, and those around polygons."""
 
-    name, title = "datumaro", "datumaro"
+    title = "datumaro"
     row = "JSON with `items` of pictures, their `annotations`, and `categories`"
 
     def recognises(self, file: LabelFile) -> bool:

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat, around, files_in
 from mcaptrack.sources.ingest.bags.decompression import opened
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around, files_in
 
 #: All of a file is in memory as a tree.
 _MAX_BYTES: Final = 64 * 2**20
@@ -33,8 +33,9 @@ def _tree(path: Path) -> Element:
 class Voc(PictureFormat):
     """Files of Pascal VOC, and of LabelMe, which has polygons."""
 
-    name, title = "voc", "Pascal VOC or LabelMe XML"
+    title = "Pascal VOC or LabelMe XML"
     row = "a folder of XML, one for each picture: `<annotation>` with an `<object>` and a `<bndbox>` for each box"
+    rank = -1
     reads_folders = True
 
     def recognises(self, file: LabelFile) -> bool:

@@ -6,15 +6,20 @@ Letters: N rows, C numbers of a box.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.table import NO_ID, NOTHING, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_ROWS, ClassNames, TrackIds, as_float, is_count, is_number
+
+_LISTED: Final = 10
+
+Part = TypeVar("Part")
 
 
 class GatheredRows:
@@ -95,3 +100,17 @@ class GatheredRows:
             aside=aside.astype(int) if aside.any() or not counts.all() else None,
             remarks=said,
         )  # fmt: skip
+
+
+def chosen_part(path: Path, parts: Mapping[str, Part], wanted: str | None, noun: str, where: str = "") -> Part:
+    """The part of a file, a ``noun``, with this name, or the only one.
+
+    Raises McaptrackError if there is none, or if there are several and none is named.
+    """
+    if wanted is None and len(parts) == 1:
+        return next(iter(parts.values()))
+    if wanted is None or wanted not in parts:
+        what = f"no {noun} {wanted!r:.60}" if wanted else f"{len(parts)} {noun}s"
+        listed = list_names(sorted(parts), _LISTED)
+        raise McaptrackError(f"{path} has {what}{where}; choose one with `scene=`: {listed}")
+    return parts[wanted]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat
 
 
 class Darknet(PictureFormat):
     """Detections with scores."""
 
-    name, title, is_normalised = "darknet", "JSON of darknet", True
+    title, is_normalised = "JSON of darknet", True
     row = "a list of pictures: `frame_id`, `filename` and `objects` with `relative_coordinates`"
 
     def recognises(self, file: LabelFile) -> bool:

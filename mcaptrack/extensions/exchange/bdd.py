@@ -7,8 +7,8 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
-from mcaptrack.sources.ingest.labels.gathered import GatheredRows
+from mcaptrack.extensions.exchange.gathered import GatheredRows, chosen_part
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import is_number, numbers_of_names
 
@@ -33,7 +33,7 @@ class Bdd(Format):
         """The rows of a file; shapes that are no boxes are left out."""
         if not self.recognises(file):
             raise McaptrackError(f"{file.path} is no JSON of frames with a name and labels, as BDD100K has")
-        frames, facts = _of_video(file, asked.scene), LabelFacts(file.path, "bdd", states_labelled=True)
+        frames, facts = _of_video(file, asked.scene), LabelFacts(file.path, states_labelled=True)
         numbers = _numbers(frames)
         facts.labelled, facts.region = np.array(sorted(numbers), np.int64), "crowd"
         facts.first_frame, facts.is_first_assumed = min(numbers), min(numbers) > 0

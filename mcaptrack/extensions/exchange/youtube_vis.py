@@ -6,16 +6,17 @@ from collections.abc import Iterator
 from typing import Any
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.masks import box_of_mask
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.masks import box_of_mask
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat
 
 
 class YoutubeVis(PictureFormat):
     """Tracks of one video."""
 
-    name, title = "youtube-vis", "YouTube-VIS"
+    title = "YouTube-VIS"
     row = "JSON with `videos`, `categories`, and `annotations` with `bboxes` or `segmentations` for all pictures"
+    rank = -2
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether JSON has annotations, or results, of whole videos."""

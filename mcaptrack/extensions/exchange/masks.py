@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat
 from mcaptrack.sources.ingest.labels.format import MAX_LINE, LabelFile
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat
 
 _MAX_PIXELS: Final = 2**31
 #: Classes of MOTS; the last one marks regions in which tracks don't count.
@@ -55,7 +55,7 @@ def _unpacked(text: str) -> list[int]:
 class Mots(PictureFormat):
     """Text of MOTS: boxes are those around the masks."""
 
-    name, title = "mots", "MOTS"
+    title = "MOTS"
     row = "`frame id class height width rle`"
 
     def recognises(self, file: LabelFile) -> bool:

@@ -15,9 +15,9 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.gathered import GatheredRows
 from mcaptrack.files import visible
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import numbers_of_names
 from mcaptrack.sources.video.image_folder import natural_order
@@ -74,7 +74,6 @@ class PictureFormat(Format):
     read, if it isn't the file as a whole.
     """
 
-    name: ClassVar[str]
     is_normalised: ClassVar[bool | None] = None
     where: str = ""
 
@@ -84,7 +83,7 @@ class PictureFormat(Format):
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The boxes of all pictures. The numbers in their names are those of frames, otherwise their order."""
-        facts = LabelFacts(file.path, self.name, is_normalised=self.is_normalised, states_labelled=True)
+        facts = LabelFacts(file.path, is_normalised=self.is_normalised, states_labelled=True)
         rows, pictures, other = GatheredRows(facts, "picture"), list[LabelledPicture](), Counter[str]()
         try:
             for picture in self.pictures(file):

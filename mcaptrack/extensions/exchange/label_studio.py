@@ -12,8 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
-from mcaptrack.sources.ingest.labels.gathered import GatheredRows
+from mcaptrack.extensions.exchange.gathered import GatheredRows, chosen_part
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_ROWS, is_number
 
@@ -36,7 +36,7 @@ class LabelStudio(Format):
         """The rows of a task."""
         tasks = {str(task.get("id", number)): task for number, task in enumerate(_tasks(file)) if [*_regions(task)]}
         task = chosen_part(file.path, tasks, asked.scene, "task", " with boxes in a video")
-        facts = LabelFacts(file.path, "label-studio", first_frame=1, is_normalised=True)
+        facts = LabelFacts(file.path, first_frame=1, is_normalised=True)
         rows, count, duration, filled = GatheredRows(facts, "result"), 0, 0.0, 0
         for order, region in enumerate(_regions(task)):
             value = region["value"]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat, around, files_in
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around, files_in
 
 
 class Labelme(PictureFormat):
     """Rectangles and polygons; a group_id is no track."""
 
-    name, title = "labelme", "labelme"
+    title = "labelme"
     row = "a folder of JSON, one for each picture: `shapes` with `label`, `points` and `shape_type`"
     reads_folders = True
 

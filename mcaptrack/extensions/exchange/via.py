@@ -7,8 +7,8 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat, around
 from mcaptrack.sources.ingest.labels.format import LabelFile
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, around
 
 _PROJECT: Final = "_via_img_metadata"
 _CELLS: Final = ("region_shape_attributes", "region_attributes")
@@ -20,7 +20,7 @@ _TRACKS: Final = ("track_id", "track", "id")
 class Via(PictureFormat):
     """Rectangles and polygons of pictures."""
 
-    name, title = "via", "VIA"
+    title = "VIA"
     row = "JSON of pictures with `filename` and `regions`, or CSV with `region_shape_attributes`"
 
     def recognises(self, file: LabelFile) -> bool:

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import numbers_of_names
 
@@ -41,7 +41,7 @@ class Jrdb(Format):
             raise McaptrackError(f"{file.path} is no JSON of labels by names of files, as JRDB has")
         labels: dict[str, Any] = file.json["labels"]
         numbers = numbers_of_names([*labels]) or list(range(len(labels)))
-        facts = LabelFacts(file.path, "jrdb", first_frame=0, states_labelled=True, not_counting="no_eval")
+        facts = LabelFacts(file.path, first_frame=0, states_labelled=True, not_counting="no_eval")
         facts.labelled = np.array(sorted(numbers), np.int64)
         rows, in_space = GatheredRows(facts, "label"), self.holds_3d(file, {})
         for number, (name, entries) in zip(numbers, labels.items(), strict=True):

@@ -9,8 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.gathered import chosen_part
 from mcaptrack.files import read_json
-from mcaptrack.sources.ingest.labels.format import Format, LabelFile, chosen_part
+from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_WHOLE, ClassNames, as_float, headings, numbered
 
@@ -121,7 +122,7 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     remarks = [f"{folder}: {len(samples)} samples; tracks are numbered from 1 on, a number for each instance"]
     if unseen:
         remarks.append(f"{folder}: {unseen} of {len(boxes)} boxes have no points of lidar or radar; they stay")
-    facts = LabelFacts(path, "nuscenes", is_timed=True, frame_id=FRAME)
+    facts = LabelFacts(path, is_timed=True, frame_id=FRAME)
     facts.name(names.names)
     facts.usual, facts.states_labelled = frozenset(_CLASSES), True
     facts.labelled = np.unique(np.array(list(samples.values()), np.int64))

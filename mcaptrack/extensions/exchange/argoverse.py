@@ -30,6 +30,7 @@ class Argoverse(Format):
 
     title = "Argoverse 2"
     row = "`annotations.feather`, or a folder with it"
+    rank = 2
     in_space = True
     reads_folders = True
 
@@ -76,7 +77,7 @@ def _read(path: Path) -> BoxTable:
     except ValueError as error:
         raise McaptrackError(f"{path}: {error}") from None
     remarks.append(f"{path}: tracks are numbered from 1 on, a number for each track_uuid")
-    facts = LabelFacts(path, "argoverse", is_timed=True, frame_id=frame_id)
+    facts = LabelFacts(path, is_timed=True, frame_id=frame_id)
     facts.name(names.names)
     return BoxTable(
         facts=facts, at=at, frame=t_ns, id=numbered([f"#{track}" for track in table["track_uuid"]]),

@@ -46,7 +46,7 @@ class LevelX(Format):
         is_highd = "xCenter" not in table.header
         names = {key: name for key, name in (_HIGHD if is_highd else _OTHERS).items() if name in table.header}
         out = read_table_3d(table, names)
-        out.facts.format, out.facts.first_frame = "levelx", int(is_highd)
+        out.facts.first_frame = int(is_highd)
         meta = file.path.with_name(file.path.name.replace("_tracks.", "_tracksMeta."))
         if meta != file.path and meta.is_file():
             names_of, id_name = ClassNames(), names["id"]

@@ -48,6 +48,7 @@ class Yolo(Format):
 
     title = "YOLO"
     row = "a folder of text files, one for each picture: `class x y width height [confidence] [id]`"
+    rank = 2
     reads_folders = True
 
     def recognises(self, file: LabelFile) -> bool:
@@ -84,9 +85,7 @@ class Yolo(Format):
         score, track_id = _score_and_id(frame, rows, asked.role)
         if np.isfinite(rows[:, 5]).any() and not np.isfinite(rows[:, 6]).any():
             remarks.append(f"{folder}: column 6 holds {'confidences' if np.isfinite(score).any() else 'track ids'}")
-        facts = LabelFacts(
-            folder, "yolo", is_normalised=True, first_class=0, labelled=np.array(sorted(numbers), np.int64)
-        )
+        facts = LabelFacts(folder, is_normalised=True, first_class=0, labelled=np.array(sorted(numbers), np.int64))
         facts.states_labelled = 0 in counts  # others write no files without boxes
         table = BoxTable(
             facts=facts, at=at, frame=frame, id=track_id, score=score, class_id=rows[:, 0], remarks=remarks,

@@ -6,15 +6,16 @@ Letters: N rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.schema.classes import PERSON
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat, files_in
+from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.pictures import LabelledPicture, LabelledShape, PictureFormat, files_in
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import (
     ClassNames,
@@ -25,6 +26,7 @@ from mcaptrack.sources.ingest.labels.text import (
     read_numbers,
     states_number,
 )
+from mcaptrack.tables.box_files import BoxFile, ExportedBoxes, joined_lines, merged_classes, score_text, unscored
 
 _COLUMNS: Final = (
     "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"
@@ -84,7 +86,7 @@ class Kitti(Format):
         kind = values[:, 2].astype(np.int64)
         aside = np.where(_named(kind, names, (_REGION,)), REGION, NOTHING)
         aside[_named(kind, names, _SITTING)] = FORGIVEN
-        facts = LabelFacts(file.path, "kitti", first_frame=0, names=names, numbering=_CLASSES, named_by="file")
+        facts = LabelFacts(file.path, first_frame=0, names=names, numbering=_CLASSES, named_by="file")
         facts.not_counting, facts.region, facts.least_height_px = "hidden or cut off", "DontCare", _HEIGHT_PX
         return BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], boxes_px=as_boxes(values[:, 6:10]),
@@ -118,7 +120,7 @@ class Kitti3d(Format):
         height, width, length, x, y, z, rotation = values[:, 10:17].T
         left = [f"{int(is_region.sum())} regions (DontCare)"] if is_region.any() else []
         left += [f"{int(has_no_box.sum())} rows without a 3D box"] if has_no_box.any() else []
-        facts = LabelFacts(file.path, "kitti-3d", first_frame=0, names=names, numbering={}, named_by="file")
+        facts = LabelFacts(file.path, first_frame=0, names=names, numbering={}, named_by="file")
         facts.frame_id, facts.labelled = _FRAME_ID, np.unique(values[:, 0])
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], score=values[:, 17], class_id=kind,
@@ -133,8 +135,9 @@ class Kitti3d(Format):
 class KittiFrames(PictureFormat):
     """Folders of KITTI's detection labels, a file for each picture, as DeepStream writes them, too."""
 
-    name, title = "kitti-frames", "KITTI detection"
+    title = "KITTI detection"
     row = "a folder of text files, one for each picture: `type [id] truncated occluded alpha left top right bottom ...`"
+    rank = 1
     reads_folders = True
 
     def recognises(self, file: LabelFile) -> bool:
@@ -154,3 +157,42 @@ class KittiFrames(PictureFormat):
                 (box,) = as_boxes(np.array([cells[4:8]], float)).tolist()
                 picture.shapes.append(LabelledShape(box, cells[0], cells[15] if len(cells) == 16 else None, track))
             yield picture
+
+
+# Boxes of a channel.
+
+
+#: What KITTI's tools write for numbers that are not known: angle, size and position of a 3D box, rotation.
+_KITTI_UNKNOWN: Final = "-10 {box} -1 -1 -1 -1000 -1000 -1000 -10"
+
+
+class KittiFile(BoxFile):
+    """KITTI tracking: frame, id, type, truncated, occluded, and the box by its corners; the score as column 18."""
+
+    title, end, holds = "KITTI", ".kitti.txt", frozenset({"scores"})
+
+    def content(self, boxes: ExportedBoxes) -> Iterator[bytes]:
+        """Yield the lines."""
+        names = {kind: kitti_name(name) for kind, name in boxes.classes.items()}
+        has_scores = bool(np.isfinite(boxes.score).any())
+
+        def line(frame: int, track: int, name: str, box: list[float], score: np.float32) -> str:
+            x, y, w, h = box
+            unknown = _KITTI_UNKNOWN.format(box=f"{x!r} {y!r} {x + w!r} {y + h!r}")
+            return f"{frame} {track} {name} 0 0 {unknown}{f' {score_text(score) or 1}' if has_scores else ''}\n"
+
+        columns = (boxes.frame.tolist(), boxes.id.tolist(), boxes.class_id.tolist(), boxes.boxes.tolist(), boxes.score)
+        yield from joined_lines(
+            line(frame, track, names[kind], box, score) for frame, track, kind, box, score in zip(*columns, strict=True)
+        )
+
+    def remarks(self, boxes: ExportedBoxes) -> Iterable[str]:
+        """Say which boxes have no score, and which classes one name."""
+        names = {kind: kitti_name(name) for kind, name in boxes.classes.items()}
+        return unscored(boxes), merged_classes(boxes.classes, names)
+
+
+def kitti_name(name: str) -> str:
+    """The name of a class in KITTI: people are pedestrians, and names are single words."""
+    word = re.sub(r"[\W_]+", "_", name).strip("_")
+    return _NAMES[0].capitalize() if is_person(name) else word if word[:1].isalpha() else f"class_{word}"

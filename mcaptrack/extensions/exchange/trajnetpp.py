@@ -9,8 +9,8 @@ from fractions import Fraction
 from typing import Any
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.gathered import GatheredRows
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import is_number
 
@@ -33,7 +33,7 @@ class TrajnetPP(Format):
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file; those of other predictions than the first are left out."""
-        facts = LabelFacts(file.path, "trajnet++", first_frame=0)
+        facts = LabelFacts(file.path, first_frame=0)
         rows, scenes, others = GatheredRows(facts, "line"), dict[str, dict[str, Any]](), 0
         tracks = list[tuple[int, dict[str, Any]]]()
         for number, line in file.lines():
