@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
@@ -131,7 +131,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
             **dict.fromkeys(("rosbag2", "rosbag2-sqlite3"), "mcaptrack.tables.rosbag2:write_bag"),
-            "mot": "mcaptrack.tables.box_files:MotFile",
+            "mot": "mcaptrack.sources.box_files:MotFile",
         },
         "judge": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
@@ -222,19 +222,24 @@ def own_names(kind: Kind) -> tuple[str, ...]:
 
 def points(kind: Kind) -> list[Point]:
     """The entry points of a kind; those with a name that is taken don't count."""
-    return [point for point in entry_points(_group(kind)) if not _owner(kind, point)]
+    listed = entry_points(_group(kind))
+    own = {point.name for point in listed if point.is_own}
+    return [point for point in listed if not _owner(kind, point, own)]
 
 
 def ignored(kind: Kind) -> dict[str, str]:
     """Why entry points of a kind don't count, by their title. Imports nothing."""
-    owners = {titled(kind, point.name, point.package): _owner(kind, point) for point in entry_points(_group(kind))}
+    listed = entry_points(_group(kind))
+    own = {point.name for point in listed if point.is_own}
+    owners = {titled(kind, point.name, point.package): _owner(kind, point, own) for point in listed}
     return {what: f"{what} is ignored: there is {owner}; rename it" for what, owner in owners.items() if owner}
 
 
-def _owner(kind: Kind, point: Point) -> str:
-    """The entry with the name of an entry point, which can't have it: a built-in one, or a command; "" if none."""
-    is_extension = any(own.is_own and own.name == point.name for own in entry_points(_group(kind)))
-    if point.name in BUILT_IN[kind] or (is_extension and not point.is_own):
+def _owner(kind: Kind, point: Point, own: Set[str]) -> str:
+    """The entry with the name of an entry point, which can't have it: a built-in one, one of those that are our
+    ``own``, or a command; "" if none.
+    """
+    if point.name in BUILT_IN[kind] or (point.name in own and not point.is_own):
         return f"a built-in {titled(kind, point.name)}"
     return f"a {titled('command', point.name)}" if kind == "stage" and point.name in names("command") else ""
 

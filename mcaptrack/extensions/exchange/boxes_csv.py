@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mcaptrack.tables.box_files import BoxFile, ExportedBoxes, score_text
+from mcaptrack.sources.box_files import BoxFile, ExportedBoxes, score_text
 
 
 class BoxesCsvFile(BoxFile):

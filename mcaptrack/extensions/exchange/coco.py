@@ -22,10 +22,10 @@ from mcaptrack.extensions.exchange.gathered import GatheredRows
 from mcaptrack.extensions.exchange.masks import box_of_mask
 from mcaptrack.files import visible
 from mcaptrack.schema.classes import UNKNOWN
+from mcaptrack.sources.box_files import BoxFile, ExportedBoxes
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, as_float, is_count, is_number, numbers_of_names
-from mcaptrack.tables.box_files import BoxFile, ExportedBoxes
 
 _MAX_CLASSES: Final = 65536
 #: The largest number of other files beside results in which their images are looked up.

@@ -23,18 +23,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
-from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.sources.box_files import BoxFile, ExportedBoxes
 from mcaptrack.sources.ingest.bags.plain_yaml import XmlReader
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import ClassNames, is_count
-from mcaptrack.tables.box_files import BoxFile, ExportedBoxes
 
 _MAX_BYTES: Final = 512 * 2**20
 _MAX_ROWS: Final = 10_000_000
@@ -480,6 +479,8 @@ def describe_classes(boxes: ExportedBoxes) -> str:
 
 def _head(boxes: ExportedBoxes) -> str:
     """The beginning, as in CVAT's own files: the labels, and the number and size of pictures."""
+    from xml.sax.saxutils import escape  # with the modules of the network that it imports
+
     width, height = boxes.size or np.ceil((boxes.boxes[:, :2] + boxes.boxes[:, 2:]).max(axis=0)).astype(int).tolist()
     labels = "".join(
         f"""
@@ -526,6 +527,8 @@ _ATTRIBUTE: Final = f"""
 
 
 def _track_of(boxes: ExportedBoxes, number: int, rows: Ints, names: dict[int, str]) -> str:
+    from xml.sax.saxutils import quoteattr
+
     frame, box, occluded = boxes.frame[rows], boxes.boxes[rows], ~boxes.observed[rows]
     corners = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], axis=1)
     kinds, counts = np.unique(boxes.class_id[rows], return_counts=True)

@@ -15,6 +15,7 @@ import numpy as np
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat, files_in
 from mcaptrack.schema.classes import PERSON, is_person
+from mcaptrack.sources.box_files import BoxFile, ExportedBoxes, joined_lines, merged_classes, score_text, unscored
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NOTHING, REGION, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import (
@@ -26,7 +27,6 @@ from mcaptrack.sources.ingest.labels.text import (
     read_numbers,
     states_number,
 )
-from mcaptrack.tables.box_files import BoxFile, ExportedBoxes, joined_lines, merged_classes, score_text, unscored
 
 _COLUMNS: Final = (
     "frame id type truncated occluded alpha left top right bottom height width length x y z rotation score"

@@ -177,7 +177,18 @@ def format_named(name: str) -> Format:
 
 def own_formats() -> list[Format]:
     """The formats of mcaptrack, of the core and of extensions, in the order in which they are asked about a file."""
-    return sorted(map(format_named, own_names(_KIND)), key=lambda made: (made.rank, made.name))
+    formats = []
+    for name, cls in _own_classes(own_names(_KIND)):
+        made = cls()
+        made.name = name
+        formats.append(made)
+    return formats
+
+
+@lru_cache(maxsize=4)
+def _own_classes(names: tuple[str, ...]) -> list[tuple[str, type[Format]]]:
+    classes = [(name, find(_KIND, name).cls) for name in names]
+    return sorted(classes, key=lambda entry: (entry[1].rank, entry[0]))
 
 
 @lru_cache(maxsize=16)
