@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import math
 
+import pytest
+
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from tests import test_label_bounds
 from tests.label_cases import Row, Writer, corners, number, per_frame, text
+from tests.test_label_files import FORMATS, Read, assert_read, assert_refused, written
 
 
 def kitti(row: Row) -> str:
@@ -25,3 +30,72 @@ WRITERS = {
     "kitti-3d": Writer(text(kitti), "kind", "space", first="stated"),
     "kitti-frames": Writer(per_frame("{}.txt", kitti_frame), "kind", first="listed"),
 }
+
+
+NAN = float("nan")
+
+
+KITTI = """2 1 Pedestrian 0 0 0 10 20 14 28 1 1 1 1 1 1 0 0.5
+0 2 Pedestrian 0 2 0 11 21 16 30 1 1 1 1 1 1 0
+0 3 Pedestrian 0 3 0 12 22 18 32 1 1 1 1 1 1 0
+1 4 Pedestrian 1 0 0 13 23 20 34 1 1 1 1 1 1 0
+1 5 Car 0 0 0 14 24 22 36 1 1 1 1 1 1 0
+1 -1 DontCare -1 -1 -10 15 25 24 38 1 1 1 1 1 1 0
+3 6 Person_sitting 0 0 0 16 26 26 40 1 1 1 1 1 1 0
+3 7 Person 0 0 0 17 27 28 42 1 1 1 1 1 1 0
+4 8 Tricycle 0 0 0 18 28 30 44 1 1 1 1 1 1 0
+"""
+
+
+KITTI_BOXES = {k: [10 + k, 20 + k, 4 + k, 8 + k] for k in range(9)}
+
+
+#: Role, and what is read, sorted by frame and id.
+FILES: dict[str, tuple[str, str, str, Read]] = {
+    "kitti truth": (KITTI, "kitti", "truth", Read(
+        [0, 2], [2, 1], [KITTI_BOXES[k] for k in (1, 0)], [NAN, 0.5], [0, 1, 2, 3, 4], [1, 1], {1: "Pedestrian"},
+        "2 Person_sitting, 1 Car, 1 Tricycle and 1 regions (DontCare) and 2 boxes that don't count (hidden or cut off)",
+        ([0, 1, 1, 3, 3], [KITTI_BOXES[k] for k in (2, 3, 5, 6, 7)], [True, True, False, True, True],
+         [False, False, True, False, False]))),
+    "kitti tracks": (KITTI, "kitti", "tracks", Read(
+        [0, 0, 1, 2], [2, 3, 4, 1], [KITTI_BOXES[k] for k in (1, 2, 3, 0)], [NAN, NAN, NAN, 0.5], [0, 1, 2, 3, 4], [1] * 4,
+        {1: "Pedestrian"}, "2 Person_sitting, 1 Car, 1 Tricycle and 1 regions (DontCare)")),
+    "kitti detections": (KITTI, "kitti", "detections", Read(
+        [0, 0, 1, 1, 2, 3, 3, 4], [2, 3, 4, 5, 1, 6, 7, 8], [KITTI_BOXES[k] for k in (1, 2, 3, 4, 0, 6, 7, 8)],
+        [NAN, NAN, NAN, NAN, 0.5, NAN, NAN, NAN], [0, 1, 2, 3, 4], [1, 1, 1, 3, 1, 7, 7, 10],
+        {1: "Pedestrian", 3: "Car", 7: "Person_sitting", 10: "Tricycle"}, "1 regions (DontCare)")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "name", "role", "wanted"), FILES.values(), ids=FILES)
+def test_every_column_is_read_as_by_hand(text, name, role, wanted, tmp_path):
+    assert_read(text, name, role, wanted, tmp_path)
+
+
+@pytest.mark.parametrize("row", ["1 1 Person_sitting" + 14 * " 1", "1 1 Car" + 15 * " 1"])
+def test_it_is_told_by_the_first_row(row, tmp_path):
+    assert read_labels(written(tmp_path / "a.txt", f"# a remark\n\n{row}\n"), role="detections").format == "kitti"
+
+
+#: What is refused, with the text of the file and the words after its name.
+REFUSED = {
+    "sixteen of kitti": ("kitti", "truth", "1 1 Car" + 13 * " 1", None),
+    "cars": ("kitti", "tracks", KITTI.splitlines()[4], " holds no people, only 1 Car; `classes=` takes others"),
+    "regions": ("kitti", "detections", KITTI.splitlines()[5], " holds no such boxes, only 1 regions (DontCare)"),
+    "coco": ("auto", "tracks", '[{"image_id": 1}]', f" is JSON (a list with image_id) of no label format ({FORMATS})"),
+    "xml": ("auto", "tracks", '\ufeff<a "images">', ":1: not valid XML: not well-formed (invalid token)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "role", "text", "words"), REFUSED.values(), ids=REFUSED)
+def test_what_is_no_file_of_labels_is_refused_in_these_words(name, role, text, words, tmp_path):
+    assert_refused(name, role, text, words, tmp_path)
+
+
+LINE = "{frame} {id} Pedestrian 0 0 0 {x} 20 {right} 50 1 1 1 1 1 1 0 {score}"
+BOUNDS = [bound for bound in test_label_bounds.BOUNDS if bound[0] in ("frame", "id", "score") and "mot" in bound[1]]
+
+
+@pytest.mark.parametrize(("name", "column", "value", "is_taken"), test_label_bounds.tried(BOUNDS))
+def test_a_number_is_taken_up_to_its_bound_and_no_further(name, column, value, is_taken, tmp_path):
+    test_label_bounds.assert_bound("kitti", LINE, column, value, is_taken, tmp_path)

@@ -15,10 +15,10 @@ import pyarrow.feather
 import pyarrow.parquet
 import pytest
 import zstandard
-from mcaptrack.sources.ingest.labels.masks import box_of_mask
 
 from mcaptrack import ingest
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.masks import box_of_mask
 from mcaptrack.sources.ingest.labels.reading import label_file, read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.table import BoxTable
