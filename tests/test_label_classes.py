@@ -30,7 +30,7 @@ FILES = {"mot": ("gt.txt", MOT), "sdd": ("gt.txt", SDD), "csv": ("gt.csv", CSV)}
 
 def classes_of(folder: Path, form: str | tuple[str, str], **options):
     """The ids of each class in the ground truth of a file, by name and number of the class."""
-    name, content = FILES[form] if form in FILES else form
+    name, content = FILES.get(form, form)
     (folder / name).write_text(content)
     target = folder / f"{name}-{options.get('classes', '')[:5]}.mcap"
     mcaptrack.ingest(folder / name, target, role=options.pop("role", "truth"), fps=10, force=True, **options)

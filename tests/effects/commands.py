@@ -188,7 +188,7 @@ CASES: dict[str, dict[str, Case]] = {
         class_map=("evaluate kinds.csv --truth kinds.csv --classes all", "--class-map cart=dog"),
         first_frame=(SCORED, "--first-frame tracks=0"),
         frames=(SCORED, "--frames 2:4"),
-        size=("evaluate shares --truth shares", "--size 640x480"),
+        size=("evaluate shares.csv --truth shares.csv", "--size 640x480"),
         camera="--camera other",
         ground_plane=(SCORED, "--ground-plane plane.txt"),
         point=(f"{SCORED} --ground-plane plane.txt --gate-m 0.1", "--point center"),

@@ -12,10 +12,7 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames
-from tests import test_corrections as core
 from tests.commands import done
-
-template = core.template
 
 
 def test_corrections_made_in_cvat_come_back_and_run_keeps_them(template, tmp_path):

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcaptrack.extensions.exchange.text import KittiFile
 
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange.cvat import KEYFRAME_PX, CvatFile
+from mcaptrack.extensions.exchange.kitti import KittiFile
 from mcaptrack.registry import find
 from mcaptrack.schema import TRACKS
 from mcaptrack.sources.box_files import BoxFile, ExportedBoxes, MotFile

@@ -37,7 +37,7 @@ class Records(Format):
     title = "tables in Parquet, Arrow, Feather or JSON"
     row = "the same columns in Parquet, Arrow or Feather, in JSON lines, or in a JSON list of objects"
     takes = ("columns",)
-    rank = 1
+    rank = 3
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a file begins so, or is JSON of rows with a place in each."""
