@@ -1,7 +1,6 @@
-"""Formats of labels: each is a class in a module of its own, and an entry point, or of the core a line in the registry.
+"""Formats of labels: each is a class in a module of its own, and an entry point, or in the core a line in the registry.
 
-To add one, write a module like ``mcaptrack.extensions.exchange.darknet``, name it in pyproject.toml, and write a test
-with a file of it. Nothing else names a format.
+To add one, write a module of an extension, name it in pyproject.toml, and write a test with a file of it.
 """
 
 from __future__ import annotations
