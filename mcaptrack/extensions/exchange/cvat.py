@@ -467,13 +467,9 @@ def describe_classes(boxes: ExportedBoxes) -> str:
     """Say how many boxes get the label of their track in place of their own class; "" if none do."""
     if not boxes.has_ids:
         return ""
-    _, track = np.unique(boxes.id, return_inverse=True)
-    _, kind = np.unique(boxes.class_id, return_inverse=True)
-    _, most = np.unique(track * (kind.max() + 1) + kind, return_counts=True)
-    owner = np.unique(track * (kind.max() + 1) + kind) // (kind.max() + 1)
-    largest = np.zeros(track.max() + 1, np.int64)
-    np.maximum.at(largest, owner, most)
-    others = len(track) - int(largest.sum())
+    pairs, counts = np.unique([boxes.id, boxes.class_id], axis=1, return_counts=True)
+    _, first = np.unique(pairs[0], return_index=True)
+    others = len(boxes.id) - int(np.maximum.reduceat(counts, first).sum())
     return f"a track has one label in CVAT: {others:,} boxes get that of their track" if others else ""
 
 

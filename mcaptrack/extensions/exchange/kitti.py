@@ -138,7 +138,7 @@ class KittiFrames(PictureFormat):
     title = "KITTI detection"
     row = "a folder of text files, one for each picture: `type [id] truncated occluded alpha left top right bottom ...`"
     rank = 1
-    reads_folders = True
+    reads_folders, reads_files = True, False
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first file of a folder that has rows begins so."""

@@ -49,7 +49,7 @@ class Yolo(Format):
     title = "YOLO"
     row = "a folder of text files, one for each picture: `class x y width height [confidence] [id]`"
     rank = 2
-    reads_folders = True
+    reads_folders, reads_files = True, False
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a folder holds label files that begin with numbers, or are all empty."""
@@ -60,9 +60,6 @@ class Yolo(Format):
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of all files. The numbers in the names of files are those of frames."""
         folder, files = file.path, _label_files(file.path)
-        if not file.is_folder:
-            text = "is not a folder; labels of YOLO are a folder with a text file for each picture"
-            raise McaptrackError(f"{folder} {text}")
         if not files:
             raise McaptrackError(f"{folder} holds no label files (*.txt)")
         if len(files) > _MAX_FILES:

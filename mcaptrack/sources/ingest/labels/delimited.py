@@ -291,15 +291,22 @@ class Csv(Format):
         """Whether the first row names columns, or a comment before it."""
         return is_table(file)
 
+    def header(self, file: LabelFile) -> list[str]:
+        """The names of columns."""
+        return header_of(file.path, file.row) or (comment_header(file.path, file.row) if file.row else [])
+
+    def opened(self, file: LabelFile) -> Opened:
+        """The table. Raises McaptrackError if it is none."""
+        return opened(file)
+
     def holds_3d(self, file: LabelFile, columns: Mapping[str, str]) -> bool:
-        """Whether the columns are those of boxes in metres, by their names, or as the user has it."""
-        return holds_boxes_3d(file.path, file.row, columns)
+        """Whether the columns are those of boxes or positions in metres, by their names, or as the user has it."""
+        return are_metres(self.header(file), columns)
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a table."""
-        if self.holds_3d(file, asked.columns):
-            return read_table_3d(opened(file), asked.columns)
-        return read_table(opened(file), asked.columns)
+        read = read_table_3d if self.holds_3d(file, asked.columns) else read_table
+        return read(self.opened(file), asked.columns)
 
 
 def records(file: LabelFile) -> Opened:
@@ -631,12 +638,6 @@ def _is_of_program(header: Sequence[str]) -> bool:
     """Whether the columns are those of a program that writes metres."""
     names = {name.strip().lower() for name in header}
     return any(names >= set(required) for required in _OF_PROGRAMS)
-
-
-def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
-    """Whether a table has 3D boxes, by its first line and the columns that are ``chosen`` by key."""
-    header = header_of(path, first) or (comment_header(path, first) if first else [])
-    return are_metres(header, chosen)
 
 
 def hold_places(header: Sequence[str]) -> bool:

@@ -223,6 +223,7 @@ class Format:
     takes: ClassVar[tuple[str, ...]] = ()
     in_space: bool = False
     reads_folders: ClassVar[bool] = False
+    reads_files: ClassVar[bool] = True
     in_parts: ClassVar[bool] = False
 
     def recognises(self, file: LabelFile) -> bool:

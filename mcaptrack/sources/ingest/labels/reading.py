@@ -132,6 +132,9 @@ def read_labels(
             raise McaptrackError(f"{path}: `{option}=` is for {takers}, not for {made.name}")
     if file.is_folder and not made.reads_folders:
         raise McaptrackError(f"{path} is a folder, and {made.name} labels are a file")
+    if not (file.is_folder or made.reads_files):
+        text = f"labels of {made.title} are a folder with a text file for each picture"
+        raise McaptrackError(f"{path} is not a folder; {text}")
     is_alike = role == "detections" or (role in ("tracks", None) and (wanted is None or wanted.is_people))
     if in_parts and made.in_parts and is_alike and class_map is None and path.stat().st_size >= _LONG_BYTES:
         table = _read_in_parts(file, made, replace(asked, role=role or "tracks"))
