@@ -78,22 +78,17 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     folder = tables_folder(path)
     if folder is None:
         raise McaptrackError(f"{path} holds no tables of nuScenes: sample_annotation.json and others")
-    tables = {name: list(_table(folder, name)) for name in TABLES[:2]}
-    token = _scene(folder, tables["scene"], scene)
+    scenes, rows = dict(_pairs(folder, "scene", "name", "token")), list(_table(folder, "sample"))
+    token = chosen_part(folder, scenes, scene, "scene")
     samples = {
         _text(folder, "sample", row, "token"): _number(folder, "sample", row, "timestamp") * _NS_PER_US
-        for row in tables["sample"]
+        for row in rows
         if row.get("scene_token") == token
     }
     if not samples:
         raise McaptrackError(f"{folder}: the scene has no samples")
-    categories = {
-        _text(folder, "category", r, "token"): _text(folder, "category", r, "name") for r in _table(folder, "category")
-    }
-    category_of = {
-        _text(folder, "instance", row, "token"): categories.get(_text(folder, "instance", row, "category_token"))
-        for row in _table(folder, "instance")
-    }
+    categories = dict(_pairs(folder, "category", "token", "name"))
+    category_of = {own: categories.get(kind) for own, kind in _pairs(folder, "instance", "token", "category_token")}
     names, ids, kinds, times, boxes, quaternions, tokens = ClassNames(), [], [], [], [], [], []
     unseen = 0
     for row in _table(folder, "sample_annotation"):
@@ -132,11 +127,6 @@ def _read(path: Path, scene: str | None) -> BoxTable:
     )  # fmt: skip
 
 
-def _scene(folder: Path, scenes: list[dict[str, Any]], wanted: str | None) -> str:
-    tokens = {_text(folder, "scene", row, "name"): _text(folder, "scene", row, "token") for row in scenes}
-    return chosen_part(folder, tokens, wanted, "scene")
-
-
 def _table(folder: Path, name: str) -> Iterator[dict[str, Any]]:
     path = folder / f"{name}.json"
     if not path.is_file():
@@ -146,6 +136,12 @@ def _table(folder: Path, name: str) -> Iterator[dict[str, Any]]:
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise McaptrackError(f"{path} is not a table of nuScenes, a list of objects")
     yield from content
+
+
+def _pairs(folder: Path, table: str, first: str, second: str) -> Iterator[tuple[str, str]]:
+    """Two texts of each row of a table."""
+    for row in _table(folder, table):
+        yield _text(folder, table, row, first), _text(folder, table, row, second)
 
 
 def _text(folder: Path, table: str, row: Mapping[str, Any], key: str) -> str:
