@@ -14,7 +14,6 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.job import fitted
 from mcaptrack.sources.ingest.labels import delimited
-from mcaptrack.sources.ingest.labels import text as texts
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.table import BoxTable
 from mcaptrack.sources.ingest.labels.timeline import Timeline
@@ -195,22 +194,6 @@ def test_a_header_has_four_names_and_no_number(tmp_path):
     assert delimited.header_of(Path("a"), "a,b,c,5") == []
     assert delimited.header_of(Path("a"), '"a b", "c;d",e,f') == ["a b", "c;d", "e", "f"]
     assert delimited.header_of(Path("a"), "abcd") == []
-
-
-def test_names_of_pictures_are_numbered_in_one_sequence():
-    numbers = texts.numbers_of_names
-    assert numbers(["d/x12_a.jpg", "e\\x007_a.png"]) == [12, 7]
-    assert numbers(["1_2.jpg", "1_3.jpg"]) == [2, 3]
-    assert numbers(["x1.jpg", "y2.jpg"]) is None
-    assert numbers(["x1a.jpg", "x2b.jpg"]) is None
-    assert numbers(["x1.jpg", "x01.jpg"]) is None
-    assert numbers(["x"]) is None
-    assert numbers([]) == []
-    assert numbers([f"{2**31 - 1}"]) == [2**31 - 1]
-    assert numbers([f"{2**31}"]) is None
-    with pytest.raises(ValueError, match=r"names of several sequences, 'a.b' and 'c'"):
-        reader = texts.FrameNames()
-        assert (reader.number("a.3b.jpg"), reader.number("4c")) == (3, 4)
 
 
 # Folders of YOLO

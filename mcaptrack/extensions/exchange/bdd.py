@@ -7,10 +7,9 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.exchange.gathered import GatheredRows, chosen_part
+from mcaptrack.extensions.exchange.gathered import GatheredRows, chosen_part, frame_numbers
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import is_number, numbers_of_names
 
 _CORNERS: Final = ("x1", "y1", "x2", "y2")
 _INDEXES: Final = ("frameIndex", "frame_index", "index")
@@ -34,7 +33,8 @@ class Bdd(Format):
         if not self.recognises(file):
             raise McaptrackError(f"{file.path} is no JSON of frames with a name and labels, as BDD100K has")
         frames, facts = _of_video(file, asked.scene), LabelFacts(file.path, states_labelled=True)
-        numbers = _numbers(frames)
+        names = [str(frame.get("name", "")).rpartition("-")[2] for frame in frames]
+        numbers = frame_numbers(names, frames, _INDEXES).numbers
         facts.labelled, facts.region = np.array(sorted(numbers), np.int64), "crowd"
         facts.first_frame, facts.is_first_assumed = min(numbers), min(numbers) > 0
         rows, others = GatheredRows(facts, "label"), 0
@@ -71,14 +71,3 @@ def _of_video(file: LabelFile, wanted: str | None) -> list[dict[str, Any]]:
     for frame in (frame for frame in _frames(file) if isinstance(frame, dict)):
         videos.setdefault(str(next((frame[key] for key in _VIDEOS if frame.get(key)), "")), []).append(frame)
     return chosen_part(file.path, videos, wanted, "video")
-
-
-def _numbers(frames: list[dict[str, Any]]) -> list[int]:
-    """The numbers of frames: their index, those in their names, or their order."""
-    for key in _INDEXES:
-        indexes = [frame.get(key) for frame in frames]
-        numbers = [int(index) for index in indexes if index is not None and is_number(index) and 0 <= index < 2**31]
-        if len(set(numbers)) == len(frames):
-            return numbers
-    names = [str(frame.get("name", "")).rpartition("-")[2] for frame in frames]
-    return numbers_of_names(names) or list(range(len(frames)))

@@ -18,14 +18,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.exchange.gathered import GatheredRows
+from mcaptrack.extensions.exchange.gathered import GatheredRows, as_float, frame_numbers, is_number
 from mcaptrack.extensions.exchange.masks import box_of_mask
 from mcaptrack.files import visible
 from mcaptrack.schema.classes import UNKNOWN
 from mcaptrack.sources.box_files import BoxFile, ExportedBoxes
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, as_float, is_count, is_number, numbers_of_names
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, is_count
 
 _MAX_CLASSES: Final = 65536
 #: The largest number of other files beside results in which their images are looked up.
@@ -37,6 +37,7 @@ _VIDEOS: Final = ("video_id", "vid_id")
 #: The attribute that is false for a box that was filled in.
 _OBSERVED: Final = "observed"
 _BY_LIST: Final = "the list `images`"
+_BY: Final = {"names": "the numbers in file_name", "order": _BY_LIST}
 #: Keys with which annotations begin.
 _BEGIN: Final = tuple(
     f'"{key}"'.encode() for key in ("images", "annotations", "categories", "info", "licenses", "videos")
@@ -226,9 +227,9 @@ class _Images(NamedTuple):
         videos = {_key(image[key]) for image in images for key in _VIDEOS if key in image}
         if len(videos) > 1:
             raise McaptrackError(f"{path} holds {len(videos)} videos (video_id); give one file for each of them")
-        frames, order = _frames(images)
+        frames, by = frame_numbers([image.get("file_name") for image in images], images, _FRAMES)
         by_id = dict(zip(ids, frames, strict=True))
-        return cls(path, images, by_id, order, _categories(path, content.get("categories")))
+        return cls(path, images, by_id, _BY.get(by, by), _categories(path, content.get("categories")))
 
     def describe(self, table: BoxTable, named_by: str) -> None:
         """Set the facts that a table has from them: its first frame, sizes of pictures and names of classes."""
@@ -250,20 +251,6 @@ class _Images(NamedTuple):
 def _key(value: Any) -> str:
     """The id of an image or a video as text; 1.0, as pandas writes it, is 1."""
     return str(int(value) if isinstance(value, float) and value.is_integer() else value)[:MAX_NAME]
-
-
-def _frames(images: list[dict[str, Any]]) -> tuple[list[int], str]:
-    """The frame numbers of images, and what they are from: a field, the numbers in names, or the order in the list."""
-    for key in _FRAMES:
-        values = [image.get(key) for image in images]
-        numbers = [number for number in values if isinstance(number, int) and 0 <= number < 2**31]
-        if len(numbers) == len(values) and len(set(numbers)) == len(numbers):
-            return numbers, key
-    names = [name for name in (image.get("file_name") for image in images) if isinstance(name, str)]
-    numbered = numbers_of_names(names) if len(names) == len(images) else None
-    if numbered is not None:
-        return numbered, "the numbers in file_name"
-    return list(range(len(images))), _BY_LIST
 
 
 def _categories(path: Path, categories: Any) -> dict[int, str] | None:

@@ -5,21 +5,42 @@ Letters: N rows, C numbers of a box.
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.sources.ingest.labels.table import NO_ID, NOTHING, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_ROWS, ClassNames, TrackIds, as_float, is_count, is_number
+from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_ID, NOTHING, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_ROWS, ClassNames, FrameNames, TrackIds, is_count
 
 _LISTED: Final = 10
 
 Part = TypeVar("Part")
+
+
+class FrameNumbers(NamedTuple):
+    """The numbers of frames, and what they are by: a key, "names" or "order"."""
+
+    numbers: list[int]
+    by: str
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of JSON is a number."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def as_float(value: float) -> float:
+    """A number of JSON, also one that is too large."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
 
 
 class GatheredRows:
@@ -114,3 +135,22 @@ def chosen_part(path: Path, parts: Mapping[str, Part], wanted: str | None, noun:
         listed = list_names(sorted(parts), _LISTED)
         raise McaptrackError(f"{path} has {what}{where}; choose one with `scene=`: {listed}")
     return parts[wanted]
+
+
+def frame_numbers(names: Sequence[Any], entries: Sequence[Any] = (), keys: Sequence[str] = ()) -> FrameNumbers:
+    """The frame numbers of pictures by the first of ``keys`` with another number in each of ``entries``, or those in
+    their ``names`` if all have one of one sequence, or their order.
+    """
+    for key in keys:
+        values = [entry.get(key) for entry in entries]
+        numbers = [int(n) for n in values if is_number(n) and 0 <= n <= MAX_FRAME and n == int(n)]
+        if len({*numbers}) == len(entries):
+            return FrameNumbers(numbers, key)
+    reader = FrameNames()
+    try:
+        numbers = [reader.number(name) for name in names]
+    except (AttributeError, TypeError, ValueError):
+        numbers = []
+    if numbers and len({*numbers}) == len(names) and max(numbers) <= MAX_FRAME:
+        return FrameNumbers(numbers, "names")
+    return FrameNumbers([*range(len(names))], "order")

@@ -11,10 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.exchange.gathered import GatheredRows
+from mcaptrack.extensions.exchange.gathered import GatheredRows, frame_numbers
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import numbers_of_names
 
 _IN_SPACE: Final = ("cx", "cy", "cz", "l", "w", "h", "rot_z")
 
@@ -40,7 +39,7 @@ class Jrdb(Format):
         if not self.recognises(file):
             raise McaptrackError(f"{file.path} is no JSON of labels by names of files, as JRDB has")
         labels: dict[str, Any] = file.json["labels"]
-        numbers = numbers_of_names([*labels]) or list(range(len(labels)))
+        numbers = frame_numbers([*labels]).numbers
         facts = LabelFacts(file.path, first_frame=0, states_labelled=True, not_counting="no_eval")
         facts.labelled = np.array(sorted(numbers), np.int64)
         rows, in_space = GatheredRows(facts, "label"), self.holds_3d(file, {})

@@ -12,10 +12,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.extensions.exchange.gathered import GatheredRows, chosen_part
+from mcaptrack.extensions.exchange.gathered import GatheredRows, chosen_part, is_number
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, is_number
+from mcaptrack.sources.ingest.labels.text import MAX_ROWS
 
 _TYPE: Final = "videorectangle"
 _BOX: Final = ("frame", "x", "y", "width", "height")

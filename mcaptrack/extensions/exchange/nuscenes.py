@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.exchange.gathered import chosen_part
+from mcaptrack.extensions.exchange.gathered import as_float, chosen_part
 from mcaptrack.files import read_json
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_WHOLE, ClassNames, as_float, headings, numbered
+from mcaptrack.sources.ingest.labels.text import ClassNames, headings, numbered
 
 TABLES: Final = ("scene", "sample", "sample_annotation", "instance", "category")
 #: The classes of the detection and tracking tasks, and the categories that they consist of.
@@ -33,6 +33,8 @@ _CLASSES: Final = {
 }
 _CLASS_OF: Final = {category: name for name, categories in _CLASSES.items() for category in categories}
 _NS_PER_US: Final = 1000
+#: Whole numbers can't be larger: as microseconds they are times.
+_MAX_WHOLE: Final = 2**53
 _MAX_BYTES: Final = 4 * 2**30
 #: The frame of reference, by the name that converters to MCAP give it.
 FRAME: Final = "map"
@@ -153,7 +155,7 @@ def _text(folder: Path, table: str, row: Mapping[str, Any], key: str) -> str:
 
 def _number(folder: Path, table: str, row: Mapping[str, Any], key: str) -> int:
     value = row.get(key)
-    if isinstance(value, bool) or not isinstance(value, int) or abs(value) > MAX_WHOLE:
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) > _MAX_WHOLE:
         raise McaptrackError(f"{folder / table}.json: {key} has to be a whole number, not {str(value)[:40]!r}")
     return value
 

@@ -15,17 +15,17 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.exchange.gathered import GatheredRows
+from mcaptrack.extensions.exchange.gathered import GatheredRows, frame_numbers
 from mcaptrack.files import visible
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import numbers_of_names
 from mcaptrack.sources.video.image_folder import natural_order
 
 _MAX_PICTURES: Final = 1_000_000
 _MAX_NAME: Final = 256
 #: The name of regions in which boxes don't count.
 _REGION: Final = "dontcare"
+_BY: Final = {"names": "the numbers in their names", "order": "their order"}
 _WHOLE: Final = re.compile(r"-?\d{1,15}")
 
 
@@ -104,15 +104,14 @@ class PictureFormat(Format):
             where = f"{file.path}: {self.where}" if self.where else f"{file.path}"
             raise McaptrackError(f"{where}: not {self.title} ({self.row.strip('`')}): {text[:200]}") from None
         table = rows.table()
-        numbers = numbers_of_names([picture.name for picture in pictures])
-        by = "the numbers in their names" if numbers else "their order"
-        frames = np.array(numbers or range(len(pictures)), np.int64)
+        numbers, by = frame_numbers([picture.name for picture in pictures])
+        frames = np.array(numbers, np.int64)
         table.frame, facts.labelled = frames[table.frame.astype(np.int64)], np.unique(frames)
         facts.first_frame, facts.is_first_assumed = int(frames.min()), int(frames.min()) > 0
         facts.region = "DontCare" if table.aside is not None else ""
         sizes = ((frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True))
         facts.measure({frame: size for frame, size in sizes if size is not None}, len(pictures))
-        table.remark(f": {len(pictures)} pictures, frames are numbered by {by}")
+        table.remark(f": {len(pictures)} pictures, frames are numbered by {_BY[by]}")
         if other:
             counted = ", ".join(f"{count} {kind}" for kind, count in other.most_common())
             table.find(f": left out are shapes that are no boxes: {counted}")

@@ -9,10 +9,9 @@ from fractions import Fraction
 from typing import Any
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.exchange.gathered import GatheredRows
+from mcaptrack.extensions.exchange.gathered import GatheredRows, is_number
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import is_number
 
 
 class TrajnetPP(Format):

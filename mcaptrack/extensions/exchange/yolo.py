@@ -14,12 +14,13 @@ import numpy as np
 
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.exchange.gathered import frame_numbers
 from mcaptrack.files import visible
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, numbers_of_names, read_numbers, states_number
+from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, read_numbers, states_number
 from mcaptrack.sources.video.image_folder import natural_order
 
 _READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
@@ -64,10 +65,8 @@ class Yolo(Format):
             raise McaptrackError(f"{folder} holds no label files (*.txt)")
         if len(files) > _MAX_FILES:
             raise McaptrackError(f"{folder} holds {len(files)} label files; at most {_MAX_FILES} are read")
-        numbers = numbers_of_names([path.name for path in files])
-        by = "their names" if numbers else "their order"
-        remarks = [f"{folder}: {len(files)} files, frames are numbered by {by}"]
-        numbers = numbers or list(range(len(files)))
+        numbers, by = frame_numbers([path.name for path in files])
+        remarks = [f"{folder}: {len(files)} files, frames are numbered by their {by}"]
         parts = [read_numbers(path, lines_of(path), _ROW, 7, _parse, str.split) for path in files]
         counts = [len(part.values) for part in parts]
         ends = np.cumsum(counts)
