@@ -75,7 +75,7 @@ class _Rows(GatheredRows):
 
     def __init__(self, path: Path, noun: str) -> None:
         super().__init__(LabelFacts(path, region="iscrowd"), noun)
-        self.outlined, self.masks = 0, 0
+        self.around = Counter[str]()
 
     def add_entry(self, number: int, entry: Any, frame_of: Callable[[Any], float]) -> None:
         """Add an annotation or a result. Raises McaptrackError if something is missing or of the wrong type."""
@@ -105,26 +105,24 @@ class _Rows(GatheredRows):
     def _around(self, number: int, outline: Any) -> list[float] | None:
         """The box around polygons, [x, y, x, y, ...] each; None without any."""
         if isinstance(outline, dict):
-            self.masks += 1
+            self.around["masks"] += 1
             try:
                 return box_of_mask(outline)
             except (KeyError, TypeError, ValueError) as error:
                 raise self.refuse(number, f"has no bbox, and a mask that can't be read: {error}") from None
-        flat = [part for part in outline if isinstance(part, list)] if isinstance(outline, list) else []
-        points = [value for part in flat for value in part[: len(part) // 2 * 2]]
+        parts = [part for part in outline if isinstance(part, list)] if isinstance(outline, list) else []
+        points = [value for part in parts for value in part[: len(part) // 2 * 2]]
         if not points or not all(map(is_number, points)):
             return None
-        self.outlined += 1
-        x, y = ([as_float(value) for part in flat for value in part[axis : len(part) // 2 * 2 : 2]] for axis in (0, 1))
+        self.around["polygons"] += 1
+        x, y = ([*map(as_float, points[axis::2])] for axis in (0, 1))
         return [min(x), min(y), max(x) - min(x), max(y) - min(y)]
 
     def table(self) -> BoxTable:
         """All rows."""
         table = super().table()
-        if self.outlined:
-            table.remark(f": {self.outlined} boxes are those around polygons, which have no bbox")
-        if self.masks:
-            table.remark(f": {self.masks} boxes are those around masks, which have no bbox")
+        for what, count in sorted(self.around.items(), reverse=True):
+            table.remark(f": {count} boxes are those around {what}, which have no bbox")
         return table
 
 

@@ -162,8 +162,8 @@ class KittiFrames(PictureFormat):
 # Boxes of a channel.
 
 
-#: What KITTI's tools write for numbers that are not known: angle, size and position of a 3D box, rotation.
-_KITTI_UNKNOWN: Final = "-10 {box} -1 -1 -1 -1000 -1000 -1000 -10"
+#: What KITTI's tools write for numbers that are not known: size and position of a 3D box, rotation.
+_UNKNOWN: Final = "-1 -1 -1 -1000 -1000 -1000 -10"
 
 
 class KittiFile(BoxFile):
@@ -178,8 +178,8 @@ class KittiFile(BoxFile):
 
         def line(frame: int, track: int, name: str, box: list[float], score: np.float32) -> str:
             x, y, w, h = box
-            unknown = _KITTI_UNKNOWN.format(box=f"{x!r} {y!r} {x + w!r} {y + h!r}")
-            return f"{frame} {track} {name} 0 0 {unknown}{f' {score_text(score) or 1}' if has_scores else ''}\n"
+            corners, own = f"{x!r} {y!r} {x + w!r} {y + h!r}", f" {score_text(score) or 1}" if has_scores else ""
+            return f"{frame} {track} {name} 0 0 -10 {corners} {_UNKNOWN}{own}\n"
 
         columns = (boxes.frame.tolist(), boxes.id.tolist(), boxes.class_id.tolist(), boxes.boxes.tolist(), boxes.score)
         yield from joined_lines(

@@ -15,32 +15,26 @@ import numpy as np
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange.gathered import frame_numbers
-from mcaptrack.files import visible
+from mcaptrack.extensions.exchange.pictures import files_in
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
 from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, read_numbers, states_number
-from mcaptrack.sources.video.image_folder import natural_order
 
 _READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
 _NOT_LABELS: Final = (*LISTS, *_READMES, "train.txt", "val.txt", "test.txt")
 #: So many files of a folder tell whether it is of this kind.
 _LOOKED_AT: Final = 100
-_MAX_FILES: Final = 1_000_000
 _ROW: Final = "YOLO (class x y width height [confidence] [id])"
 
 
 def _label_files(folder: Path) -> list[Path]:
     """The label files of a folder, or of its subfolder "labels", in natural order; none if there are none."""
     for place in (folder, folder / "labels"):
-        try:
-            files = [path for path in visible(place.iterdir()) if path.suffix.lower() == ".txt"]
-        except OSError:
-            continue
-        files = [path for path in files if path.name.lower() not in _NOT_LABELS]
-        if files:
-            return sorted(files, key=natural_order)
+        files = files_in(place, ".txt") if place.is_dir() else []
+        if files := [path for path in files if path.name.lower() not in _NOT_LABELS]:
+            return files
     return []
 
 
@@ -63,8 +57,6 @@ class Yolo(Format):
         folder, files = file.path, _label_files(file.path)
         if not files:
             raise McaptrackError(f"{folder} holds no label files (*.txt)")
-        if len(files) > _MAX_FILES:
-            raise McaptrackError(f"{folder} holds {len(files)} label files; at most {_MAX_FILES} are read")
         numbers, by = frame_numbers([path.name for path in files])
         remarks = [f"{folder}: {len(files)} files, frames are numbered by their {by}"]
         parts = [read_numbers(path, lines_of(path), _ROW, 7, _parse, str.split) for path in files]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.exchange import yolo
+from mcaptrack.extensions.exchange import pictures, yolo
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from tests.label_cases import Row, Writer, by_frame, number, shares
 
@@ -113,11 +113,11 @@ def test_a_folder_of_labels_has_no_more_than_its_limits(tmp_path, monkeypatch):
     folder_of(tmp_path, {"b.txt": ROW, "a.txt": f"{ROW}\n", "readme.txt": "x"})
     assert read_labels(tmp_path, role="detections").remarks[0].endswith("2 files, frames are numbered by their order")
     monkeypatch.setattr(yolo, "MAX_ROWS", 2)
-    monkeypatch.setattr(yolo, "_MAX_FILES", 2)
+    monkeypatch.setattr(pictures, "_MAX_PICTURES", 3)
     assert len(read_labels(tmp_path, role="detections").frame) == 2
     (tmp_path / "a.txt").write_text(f"{ROW}\n{ROW}")
     with pytest.raises(McaptrackError, match="has more than 2 rows; give it in parts"):
         read_labels(tmp_path, role="detections")
     (tmp_path / "c.txt").write_text("")
-    with pytest.raises(McaptrackError, match="holds 3 label files; at most 2 are read"):
+    with pytest.raises(McaptrackError, match="holds 4 label files; at most 3 are read"):
         read_labels(tmp_path, role="detections")
