@@ -115,7 +115,11 @@ def test_kitti_counts_pedestrians_and_ignores_its_regions(tmp_path):
         truth += [line_of(n, 1, "Pedestrian", 10), line_of(n, 2, "Car", 100), line_of(n, 3, "Person_sitting", 200)]
         truth += [line_of(n, 4, "Pedestrian", 300, occluded=3), line_of(n, -1, "DontCare", 400, height=300)]
         found += [line_of(n, who, "Pedestrian", x, more=(0.9,)) for who, x in ((1, 10), (2, 100), (3, 200), (4, 300))]
-        found += [line_of(n, 5, "Pedestrian", 402), line_of(n, 6, "Pedestrian", 600, height=20.0), line_of(n, 7, "Car", 700)]
+        found += [
+            line_of(n, 5, "Pedestrian", 402),
+            line_of(n, 6, "Pedestrian", 600, height=20.0),
+            line_of(n, 7, "Car", 700),
+        ]
     a, b = tmp_path / "t.txt", tmp_path / "gt.txt"
     a.write_text("\n".join(found))
     b.write_text("\n".join(truth))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ import numpy as np
 import pytest
 
 from mcaptrack.extensions.exchange.masks import box_of_mask
+from mcaptrack.registry import own_names
+from mcaptrack.sources.ingest.labels import of_packages
 from mcaptrack.sources.ingest.labels.reading import label_file, read_labels
+from tests.label_cases import WALK, writers
 from tests.test_labels_of_others import (
     ALL,
     NEITHER,
@@ -278,3 +282,16 @@ def test_one_of_several_splits_is_given(tmp_path):
     assert label_file(path).path == path / "labels/train"
     words = "holds labels in 2 places, labels/train, labels/val; give one of them"
     assert_not_read("a/labels/val/p0.txt", row, words, tmp_path)
+
+
+WRITERS = writers()
+
+
+@pytest.mark.parametrize("names", permutations(("voc", "labelme", "kitti-frames"), 2))
+def test_a_folder_with_files_of_two_formats_is_of_the_one_of_less_rank(names, tmp_path, monkeypatch):
+    for name in names:
+        WRITERS[name].write(tmp_path, WALK)
+    order = ("voc", "labelme", "kitti-frames")
+    assert read_labels(tmp_path / "a", role="detections").format == min(names, key=order.index)
+    monkeypatch.setattr(of_packages, "own_names", lambda kind: own_names(kind)[::-1])
+    assert read_labels(tmp_path / "a", role="detections").format == min(names, key=order.index)
