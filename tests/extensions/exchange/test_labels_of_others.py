@@ -287,7 +287,7 @@ def test_one_of_several_splits_is_given(tmp_path):
 WRITERS = writers()
 
 
-@pytest.mark.parametrize("names", permutations(("voc", "labelme", "kitti-frames"), 2))
+@pytest.mark.parametrize("names", [*permutations(("voc", "labelme", "kitti-frames"), 2)])
 def test_a_folder_with_files_of_two_formats_is_of_the_one_of_less_rank(names, tmp_path, monkeypatch):
     for name in names:
         WRITERS[name].write(tmp_path, WALK)
