@@ -17,7 +17,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import own_names
+from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, OF_SOURCE
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 from mcaptrack.sources.ingest.labels.table import BoxTable
@@ -79,7 +79,7 @@ BROKEN: dict[str, list[tuple[list[Row], str, str, str]]] = {
 
 
 def test_every_format_and_every_check_is_here():
-    assert set(WRITERS) == set(own_names("label_format"))
+    assert set(WRITERS) == set(own("label_format"))
     assert set(BROKEN) == {*OF_SOURCE, *OF_ROLE, "classes"}
 
 

@@ -14,7 +14,7 @@ from mcaptrack import tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_files
 from mcaptrack.notices import collected
-from mcaptrack.registry import own_names
+from mcaptrack.registry import own
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.sources.ingest.labels.frames import Frames
@@ -228,7 +228,7 @@ FORMATS = {
     "sdd": "".join(f'1 1 1 5 9 {n} 0 0 0 "Pedestrian"\n' for n in (0, 10)),
     "trajnet": "0 1 1 1\n10 1 1 1\n",
 }
-FORMATS = {name: text for name, text in FORMATS.items() if name in own_names("label_format")}
+FORMATS = {name: text for name, text in FORMATS.items() if name in own("label_format")}
 
 
 @pytest.mark.parametrize(("found", "truth"), [*product(FORMATS, FORMATS)])

@@ -15,7 +15,7 @@ from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
 from mcaptrack.installed import missing_parts
-from mcaptrack.registry import own_names
+from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels import text as texts
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
@@ -120,7 +120,7 @@ def written(path: Path, text: str) -> Path:
 
 
 #: All formats.
-FORMATS = ", ".join(own_names("label_format"))
+FORMATS = ", ".join(own("label_format"))
 #: What is said of those that aren't there.
 OTHERS = "".join(f"; {text}" for text in [missing_parts("label_format")] if text)
 #: The first row of a file, and what it is taken for; None for no format.

@@ -121,9 +121,9 @@ def class_limits() -> str:
 
 def label_formats() -> str:
     """The formats of label files, of the core and of extensions, as a table in Markdown."""
-    from mcaptrack.registry import find, own_names
+    from mcaptrack.registry import find, own
 
-    forms = {name: find("label_format", name).cls for name in own_names("label_format")}
+    forms = {name: find("label_format", name).cls for name in own("label_format")}
     rows = (f"| `{name}` | {form.title} | {form.row} |" for name, form in forms.items())
     return "\n".join(["| `--format` | | a row, or a file |", "|---|---|---|", *rows])
 

@@ -215,9 +215,9 @@ def names(kind: Kind) -> tuple[str, ...]:
     return (*BUILT_IN[kind], *sorted({point.name for point in points(kind)}))
 
 
-def own_names(kind: Kind) -> tuple[str, ...]:
-    """The names of what mcaptrack itself has of a kind, in the core and in extensions. Imports nothing."""
-    return (*BUILT_IN[kind], *sorted({point.name for point in points(kind) if point.is_own}))
+def own(kind: Kind) -> dict[str, str]:
+    """Module and class of what mcaptrack itself has of a kind, in the core and in extensions, by name."""
+    return {**BUILT_IN[kind], **{point.name: point.value for point in sorted(points(kind)) if point.is_own}}
 
 
 def points(kind: Kind) -> list[Point]:

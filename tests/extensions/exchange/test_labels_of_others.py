@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.extensions.exchange.masks import box_of_mask
-from mcaptrack.registry import own_names
+from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels import of_packages
 from mcaptrack.sources.ingest.labels.reading import label_file, read_labels
 from tests.label_cases import WALK, writers
@@ -293,5 +293,5 @@ def test_a_folder_with_files_of_two_formats_is_of_the_one_of_less_rank(names, tm
         WRITERS[name].write(tmp_path, WALK)
     order = ("voc", "labelme", "kitti-frames")
     assert read_labels(tmp_path / "a", role="detections").format == min(names, key=order.index)
-    monkeypatch.setattr(of_packages, "own_names", lambda kind: own_names(kind)[::-1])
+    monkeypatch.setattr(of_packages, "own", lambda kind: dict(reversed(own(kind).items())))
     assert read_labels(tmp_path / "a", role="detections").format == min(names, key=order.index)

@@ -18,7 +18,7 @@ from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.registry import Entry, blamed, find, names, own_names
+from mcaptrack.registry import Entry, blamed, find, load, names, own
 from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
@@ -178,7 +178,7 @@ def format_named(name: str) -> Format:
 def own_formats() -> list[Format]:
     """The formats of mcaptrack, of the core and of extensions, in the order in which they are asked about a file."""
     formats = []
-    for name, cls in _own_classes(own_names(_KIND)):
+    for name, cls in _classes(tuple(own(_KIND).items())):
         made = cls()
         made.name = name
         formats.append(made)
@@ -186,8 +186,8 @@ def own_formats() -> list[Format]:
 
 
 @lru_cache(maxsize=4)
-def _own_classes(names: tuple[str, ...]) -> list[tuple[str, type[Format]]]:
-    classes = [(name, find(_KIND, name).cls) for name in names]
+def _classes(formats: tuple[tuple[str, str], ...]) -> list[tuple[str, type[Format]]]:
+    classes = [(name, load(name, value)) for name, value in formats]
     return sorted(classes, key=lambda entry: (entry[1].rank, entry[0]))
 
 
@@ -202,7 +202,7 @@ def recognised(file: LabelFile) -> Format | None:
     Raises McaptrackError if several say so.
     """
     formats: dict[str, Format] = {}
-    for name in sorted({*names(_KIND)} - {*own_names(_KIND)}):
+    for name in sorted({*names(_KIND)} - {*own(_KIND)}):
         try:
             made = format_named(name)
             formats |= {name: made} if made.recognises(file) else {}
