@@ -178,7 +178,7 @@ def format_named(name: str) -> Format:
 def own_formats() -> list[Format]:
     """The formats of mcaptrack, of the core and of extensions, in the order in which they are asked about a file."""
     formats = []
-    for name, cls in _classes(tuple(own(_KIND).items())):
+    for name, cls in _own_classes(tuple(own(_KIND).items())):
         made = cls()
         made.name = name
         formats.append(made)
@@ -186,7 +186,7 @@ def own_formats() -> list[Format]:
 
 
 @lru_cache(maxsize=4)
-def _classes(formats: tuple[tuple[str, str], ...]) -> list[tuple[str, type[Format]]]:
+def _own_classes(formats: tuple[tuple[str, str], ...]) -> list[tuple[str, type[Format]]]:
     classes = [(name, load(name, value)) for name, value in formats]
     return sorted(classes, key=lambda entry: (entry[1].rank, entry[0]))
 
