@@ -16,6 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange import cvat
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames
+from mcaptrack.sources.ingest.label_job import with_new_ids
 from mcaptrack.sources.ingest.labels import text as texts
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
@@ -275,3 +276,18 @@ def test_corrections_made_in_cvat_come_back_and_run_keeps_them(template, tmp_pat
         assert opened.rows("/camera/retracks", TRACKS).rows.tobytes() == (
             first.rows("/camera/retracks", TRACKS).rows.tobytes()
         )
+
+
+def test_parts_of_tracks_get_ids_that_no_track_of_the_log_has(template, tmp_path):
+    box = '<box frame="{}" xtl="1" ytl="1" xbr="9" ybr="9"><attribute name="track_id">0</attribute></box>'
+    parts = "".join(f'<track label="person">{box.format(k)}</track>' for k in (3, 7, 9))
+    (tmp_path / "a.xml").write_text(f"<annotations>{parts}</annotations>")
+    labels = read_labels(tmp_path / "a.xml", role="corrections")
+    assert sorted(labels.id.tolist()) == [0, 1, 2]
+    with log.read(Path(template)) as opened:
+        found = with_new_ids(opened, "/camera", labels)
+        topics = "/camera/tracks", "/camera/retracks/full"
+        used = {one for topic in topics for one in opened.rows(topic, TRACKS).rows["track_id"].tolist()}
+    assert 1 in used
+    assert (found.id[0], len(np.unique(found.id))) == (0, 3)
+    assert not used & set(found.id[1:].tolist())
