@@ -34,7 +34,7 @@ class Bdd(Format):
             raise McaptrackError(f"{file.path} is no JSON of frames with a name and labels, as BDD100K has")
         frames, facts = _of_video(file, asked.scene), LabelFacts(file.path, states_labelled=True)
         names = [str(frame.get("name", "")).rpartition("-")[2] for frame in frames]
-        numbers = frame_numbers(names, frames, _INDEXES).numbers
+        numbers, _ = frame_numbers(names, frames, _INDEXES)
         facts.labelled, facts.region = np.array(sorted(numbers), np.int64), "crowd"
         facts.first_frame, facts.is_first_assumed = min(numbers), min(numbers) > 0
         rows, others = GatheredRows(facts, "label"), 0

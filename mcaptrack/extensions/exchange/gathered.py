@@ -9,7 +9,7 @@ import math
 from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -21,13 +21,6 @@ from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_ROWS, ClassNames,
 _LISTED: Final = 10
 
 Part = TypeVar("Part")
-
-
-class FrameNumbers(NamedTuple):
-    """The numbers of frames, and what they are by: a key, "names" or "order"."""
-
-    numbers: list[int]
-    by: str
 
 
 def is_number(value: Any) -> bool:
@@ -137,20 +130,20 @@ def chosen_part(path: Path, parts: Mapping[str, Part], wanted: str | None, noun:
     return parts[wanted]
 
 
-def frame_numbers(names: Sequence[Any], entries: Sequence[Any] = (), keys: Sequence[str] = ()) -> FrameNumbers:
+def frame_numbers(names: Sequence[Any], entries: Sequence[Any] = (), keys: Sequence[str] = ()) -> tuple[list[int], str]:
     """The frame numbers of pictures by the first of ``keys`` with another number in each of ``entries``, or those in
-    their ``names`` if all have one of one sequence, or their order.
+    their ``names`` if all have one of one sequence, or their order; and which it is: the key, "names" or "order".
     """
     for key in keys:
         values = [entry.get(key) for entry in entries]
         numbers = [int(n) for n in values if is_number(n) and 0 <= n <= MAX_FRAME and n == int(n)]
         if len({*numbers}) == len(entries):
-            return FrameNumbers(numbers, key)
+            return numbers, key
     reader = FrameNames()
     try:
         numbers = [reader.number(name) for name in names]
     except (AttributeError, TypeError, ValueError):
         numbers = []
     if numbers and len({*numbers}) == len(names) and max(numbers) <= MAX_FRAME:
-        return FrameNumbers(numbers, "names")
-    return FrameNumbers([*range(len(names))], "order")
+        return numbers, "names"
+    return [*range(len(names))], "order"

@@ -39,7 +39,7 @@ class Jrdb(Format):
         if not self.recognises(file):
             raise McaptrackError(f"{file.path} is no JSON of labels by names of files, as JRDB has")
         labels: dict[str, Any] = file.json["labels"]
-        numbers = frame_numbers([*labels]).numbers
+        numbers, _ = frame_numbers([*labels])
         facts = LabelFacts(file.path, first_frame=0, states_labelled=True, not_counting="no_eval")
         facts.labelled = np.array(sorted(numbers), np.int64)
         rows, in_space = GatheredRows(facts, "label"), self.holds_3d(file, {})
