@@ -79,9 +79,22 @@ def missing_extension(name: str, kind: str = "name", what: str = "") -> str:
 
 
 def missing_names(kind: str) -> list[str]:
-    """The names of a kind that are of extensions which aren't installed, by the comments of the stub."""
-    names = re.findall(rf"^# {kind} (\S+): {_PLACE}$", _stub(), re.M)
-    return [name for name, extension in names if not _is_extension(extension)]
+    """The names of a kind that are of extensions which aren't installed."""
+    return [name for name, _ in _missing(kind)]
+
+
+def missing_parts(kind: str) -> str:
+    """Say which names of a kind extensions have that aren't installed, and what to do; "" if there are none."""
+    missing = _missing(kind)
+    folders = " and ".join(sorted({f"mcaptrack/extensions/{extension}" for _, extension in missing}))
+    names = ", ".join(name for name, _ in missing)
+    return f"{names} are of an extension that isn't installed; install mcaptrack again, with {folders}" if names else ""
+
+
+def _missing(kind: str) -> list[tuple[str, str]]:
+    """Names of a kind, by the comments of the stub, and their extensions, which aren't installed."""
+    named = re.findall(rf"^# {kind} (\S+): {_PLACE}$", _stub(), re.M)
+    return [(name, extension) for name, extension in named if not _is_extension(extension)]
 
 
 def _stub() -> str:

@@ -6,409 +6,27 @@ speaks: with its code, or with an error. A format without a writer, and a check 
 
 from __future__ import annotations
 
-import json
 import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-from pyarrow import feather
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN
+from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, OF_SOURCE
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 from mcaptrack.sources.ingest.labels.table import BoxTable
+from tests.label_cases import WALK, Row, writers
 
 NAN = math.nan
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of labels, as it is in a picture, as a position and as a box in space."""
-
-    frame: int = 0
-    id: int | None = 1
-    box: tuple[float, ...] = (10, 20, 30, 60)
-    xy: tuple[float, ...] = (1.5, 2.5)
-    size: tuple[float, ...] = (0.5, 0.5, 1.8)
-    heading: float = 0.25
-    score: float | None = 0.5
-    kind: str | None = "person"
-
-
-@dataclass(frozen=True)
-class Writer:
-    """A writer of a format: ``write`` rows to a folder, and the columns that the format lacks.
-
-    ``kind`` is "box", "xy" or "space"; ``names``: classes are names, and no numbers; ``size``: the file states that of
-    its pictures, 640x480; ``tracks``: it has ids.
-    """
-
-    write: Callable[[Path, Sequence[Row]], Path]
-    lacks: str = ""
-    kind: str = "box"
-    names: bool = True
-    size: bool = False
-    tracks: bool = True
-
-
-def text(line: Callable[[Row], str], head: str = "", name: str = "a.txt") -> Callable[[Path, Sequence[Row]], Path]:
-    def write(folder: Path, rows: Sequence[Row]) -> Path:
-        path = folder / name
-        path.write_text("\n".join([*([head] if head else []), *(line(row) for row in rows)]) + "\n")
-        return path
-
-    return write
-
-
-def as_json(content: Callable[[Sequence[Row]], Any]) -> Callable[[Path, Sequence[Row]], Path]:
-    def write(folder: Path, rows: Sequence[Row]) -> Path:
-        path = folder / "a.json"
-        path.write_text(json.dumps(content(rows)))
-        return path
-
-    return write
-
-
-def number(value: float | None, missing: str = "") -> str:
-    return missing if value is None else f"{value:g}"
-
-
-def corners(row: Row) -> tuple[float, ...]:
-    left, top, width, height = row.box
-    return left, top, left + width, top + height
-
-
-def by_frame(rows: Sequence[Row]) -> dict[int, list[Row]]:
-    return {frame: [row for row in rows if row.frame == frame] for frame in sorted({row.frame for row in rows})}
-
-
-def kitti(row: Row) -> str:
-    boxes = " ".join(map(number, corners(row)))
-    length, width, height = row.size
-    space = f"{height} {width} {length} {-row.xy[1]} 0 {row.xy[0]} {-row.heading - math.pi / 2}"
-    who = {"person": "Pedestrian"}.get(row.kind, row.kind)
-    return f"{row.frame} {number(row.id, '-1')} {who} 0 0 0 {boxes} {space} {number(row.score)}"
-
-
-def coco(rows: Sequence[Row]) -> Any:
-    kinds = {"person": 1, "77": 77, None: None}
-    images = [{"id": n, "frame_id": n, "width": 640, "height": 480} for n in sorted({row.frame for row in rows})]
-    entries = [
-        {"image_id": row.frame, "track_id": row.id, "bbox": list(row.box), "score": row.score, "category_id": kinds[row.kind]}
-        for row in rows
-    ]  # fmt: skip
-    return {"images": images, "annotations": entries, "categories": [{"id": 1, "name": "person"}]}
-
-
-def cvat(folder: Path, rows: Sequence[Row]) -> Path:
-    """Tracks, whose attribute is the id; a row without one is a track of its own."""
-    frames = by_frame(rows)
-    parts = ["<annotations><meta><task><size>99</size></task></meta>"]
-    for frame, mine in frames.items():
-        for row in mine:
-            left, top, right, bottom = corners(row)
-            own = "" if row.id is None else f'<attribute name="track_id">{row.id}</attribute>'
-            parts.append(
-                f'<image id="{frame}" width="640" height="480"><box label="{row.kind or ""}" xtl="{left}" ytl="{top}" xbr="{right}" '
-                f'ybr="{bottom}">{own}</box></image>'
-                if frame not in frames or len(mine) == 1
-                else f'<box label="{row.kind or ""}" xtl="{left}" ytl="{top}" xbr="{right}" ybr="{bottom}">{own}</box>'
-            )
-        if len(mine) > 1:
-            parts[-len(mine)] = f'<image id="{frame}" width="640" height="480">' + parts[-len(mine)]
-            parts[-1] += "</image>"
-    path = folder / "a.xml"
-    path.write_text("".join(parts) + "</annotations>")
-    return path
-
-
-def shares(row: Row) -> tuple[float, ...]:
-    """Centre and size of a box as shares of 640x480; those that are shares are far too large then."""
-    left, top, width, height = row.box
-    across, down = (1, 1) if width <= 2 else (640, 480)
-    return (left + width / 2) / across, (top + height / 2) / down, width / across, height / down
-
-
-def yolo(folder: Path, rows: Sequence[Row]) -> Path:
-    """Shares of 640x480 of boxes in pixels; those that are shares are far too large then."""
-    (folder / "labels").mkdir(exist_ok=True)
-    for frame, mine in by_frame(rows).items():
-        lines = []
-        for row in mine:
-            place = shares(row)
-            kind = {"person": "0", "77": "77"}.get(row.kind, "-1")
-            lines.append(f"{kind} {' '.join(map(str, place))} {number(row.score, '1')} {number(row.id, '-1')}")
-        (folder / "labels" / f"{frame:06}.txt").write_text("\n".join(lines))
-    if not any(row.kind == "77" for row in rows):
-        (folder / "classes.txt").write_text("person\n")
-    return folder / "labels"
-
-
-def label_studio(rows: Sequence[Row]) -> Any:
-    results = []
-    for order, row in enumerate(rows):
-        left, top, width, height = (
-            100 * part / whole for part, whole in zip(row.box, (640, 480, 640, 480), strict=True)
-        )
-        if row.box[2] <= 2:
-            left, top, width, height = (100 * part for part in row.box)
-        place = {"frame": row.frame, "enabled": False, "x": left, "y": top, "width": width, "height": height}
-        value = {"framesCount": 99, "duration": 9.9, "sequence": [place], "labels": [row.kind] if row.kind else []}
-        results.append({"type": "videorectangle", "id": f"t{row.id}" if row.id is not None else "", "value": value})
-        results[-1]["order"] = order
-    return [{"id": 3, "annotations": [{"result": results}]}]
-
-
-def nuscenes(folder: Path, rows: Sequence[Row]) -> Path:
-    tables = {
-        "scene": [{"token": "one", "name": "scene-1"}],
-        "sample": [{"token": f"s{n}", "timestamp": 100 + n, "scene_token": "one"} for n in range(9)],
-        "instance": [{"token": f"i{row.id}", "category_token": row.kind} for row in rows],
-        "category": [{"token": kind, "name": "human.pedestrian.adult"} for kind in ("person", None) if kind],
-        "sample_annotation": [
-            {"token": f"a{n}", "sample_token": f"s{row.frame}", "instance_token": f"i{row.id}",
-             "translation": [*row.xy, 1.0], "size": [row.size[1], row.size[0], row.size[2]],
-             "rotation": [math.cos(row.heading / 2), 0, 0, math.sin(row.heading / 2)]}
-            for n, row in enumerate(rows)
-        ],
-    }  # fmt: skip
-    for name, content in tables.items():
-        (folder / f"{name}.json").write_text(json.dumps(content))
-    return folder
-
-
-def argoverse(folder: Path, rows: Sequence[Row]) -> Path:
-    columns = {
-        "timestamp_ns": pa.array([row.frame for row in rows], pa.int64()),
-        "track_uuid": [f"t{row.id}" for row in rows],
-        "category": pa.array(["PEDESTRIAN" if row.kind else None for row in rows], pa.string()),
-        **{f"{name}_m": [float(row.size[at]) for row in rows] for at, name in enumerate(("length", "width", "height"))},
-        "qw": [math.cos(row.heading / 2) for row in rows],
-        "qz": [math.sin(row.heading / 2) for row in rows],
-        "qx": [0.0 for _ in rows],
-        "qy": [0.0 for _ in rows],
-        "tx_m": [float(row.xy[0]) for row in rows],
-        "ty_m": [float(row.xy[1]) for row in rows],
-        "tz_m": [1.0 for _ in rows],
-    }
-    feather.write_feather(pa.table(columns), folder / "annotations.feather")
-    return folder
-
-
-def bdd(rows: Sequence[Row]) -> Any:
-    frames = []
-    for frame, mine in by_frame(rows).items():
-        labels = [
-            {"id": row.id, "category": row.kind, "score": row.score,
-             "box2d": dict(zip(("x1", "y1", "x2", "y2"), corners(row), strict=True))}
-            for row in mine
-        ]  # fmt: skip
-        frames.append({"name": f"v-{frame + 1:07}.jpg", "videoName": "v", "frameIndex": frame, "labels": labels})
-    return frames
-
-
-def jrdb(rows: Sequence[Row]) -> Any:
-    return {"labels": {
-        f"{frame:06}.jpg": [
-            {"box": list(row.box), "label_id": f"{row.kind or ''}:{number(row.id)}", "score": row.score} for row in mine
-        ]
-        for frame, mine in by_frame(rows).items()
-    }}  # fmt: skip
-
-
-def trajnetpp(row: Row) -> str:
-    return json.dumps({"track": {"f": row.frame, "p": row.id, "x": row.xy[0], "y": row.xy[1]}})
-
-
-def per_frame(name: str, content: Callable[[int, list[Row]], str]) -> Callable[[Path, Sequence[Row]], Path]:
-    """A folder with a file for each frame, and one without rows if there are none."""
-
-    def write(folder: Path, rows: Sequence[Row]) -> Path:
-        for frame, mine in (by_frame(rows) or {0: []}).items():
-            path = folder / "a" / name.format(frame)
-            path.parent.mkdir(exist_ok=True)
-            path.write_text(content(frame, mine))
-        return folder / "a"
-
-    return write
-
-
-def voc(frame: int, rows: list[Row]) -> str:
-    """Ids are attributes, as LabelMe has them."""
-    parts = [f"<annotation><filename>{frame}.jpg</filename><size><width>640</width><height>480</height></size>"]
-    for row in rows:
-        ends = "".join(
-            f"<{key}>{end}</{key}>" for key, end in zip(("xmin", "ymin", "xmax", "ymax"), corners(row), strict=True)
-        )
-        own = "" if row.id is None else f"<attributes>track_id={row.id}</attributes>"
-        parts.append(f"<object><name>{row.kind or ''}</name><bndbox>{ends}</bndbox>{own}</object>")
-    return "".join(parts) + "</annotation>"
-
-
-def labelme(frame: int, rows: list[Row]) -> str:
-    shapes = [
-        {
-            "label": row.kind,
-            "points": [corners(row)[:2], corners(row)[2:]],
-            "shape_type": "rectangle",
-            "score": row.score,
-        }
-        for row in rows
-    ]
-    return json.dumps({"shapes": shapes, "imagePath": f"{frame}.jpg", "imageWidth": 640, "imageHeight": 480})
-
-
-def kitti_frame(_: int, rows: list[Row]) -> str:
-    lines = [kitti(row).split() for row in rows]
-    return "".join(f"{kind} {own} {' '.join(more)}\n" for _, own, kind, *more in lines)
-
-
-def via(rows: Sequence[Row]) -> Any:
-    out = {}
-    for frame, mine in by_frame(rows).items():
-        regions = [
-            {"shape_attributes": {"name": "rect", **dict(zip(("x", "y", "width", "height"), row.box, strict=True))},
-             "region_attributes": {"class": row.kind, "track": row.id}} for row in mine
-        ]  # fmt: skip
-        out[f"{frame}.jpg9"] = {"filename": f"{frame}.jpg", "regions": regions}
-    return out
-
-
-def datumaro(rows: Sequence[Row]) -> Any:
-    kinds = sorted({row.kind for row in rows if row.kind})
-    items = [
-        {"id": f"{frame}", "image": {"size": [480, 640]}, "annotations": [
-            {"type": "bbox", "bbox": row.box, "label_id": kinds.index(row.kind) if row.kind else None,
-             "attributes": {"track_id": row.id, "score": row.score}} for row in mine]}
-        for frame, mine in by_frame(rows).items()
-    ]  # fmt: skip
-    return {"items": items, "categories": {"label": {"labels": [{"name": kind} for kind in kinds]}}}
-
-
-def darknet(rows: Sequence[Row]) -> Any:
-    """Shares of 640x480 of boxes in pixels; those that are shares are far too large then."""
-    out = []
-    for frame, mine in by_frame(rows).items():
-        objects = []
-        for row in mine:
-            place = dict(zip(("center_x", "center_y", "width", "height"), shares(row), strict=True))
-            objects.append(
-                {"name": row.kind or "", "class_id": "", "confidence": row.score, "relative_coordinates": place}
-            )
-        out.append({"frame_id": frame, "objects": objects})
-    return out
-
-
-def youtube_vis(rows: Sequence[Row]) -> Any:
-    """A track for each row."""
-    names = [f"{frame}.jpg" for frame in range(max((row.frame for row in rows), default=0) + 1)]
-    tracks = [
-        {"id": row.id, "video_id": 1, "category_id": row.kind or "", "score": row.score,
-         "bboxes": [row.box if name == f"{row.frame}.jpg" else None for name in names]} for row in rows
-    ]  # fmt: skip
-    return {"videos": [{"id": 1, "width": 640, "height": 480, "file_names": names}], "annotations": tracks}
-
-
-def mots(row: Row) -> str:
-    """A mask that is one pixel wide, in the column that the box begins with."""
-    return f"{row.frame} {number(row.id, '-1')} 2 8 9 {chr(48 + 8 * (row.frame % 2))}84l0"
-
-
-def levelx(folder: Path, rows: Sequence[Row]) -> Path:
-    lines = ["trackId,frame,xCenter,yCenter,heading,width,length,xVelocity,yVelocity"]
-    for row in rows:
-        length, width, _ = row.size
-        place = f"{row.xy[0]},{row.xy[1]},{math.degrees(row.heading)},{width},{length}"
-        lines.append(f"{number(row.id, '-1')},{row.frame},{place},1,0")
-    kinds = {f"{row.id},{'pedestrian' if row.kind == 'person' else row.kind}" for row in rows}
-    (folder / "00_tracksMeta.csv").write_text("\n".join(["trackId,class", *kinds]))
-    (folder / "00_tracks.csv").write_text("\n".join(lines))
-    return folder / "00_tracks.csv"
-
-
-def parquet(folder: Path, rows: Sequence[Row]) -> Path:
-    keys = ("frame", "id", "x", "y", "w", "h", "score", "class")
-    values = [[row.frame, row.id, *map(float, row.box), row.score, row.kind] for row in rows]
-    table = pa.table({key: [row[at] for row in values] for at, key in enumerate(keys)})
-    pq.write_table(table, folder / "a.parquet")
-    return folder / "a.parquet"
-
-
-def mot(row: Row) -> str:
-    kind = {"person": "1", None: "-1"}.get(row.kind, row.kind)
-    box = ",".join(map(number, row.box))
-    return f"{row.frame + 1},{number(row.id, '-1')},{box},{number(row.score, '1')},{kind},1"
-
-
-def sdd(row: Row) -> str:
-    box = " ".join(map(number, corners(row)))
-    return f'{number(row.id, "-1")} {box} {row.frame} 0 0 0 "{ {"person": "Pedestrian"}.get(row.kind, row.kind) }"'
-
-
-CSV, SUPERVISION = "frame,id,x,y,w,h,score,class", "x_min,y_min,x_max,y_max,class_id,confidence,tracker_id,frame_index"
-WRITERS = {
-    "mot": Writer(text(mot), names=False),
-    "kitti": Writer(text(kitti), "kind"),
-    "sdd": Writer(text(sdd), "score kind"),
-    "trajnet": Writer(text(lambda row: f"{row.frame} {number(row.id, '-1')} {row.xy[0]} {row.xy[1]}"), "score kind", "xy"),
-    "obsmat": Writer(
-        text(lambda row: f"{row.frame} {number(row.id, '-1')} {row.xy[0]} 0 {row.xy[1]} 0 0 0"), "score kind", "xy"
-    ),
-    "coco": Writer(as_json(coco), names=False, size=True),
-    "cvat": Writer(cvat, "score numbered", size=True),
-    "yolo": Writer(yolo, names=False),
-    "trajnet++": Writer(
-        text(trajnetpp, '{"scene": {"id": 0, "p": 1, "s": 0, "e": 9, "fps": 2.5}}', "a.ndjson"), "score kind", "xy"
-    ),
-    "bdd": Writer(as_json(bdd)),
-    "jrdb": Writer(as_json(jrdb), "numbered"),
-    "label-studio": Writer(as_json(label_studio), "score numbered"),
-    "voc": Writer(per_frame("{}.xml", voc), "score", size=True),
-    "labelme": Writer(per_frame("{}.json", labelme), "box id numbered", size=True, tracks=False),
-    "via": Writer(as_json(via), "score"),
-    "datumaro": Writer(as_json(datumaro), size=True),
-    "darknet": Writer(as_json(darknet), "id numbered", tracks=False),
-    "youtube-vis": Writer(as_json(youtube_vis), size=True),
-    "mots": Writer(text(mots), "box pixels score kind size numbered"),
-    "kitti-frames": Writer(per_frame("{}.txt", kitti_frame), "kind"),
-    "levelx": Writer(levelx, "score kind numbered", "space"),
-    "records": Writer(parquet),
-    "supervision": Writer(
-        text(lambda row: ",".join(
-            [*map(number, corners(row)), {"person": "0"}.get(row.kind, row.kind or ""), number(row.score),
-             number(row.id, "-1"), f"{row.frame}"]), SUPERVISION, "a.csv"), names=False),
-    "csv": Writer(
-        text(lambda row: ",".join(
-            [f"{row.frame}", number(row.id), *map(number, row.box), number(row.score), row.kind or ""]),
-            CSV, "a.csv")),
-    "kitti-3d": Writer(text(kitti), "kind", "space"),
-    "nuscenes": Writer(nuscenes, "score kind id numbered", "space"),
-    "argoverse": Writer(argoverse, "score id numbered", "space"),
-}  # fmt: skip
-#: What a format states in all of its files.
-STATED_FIRST = (
-    "supervision", "mot", "kitti", "sdd", "trajnet", "obsmat", "trajnet++", "cvat", "jrdb", "label-studio", "kitti-3d",
-    "youtube-vis", "levelx",
-)  # fmt: skip
-#: The first of the pictures that these list is taken as the first; what is assumed is said once the clock is known.
-BY_LIST = ("coco", "bdd", "voc", "labelme", "via", "datumaro", "darknet", "mots", "kitti-frames")
-TIMED = ("nuscenes", "argoverse")
-#: Formats of boxes in shares of the picture.
-SHARED = ("yolo", "label-studio", "darknet")
-
-#: Two people that walk, without fault.
-WALK = [
-    Row(frame, who, (10 + 3 * frame + 40 * who, 20, 30, 60), (1.5 + 0.2 * frame, 2.5 * who)) for frame in range(1, 5) for who in (1, 2)
-]  # fmt: skip
+WRITERS = writers()
 
 
 def changed(at: int = 3, **changes: Any) -> list[Row]:
@@ -461,7 +79,7 @@ BROKEN: dict[str, list[tuple[list[Row], str, str, str]]] = {
 
 
 def test_every_format_and_every_check_is_here():
-    assert set(WRITERS) == set(BUILT_IN["label_format"])
+    assert set(WRITERS) == set(own("label_format"))
     assert set(BROKEN) == {*OF_SOURCE, *OF_ROLE, "classes"}
 
 
@@ -469,11 +87,11 @@ def has(name: str) -> set[str]:
     """The columns and facts of a format, as they are declared here."""
     writer = WRITERS[name]
     out = {writer.kind, "score", "kind", "id", "numbered"} - {*writer.lacks.split()}
-    out |= {"pixels"} if writer.kind == "box" and name not in SHARED else {"share"} if name in SHARED else set()
+    out |= {"share"} if writer.shares else {"pixels"} if writer.kind == "box" else set()
     out |= {"size"} if writer.size else set()
     out |= {"numbers"} if not writer.names else set()
     out -= {*writer.lacks.split()}
-    return out | ({"frames"} if name not in (*TIMED, *STATED_FIRST, *BY_LIST) else set())
+    return out if writer.first else out | {"frames"}
 
 
 CASES = [
@@ -574,7 +192,7 @@ def test_boxes_outside_of_the_pictures_are_said_of_every_format(name, tmp_path, 
     assert ("outside" in codes) == in_pixels
 
 
-@pytest.mark.parametrize("name", BY_LIST)
+@pytest.mark.parametrize("name", [name for name in WRITERS if WRITERS[name].first == "listed"])
 def test_a_first_picture_that_is_assumed_is_said(name, tmp_path, pictures):
     log = tmp_path / "a.mcap"
     log.write_bytes(pictures.read_bytes())
@@ -653,18 +271,6 @@ def test_damaged_files_are_read_or_refused_in_a_line(name, tmp_path):
             except McaptrackError as error:
                 assert "\n" not in str(error), error
         file.write_bytes(data)
-
-
-def test_a_video_of_several_is_chosen_while_a_log_is_made(tmp_path):
-    label = {"id": "1", "category": "person", "box2d": {"x1": 1, "y1": 1, "x2": 20, "y2": 40}}
-    frames = [
-        {"name": f"{name}-{number}.jpg", "videoName": name, "frameIndex": number, "labels": [label]}
-        for name, count in (("a", 3), ("b", 5))
-        for number in range(count)
-    ]
-    (tmp_path / "a.json").write_text(json.dumps(frames))
-    out = mcaptrack.ingest(tmp_path / "a.json", tmp_path / "a.mcap", role="truth", fps=10, scene="b")
-    assert out.messages == {"/camera/truth": 5}
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mcaptrack
-from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.corrections import Changes, compare
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources.corrections import fixed_ids, with_corrections, without_filled
-from mcaptrack.sources.ingest.label_job import with_new_ids
-from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack.offline import fix_tracks
 from tests.test_offline_reference import tracks_of as assigned
@@ -154,21 +150,6 @@ class TestCompare:
         assert (found.same, found.moved, found.added, found.removed, kept) == (4, 4, 0, 0, 8)
         assert found.relabelled == {1: ("person", "car")}
         assert found.words.endswith("4 moved, track 1 from person to car")
-
-
-def test_parts_of_tracks_get_ids_that_no_track_of_the_log_has(template, tmp_path):
-    box = '<box frame="{}" xtl="1" ytl="1" xbr="9" ybr="9"><attribute name="track_id">0</attribute></box>'
-    parts = "".join(f'<track label="person">{box.format(k)}</track>' for k in (3, 7, 9))
-    (tmp_path / "a.xml").write_text(f"<annotations>{parts}</annotations>")
-    labels = read_labels(tmp_path / "a.xml", role="corrections")
-    assert sorted(labels.id.tolist()) == [0, 1, 2]
-    with log.read(Path(template)) as opened:
-        found = with_new_ids(opened, "/camera", labels)
-        topics = "/camera/tracks", "/camera/retracks/full"
-        used = {one for topic in topics for one in opened.rows(topic, TRACKS).rows["track_id"].tolist()}
-    assert 1 in used
-    assert (found.id[0], len(np.unique(found.id))) == (0, 3)
-    assert not used & set(found.id[1:].tolist())
 
 
 def test_corrections_need_a_log_and_ids(template, tmp_path):

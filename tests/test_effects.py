@@ -98,11 +98,8 @@ def template(template, tmp_path_factory) -> Path:
     (folder / "kinds.csv").write_text(f"frame,id,x,y,w,h,class\n{kinds}")
     (folder / "table.csv").write_text("frame,id,x,y,w,h\n" + "".join(f"{n},1,{n},24,8,16\n" for n in range(30)))
     (folder / "cubes.csv").write_text("t,id,x_m,y_m\n" + "".join(f"{n},1,{n},2\n" for n in range(3)))
-    _write_nuscenes(folder / "nuscenes")
-    for name, more in (("yolo", ""), ("shares", " 0.9 1")):
-        (folder / name).mkdir()
-        for n in range(30):
-            (folder / name / f"{n:04}.txt").write_text(f"0 {0.1 + n / 100} 0.5 0.1 0.3{more}\n")
+    shares = "".join(f"{n},1,{0.05 + n / 100},0.35,0.1,0.3\n" for n in range(30))
+    (folder / "shares.csv").write_text(f"frame,id,x,y,w,h\n{shares}")
     (folder / "motion.txt").write_text("".join(f"{n}\t1\t0\t0.5\t0\t1\t0\n" for n in range(30)))
     lens, down = "[40, 0, 31.5, 0, 40, 23.5, 0, 0, 1]", "[0, -2.2, 2.2]"
     (folder / "pose.yml").write_text(f"%YAML:1.0\n---\nK: {lens}\nrvec: {down}\ntvec: [0, 0, 9]\n")
@@ -120,21 +117,6 @@ def template(template, tmp_path_factory) -> Path:
         path.rename(path.with_name("recording=a"))
     (folder / "taken" / "demo.mcap").write_text("")
     return folder
-
-
-def _write_nuscenes(folder: Path) -> None:
-    """Write the tables of two scenes of one annotation each."""
-    folder.mkdir()
-    box = {"instance_token": "i", "translation": [1, 2, 3], "size": [2, 4, 1.5], "rotation": [1, 0, 0, 0]}
-    tables = {
-        "scene": [{"token": one, "name": one} for one in "ab"],
-        "sample": [{"token": f"s{one}", "timestamp": t, "scene_token": one} for t, one in enumerate("ab", 1)],
-        "sample_annotation": [box | {"token": one, "sample_token": f"s{one}"} for one in "ab"],
-        "instance": [{"token": "i", "category_token": "c"}],
-        "category": [{"token": "c", "name": "vehicle.car"}],
-    }
-    for name, rows in tables.items():
-        (folder / f"{name}.json").write_text(json.dumps(rows))
 
 
 def _add_channels_of_others(path: Path) -> None:

@@ -72,19 +72,17 @@ def test_parameters_of_labels(place):
 
 
 def test_boxes_in_shares_of_the_picture_need_its_size(place):
-    Path("yolo").mkdir()
-    for n in range(2):
-        Path(f"yolo/{n:06}.txt").write_text("0 0.5 0.5 0.25 0.5 0.9\n")
-    made = job(labels={"detections": "yolo"}, size=(640, 480))
+    Path("shares.csv").write_text("frame,cx,cy,w,h,score\n0,0.5,0.5,0.25,0.5,0.9\n1,0.5,0.5,0.25,0.5,0.9\n")
+    made = job(labels={"detections": "shares.csv"}, size=(640, 480))
     made.fit_to_pictures(lambda: (640, 480))
     assert made.labels["detections"].boxes_px[0].tolist() == [240, 120, 160, 240]
-    again = job(labels={"detections": "yolo"}, size=(100, 200))
+    again = job(labels={"detections": "shares.csv"}, size=(100, 200))
     again.fit_to_pictures(None)
     assert again.labels["detections"].boxes_px[0].tolist() == [37.5, 50, 25, 100]
     with pytest.raises(McaptrackError, match=r"a.mp4: the pictures are 640x480, not 100x200; leave `size=` out"):
-        job(labels={"detections": "yolo"}, size=(100, 200)).fit_to_pictures(lambda: (640, 480))
+        job(labels={"detections": "shares.csv"}, size=(100, 200)).fit_to_pictures(lambda: (640, 480))
     with pytest.raises(McaptrackError, match=r"has boxes in shares of the picture's size; give it with `size="):
-        job(labels={"detections": "yolo"}).fit_to_pictures(None)
+        job(labels={"detections": "shares.csv"}).fit_to_pictures(None)
     small = job(labels={"truth": "gt.txt"})
     small.fit_to_pictures(lambda: (8, 8))
     assert [code for _, code in small.labels["truth"].doubts] == ["outside"]

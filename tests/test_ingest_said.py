@@ -25,9 +25,9 @@ from mcaptrack.sources.ingest.plain_yaml import UnsupportedYamlError
 from tests.logs import provenance_of, recorder
 from tests.worlds import ns
 
-KITTI = "".join(
-    f"{frame} {number} {name} 0 0 0 10 20 14 28 1 1 1 1 1 1 0\n"
-    for number, (frame, name) in enumerate([(0, "Car"), (0, "Pedestrian"), (1, "Car"), (1, "Misc")])
+SDD = "".join(
+    f'{number} 10 20 14 28 {frame} 0 0 0 "{name}"\n'
+    for number, (frame, name) in enumerate([(0, "Biker"), (0, "Pedestrian"), (1, "Biker"), (1, "Misc")])
 )
 
 
@@ -58,14 +58,14 @@ def parameters_of(path: Path, topic: str) -> dict[str, Any]:
 
 
 def test_classes_of_detections_are_listed_and_their_names_kept(tmp_path):
-    found = write(tmp_path / "found.txt", KITTI)
+    found = write(tmp_path / "found.txt", SDD)
     report, path = made(found, role="detections", fps=Fraction(10))
-    assert report.remarks[0] == f"{found} has several classes; class_id is 1 Pedestrian (1), 3 Car (2), 8 Misc (1)"
+    assert report.remarks[0] == f"{found} has several classes; class_id is 1 Pedestrian (1), 2 Biker (2), 7 Misc (1)"
     with log.read(path) as opened:
         metadata = opened.channel("/camera/detections").metadata
-        assert json.loads(metadata["mcaptrack.classes"]) == {"1": "Pedestrian", "3": "Car", "8": "Misc"}
+        assert json.loads(metadata["mcaptrack.classes"]) == {"1": "Pedestrian", "2": "Biker", "7": "Misc"}
         rows = opened.rows("/camera/detections", DETECTIONS).rows
-    assert rows["class_id"].tolist() == [3, 1, 3, 8]
+    assert rows["class_id"].tolist() == [2, 1, 2, 7]
     assert [rows[name][0] for name in ("x_px", "y_px", "w_px", "h_px")] == [10, 20, 4, 8]
     assert (report.messages, report.has_labels, report.uses_camera) == ({"/camera/detections": 2}, True, True)
 

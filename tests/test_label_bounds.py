@@ -14,7 +14,6 @@ EXACT = 2**53
 #: A line of each format, by the names of its columns.
 LINES = {
     "mot": "{frame},{id},{x},20,{w},30,{score},{kind}",
-    "kitti": "{frame} {id} Pedestrian 0 0 0 {x} 20 {right} 50 1 1 1 1 1 1 0 {score}",
     "sdd": '{id} {x} 20 {right} 50 {frame} 0 0 0 "Pedestrian"',
     "trajnet": "{frame} {id} {x} {y}",
     "obsmat": "{frame} {id} {x} 0 {y} 0 0 0",
@@ -23,27 +22,32 @@ USUAL = {"frame": "1", "id": "1", "x": "10", "y": "10", "w": "5", "right": "15",
 #: What is tried: a column, the formats, values that are taken, and values that are not.
 BOUNDS = [
     ("frame", tuple(LINES), ("0", str(2**31 - 1)), ("-1", str(2**31), "1.5", "nan", "inf", "one")),
-    ("id", ("mot", "kitti"), ("-1", "0", str(EXACT - 1)), ("-2", str(EXACT), "0.5", "nan", "x")),
+    ("id", ("mot",), ("-1", "0", str(EXACT - 1)), ("-2", str(EXACT), "0.5", "nan", "x")),
     ("id", ("sdd", "trajnet", "obsmat"), ("0", str(EXACT - 1)), ("-2", str(EXACT), "0.5", "inf")),
     ("x", ("mot", "trajnet", "obsmat"), ("1e8", "-1e8", "0.25"), ("1.000001e8", "-1.000001e8", "nan", "-inf", "")),
     ("y", ("trajnet", "obsmat"), ("1e8", "-1e8"), ("1.000001e8", "nan")),
     ("w", ("mot",), ("0.001", "1e8"), ("1.000001e8", "inf")),
-    ("score", ("mot", "kitti"), ("1e9", "-1e9", "0"), ("1.1e9", "-1.1e9")),
+    ("score", ("mot",), ("1e9", "-1e9", "0"), ("1.1e9", "-1.1e9")),
     ("kind", ("mot",), ("-1", "2", str(2**31 - 1)), ("-2", "1.5")),
 ]
-TRIED = [(name, column, value, True) for column, names, taken, _ in BOUNDS for name in names for value in taken]
-TRIED += [
-    (name, column, value, False) for column, names, _, not_taken in BOUNDS for name in names for value in not_taken
-]
 
 
-@pytest.mark.parametrize(("name", "column", "value", "is_taken"), TRIED)
+def tried(bounds):
+    """A format, a column, a value, and whether it is taken, of each that is tried."""
+    rows = [(column, names, value, True) for column, names, taken, _ in bounds for value in taken]
+    rows += [(column, names, value, False) for column, names, _, not_taken in bounds for value in not_taken]
+    return [(name, column, value, is_taken) for column, names, value, is_taken in rows for name in names]
+
+
+@pytest.mark.parametrize(("name", "column", "value", "is_taken"), tried(BOUNDS))
 def test_a_number_is_taken_up_to_its_bound_and_no_further(name, column, value, is_taken, tmp_path):
+    assert_bound(name, LINES[name], column, value, is_taken, tmp_path)
+
+
+def assert_bound(name: str, line: str, column: str, value: str, is_taken: bool, tmp_path: Path) -> None:
     path = Path(tmp_path / "a.txt")
-    path.write_text(
-        f"{LINES[name].format_map(USUAL | {'id': '5'})}\n{LINES[name].format_map(USUAL | {column: value})}\n"
-    )
-    role = "detections" if name in ("mot", "kitti") else "tracks"
+    path.write_text(f"{line.format_map(USUAL | {'id': '5'})}\n{line.format_map(USUAL | {column: value})}\n")
+    role = "tracks" if name in ("sdd", "trajnet", "obsmat") else "detections"
     if not is_taken:
         with pytest.raises(McaptrackError, match=r"^.*a\.txt:2: "):
             read_labels(path, name, role=role)

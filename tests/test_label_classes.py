@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +15,6 @@ from mcaptrack.sources.ingest.labels.roles import WantedClasses
 
 MOT = "".join(f"{t},{who},{10 * who},20,30,60,{flag},{kind},1\n" for t in (1, 2)
               for who, flag, kind in ((1, 1, 1), (2, 0, 3), (3, 0, 4), (4, 0, 1)))  # fmt: skip
-KITTI = "".join(
-    f"{t} {who} {kind} {cut} 0 0 {100 * who} 50 {100 * who + 40} 110 1 1 1 1 1 1 0\n"
-    for t in (0, 1)
-    for who, kind, cut in ((1, "Pedestrian", 0), (2, "Car", 0), (3, "Car", 1), (-1, "DontCare", -1))
-)
 SDD = "".join(
     f'{who} {10 * who} 20 {10 * who + 9} 40 {t} {lost} 0 0 "{kind}"\n'
     for who, kind, lost in ((1, "Pedestrian", 0), (2, "Biker", 0), (3, "Cart", 1))
@@ -30,23 +25,14 @@ CSV = "frame,id,x,y,w,h,class\n" + "".join(
     for t in (0, 1, 2)
     for who, kind in ((1, "human"), (2, "vélo"), (3, "Cat"))
 )
-COCO = json.dumps({
-    "images": [{"id": n, "file_name": f"{n:03}.jpg", "width": 640, "height": 480} for n in (1, 2)],
-    "categories": [{"id": 1, "name": "person"}, {"id": 17, "name": "cat"}, {"id": 3, "name": "car"}],
-    "annotations": [
-        {"id": 10 * n + c, "image_id": n, "category_id": c, "bbox": [10 * c, 20, 30, 60], "track_id": c}
-        for n in (1, 2) for c in (1, 17, 3)
-    ],
-})  # fmt: skip
-FILES = {"mot": ("gt.txt", MOT), "kitti": ("gt.txt", KITTI), "sdd": ("gt.txt", SDD), "csv": ("gt.csv", CSV),
-         "coco": ("gt.json", COCO)}  # fmt: skip
+FILES = {"mot": ("gt.txt", MOT), "sdd": ("gt.txt", SDD), "csv": ("gt.csv", CSV)}
 
 
-def classes_of(folder: Path, form: str, **options):
+def classes_of(folder: Path, form: str | tuple[str, str], **options):
     """The ids of each class in the ground truth of a file, by name and number of the class."""
-    name, content = FILES[form]
+    name, content = FILES.get(form, form)
     (folder / name).write_text(content)
-    target = folder / f"{form}-{options.get('classes', '')[:5]}.mcap"
+    target = folder / f"{name}-{options.get('classes', '')[:5]}.mcap"
     mcaptrack.ingest(folder / name, target, role=options.pop("role", "truth"), fps=10, force=True, **options)
     found = {}
     with mcaptrack.open(target) as log:
@@ -60,15 +46,18 @@ def classes_of(folder: Path, form: str, **options):
     [
         ("mot", {("person", 1): {1}}, {("pedestrian", 1): {1}, ("car", 3): {2}, ("bicycle", 4): {3}}, "car,4",
          {("car", 3): {2}, ("bicycle", 4): {3}}),
-        ("kitti", {("Pedestrian", 1): {1}}, {("Pedestrian", 1): {1}, ("Car", 3): {2}}, "CAR", {("Car", 3): {2}}),
         ("sdd", {("Pedestrian", 1): {1}}, {("Pedestrian", 1): {1}, ("Biker", 2): {2}}, "person", {("Pedestrian", 1): {1}}),
         ("csv", {("human", 1): {1}}, {("human", 1): {1}, ("Cat", 2): {3}, ("vélo", 3): {2}}, "vélo", {("vélo", 3): {2}}),
-        ("coco", {("person", 1): {1}}, {("person", 1): {1}, ("car", 3): {3}, ("cat", 17): {17}}, "pedestrian,cat",
-         {("person", 1): {1}, ("cat", 17): {17}}),
     ],
 )  # fmt: skip
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_wanted_classes_are_kept_with_their_names(tmp_path, form, people, everything, one, of_one):
+    assert_kept(tmp_path, form, people, everything, one, of_one)
+
+
+def assert_kept(
+    tmp_path: Path, form: str | tuple[str, str], people: Any, everything: Any, one: str, of_one: Any
+) -> None:
     assert classes_of(tmp_path, form) == people
     assert classes_of(tmp_path, form, classes="all") == everything
     assert classes_of(tmp_path, form, classes=one) == of_one
@@ -105,24 +94,17 @@ def ingest(folder: Path, name: str, content: bytes, **options):
     return mcaptrack.ingest(folder / name, folder / "a.mcap", fps=10, force=True, **options)
 
 
-@pytest.mark.parametrize(
-    ("form", "numbers"),
-    [
-        ("sdd", {"Pedestrian": 1, "Biker": 2, "Skater": 3, "Cart": 4, "Car": 5, "Bus": 6, "Dog": 7, "Tram": 8}),
-        (
-            "kitti",
-            {"Pedestrian": 1, "Cyclist": 2, "Car": 3, "Van": 4, "Truck": 5, "Tram": 6, "Person_sitting": 7, "Misc": 8,
-             "Cow": 9},
-        ),
-        ("kitti", {"Person": 7, "Bus": 9}),
-    ],
-)  # fmt: skip
-def test_classes_have_their_numbers_and_others_the_next_ones(form, numbers, tmp_path):
-    write = {
-        "sdd": lambda n, name: f'{n} {10 * n} 20 {10 * n + 9} 40 0 0 0 0 "{name}"\n',
-        "kitti": lambda n, name: f"0 {n} {name} 0 0 0 {10 * n} 20 {10 * n + 9} 40 1 1 1 1 1 1 0\n",
-    }[form]
-    (tmp_path / "a.txt").write_text("".join(write(n, name) for n, name in enumerate(numbers)))
+#: Classes of a data set with their numbers, and others with the next ones.
+SDD_NUMBERS = {"Pedestrian": 1, "Biker": 2, "Skater": 3, "Cart": 4, "Car": 5, "Bus": 6, "Dog": 7, "Tram": 8}
+
+
+def test_classes_have_their_numbers_and_others_the_next_ones(tmp_path):
+    rows = [f'{n} {10 * n} 20 {10 * n + 9} 40 0 0 0 0 "{name}"\n' for n, name in enumerate(SDD_NUMBERS)]
+    assert_numbered("sdd", rows, SDD_NUMBERS, tmp_path)
+
+
+def assert_numbered(form: str, rows: list[str], numbers: dict[str, int], tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("".join(rows))
     labels = read_labels(tmp_path / "a.txt", form, "tracks", wanted=WantedClasses("all"))
     assert labels.class_id.tolist() == list(numbers.values())
     assert labels.classes == {number: name for name, number in numbers.items()}
@@ -149,22 +131,6 @@ def test_classes_of_the_motchallenge_that_are_scored_forgiven_or_false(tmp_path)
     assert every.left_out == "1 boxes that don't count (score 0)"
     tracks = read_labels(tmp_path / "a.txt", "mot", "tracks", wanted=WantedClasses("person"))
     assert (tracks.id.tolist(), set(tracks.class_id.tolist())) == ([1, 14], {1})
-
-
-def test_people_of_kitti_that_are_hidden_or_cut_off_are_ignored_if_all_classes_count(tmp_path):
-    (tmp_path / "a.txt").write_text("".join(
-        f"0 {x} {kind} {cut} {hidden} 0 {x} 20 {x + 9} 40 1 1 1 1 1 1 0\n"
-        for x, kind, cut, hidden in (
-            (10, "Pedestrian", 0, 2), (20, "Pedestrian", 0, 3), (30, "Pedestrian", 1, 0), (50, "Car", 0, 0),
-            (60, "DontCare", -1, -1),
-        )
-    ))  # fmt: skip
-    every = read_labels(tmp_path / "a.txt", "kitti", "truth", wanted=WantedClasses("all"))
-    assert (every.id.tolist(), every.left_out) == (
-        [10, 50],
-        "1 regions (DontCare) and 2 boxes that don't count (hidden or cut off)",
-    )
-    assert every.ignored.boxes_px[:, 0].tolist() == [20, 30, 60]
 
 
 def test_tracks_without_people_are_refused_with_a_remedy(tmp_path):

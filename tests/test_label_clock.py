@@ -20,6 +20,7 @@ from mcap.reader import make_reader
 from mcaptrack import foxglove, log
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
+from mcaptrack.registry import own
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest, label_frames
@@ -48,7 +49,7 @@ WRITERS: dict[str, Callable[[int, int, bool], str]] = {
     "obsmat": lambda k, who, _: f"{k} {who} {who}.5 0 2.5 0 0 0",
 }
 POSITIONS = ("trajnet", "obsmat")
-DATA_SETS = ("mot", "kitti", "sdd", *POSITIONS)
+DATA_SETS = [name for name in WRITERS if name in own("label_format")]
 #: What labels hold makes no difference to their clock, so one format is enough for kinds other than ground truth.
 KINDS = [(f, r) for f, r in itertools.product(DATA_SETS, ROLES) if r == "truth" or f == "mot"]
 NAMES = ["-".join(kind) for kind in KINDS]

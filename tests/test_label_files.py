@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import FPS_RANGE
-from mcaptrack.registry import BUILT_IN
+from mcaptrack.installed import missing_parts
+from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels import text as texts
 from mcaptrack.sources.ingest.labels.reading import read_homography, read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
@@ -29,16 +30,6 @@ MOT = """3,2,10,20,4,8,0.5,1,1
 4,5,14,24,8,12,1,3,1
 5,6,15,25,9,13,1,-1,1
 """
-KITTI = """2 1 Pedestrian 0 0 0 10 20 14 28 1 1 1 1 1 1 0 0.5
-0 2 Pedestrian 0 2 0 11 21 16 30 1 1 1 1 1 1 0
-0 3 Pedestrian 0 3 0 12 22 18 32 1 1 1 1 1 1 0
-1 4 Pedestrian 1 0 0 13 23 20 34 1 1 1 1 1 1 0
-1 5 Car 0 0 0 14 24 22 36 1 1 1 1 1 1 0
-1 -1 DontCare -1 -1 -10 15 25 24 38 1 1 1 1 1 1 0
-3 6 Person_sitting 0 0 0 16 26 26 40 1 1 1 1 1 1 0
-3 7 Person 0 0 0 17 27 28 42 1 1 1 1 1 1 0
-4 8 Tricycle 0 0 0 18 28 30 44 1 1 1 1 1 1 0
-"""
 SDD = """1 10 20 14 28 3 0 0 0 "Pedestrian"
 1 11 20 16 29 1 0 0 0 "Pedestrian"
 2 1 1 9 9 1 0 0 0 "Biker"
@@ -47,7 +38,6 @@ SDD = """1 10 20 14 28 3 0 0 0 "Pedestrian"
 5 5 6 9 9 4 0 1 0 "Scooter"
 """
 MOT_BOXES = {k: [10 + k, 20 + k, 4 + k, 8 + k] for k in range(6)}
-KITTI_BOXES = {k: [10 + k, 20 + k, 4 + k, 8 + k] for k in range(9)}
 
 
 class Read(NamedTuple):
@@ -79,18 +69,6 @@ FILES: dict[str, tuple[str, str, str, Read]] = {
     "mot without classes": ("2,-1,1,2,3,4\n1,-1,5,6,7,8\n1,-1,4,4,4,4\n", "mot", "detections", Read(
         [1, 1, 2], [-1] * 3, [[5, 6, 7, 8], [4] * 4, [1, 2, 3, 4]], [NAN] * 3, [1, 2], [1] * 3)),
     "mot of ten columns": ("2,1,1,2,3,4,0.5,7,8,9\n", "mot", "truth", Read([2], [1], [[1, 2, 3, 4]], [NAN], [2], [1])),
-    "kitti truth": (KITTI, "kitti", "truth", Read(
-        [0, 2], [2, 1], [KITTI_BOXES[k] for k in (1, 0)], [NAN, 0.5], [0, 1, 2, 3, 4], [1, 1], {1: "Pedestrian"},
-        "2 Person_sitting, 1 Car, 1 Tricycle and 1 regions (DontCare) and 2 boxes that don't count (hidden or cut off)",
-        ([0, 1, 1, 3, 3], [KITTI_BOXES[k] for k in (2, 3, 5, 6, 7)], [True, True, False, True, True],
-         [False, False, True, False, False]))),
-    "kitti tracks": (KITTI, "kitti", "tracks", Read(
-        [0, 0, 1, 2], [2, 3, 4, 1], [KITTI_BOXES[k] for k in (1, 2, 3, 0)], [NAN, NAN, NAN, 0.5], [0, 1, 2, 3, 4], [1] * 4,
-        {1: "Pedestrian"}, "2 Person_sitting, 1 Car, 1 Tricycle and 1 regions (DontCare)")),
-    "kitti detections": (KITTI, "kitti", "detections", Read(
-        [0, 0, 1, 1, 2, 3, 3, 4], [2, 3, 4, 5, 1, 6, 7, 8], [KITTI_BOXES[k] for k in (1, 2, 3, 4, 0, 6, 7, 8)],
-        [NAN, NAN, NAN, NAN, 0.5, NAN, NAN, NAN], [0, 1, 2, 3, 4], [1, 1, 1, 3, 1, 7, 7, 10],
-        {1: "Pedestrian", 3: "Car", 7: "Person_sitting", 10: "Tricycle"}, "1 regions (DontCare)")),
     "sdd tracks": (SDD, "sdd", "tracks", Read(
         [1, 3], [1, 1], [[11, 20, 5, 9], [10, 20, 4, 8]], [NAN] * 2, [1, 2, 3, 4], [1, 1], {1: "Pedestrian"},
         "2 boxes out of sight (lost) and 1 Biker, 1 Scooter")),
@@ -110,6 +88,10 @@ def test_a_class_of_mot_that_no_row_can_have_is_none(tmp_path):
 
 @pytest.mark.parametrize(("text", "name", "role", "wanted"), FILES.values(), ids=FILES)
 def test_every_column_is_read_as_by_hand(text, name, role, wanted, tmp_path):
+    assert_read(text, name, role, wanted, tmp_path)
+
+
+def assert_read(text: str, name: str, role: str, wanted: Read, tmp_path: Path) -> None:
     path = written(tmp_path / "a.txt", text)
     labels = read_labels(path, role=role)
     assert (labels.format, labels.first_frame) == (name, 1 if name == "mot" else 0)
@@ -138,7 +120,9 @@ def written(path: Path, text: str) -> Path:
 
 
 #: All formats.
-FORMATS = ", ".join(BUILT_IN["label_format"])
+FORMATS = ", ".join(own("label_format"))
+#: What is said of those that aren't there.
+OTHERS = "".join(f"; {text}" for text in [missing_parts("label_format")] if text)
 #: The first row of a file, and what it is taken for; None for no format.
 GUESSES = {
     "1,1,1,1,1": None,
@@ -149,8 +133,6 @@ GUESSES = {
     '1 1 1 1 1 1 0 1 1 "Biker"': "sdd",
     "1 1 1 1 1 1 1 1 1 Biker": None,
     '1 1 1 1 1 1 1 1 "Biker"': None,
-    "1 1 Person_sitting" + 14 * " 1": "kitti",
-    "1 1 Car" + 15 * " 1": "kitti",
     "1 1 Car" + 13 * " 1": None,
     "1 1 Car" + 16 * " 1": None,
     "1 1 5" + 14 * " 1": None,
@@ -171,7 +153,9 @@ def test_a_format_is_told_by_the_first_row(row, name, tmp_path):
     count = len(row.replace(",", " ").split())
     with pytest.raises(McaptrackError) as error:
         read_labels(path)
-    assert str(error.value) == f"{path}:3: a row of {count} columns fits no label format ({FORMATS}): {row[:60]}"
+    assert (
+        str(error.value) == f"{path}:3: a row of {count} columns fits no label format ({FORMATS}): {row[:60]}{OTHERS}"
+    )
 
 
 #: What is refused, with the text of the file and the words after its name.
@@ -182,23 +166,22 @@ REFUSED = {
     "letters": ("auto", "truth", "1,1,1,1,2,2\n2,1,x,1,2,2\n", ":2: not MOTChallenge (frame, id, left, top, width, height, score, ...), not all are numbers: 2,1,x,1,2,2"),
     "another format": ("trajnet", "truth", ",".join("1" * 10), ":1: not TrajNet (frame id x y), 10 columns: 1,1,1,1,1,1,1,1,1,1"),
     "nothing": ("auto", "truth", "\n\n", None),
-    "sixteen of kitti": ("kitti", "truth", "1 1 Car" + 13 * " 1", None),
     "none count": ("mot", "truth", "1,1,1,1,1,1,1,3\n1,2,1,1,1,1,0,1\n", " holds no people, only 1 car and 1 boxes that don't count (score 0); `classes=` takes others"),
     "height": ("mot", "truth", "1,1,1,1,1,-3\n", ":1: a box can't be 1 wide and -3 high"),
-    "cars": ("kitti", "tracks", KITTI.splitlines()[4], " holds no people, only 1 Car; `classes=` takes others"),
-    "regions": ("kitti", "detections", KITTI.splitlines()[5], " holds no such boxes, only 1 regions (DontCare)"),
     "bikers": ("sdd", "tracks", SDD.splitlines()[2], " holds no people, only 1 Biker; `classes=` takes others"),
     "lost": ("sdd", "detections", SDD.splitlines()[3], " holds no boxes in sight, only 1 boxes out of sight (lost)"),
     "ids": ("trajnet", "tracks", "4 1 1 1\n2 7 1 1\n2 8 1 1\n2 7 1 1\n", ":4: id 7 appears twice in frame 2"),
-    "json": ("auto", "tracks", ' \n{"a": 1}', f" is JSON (an object with a) of no label format ({FORMATS})"),
-    "coco": ("auto", "tracks", '[{"image_id": 1}]', f" is JSON (a list with image_id) of no label format ({FORMATS})"),
-    "xml": ("auto", "tracks", '\ufeff<a "images">', ":1: not valid XML: not well-formed (invalid token)"),
+    "json": ("auto", "tracks", ' \n{"a": 1}', f" is JSON (an object with a) of no label format ({FORMATS}){OTHERS}"),
     "a long line": ("mot", "tracks", "1,1,1,1,1,1\n" + "1," * 2048 + "1", ":2: a line of more than 4096 characters is no row"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "role", "text", "words"), REFUSED.values(), ids=REFUSED)
 def test_what_is_no_file_of_labels_is_refused_in_these_words(name, role, text, words, tmp_path):
+    assert_refused(name, role, text, words, tmp_path)
+
+
+def assert_refused(name: str, role: str, text: str, words: str | None, tmp_path: Path) -> None:
     path = written(tmp_path / "a.txt", text)
     with pytest.raises(McaptrackError) as error:
         read_labels(path, name, role)

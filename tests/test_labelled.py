@@ -56,59 +56,9 @@ def timed(path: Path, frames: Iterable[int], off_s: float = 0.0) -> Path:
     return path
 
 
-def kitti(path: Path, frames: Iterable[int]) -> Path:
-    lines = (
-        f"{k} {who} Pedestrian 0 0 0 {x} {y} {x + w} {y + h} 1 1 1 1 1 1 0\n" for k, who, (x, y, w, h) in rows(frames)
-    )
-    path.write_text("".join(lines))
-    return path
-
-
 def sdd(path: Path, frames: Iterable[int]) -> Path:
     lines = (f'{who} {x} {y} {x + w} {y + h} {k} 0 0 0 "Pedestrian"\n' for k, who, (x, y, w, h) in rows(frames))
     path.write_text("".join(lines))
-    return path
-
-
-def coco(path: Path, frames: Iterable[int], images: Iterable[int] | None = None) -> Path:
-    """Annotations of COCO, with a list of images; others of them are marked as not labelled, as PoseTrack does it."""
-    shown, labelled = [*(frames if images is None else images)], {*frames}
-    content = {
-        "images": [{"id": k + 1000, "frame_id": k, "is_labeled": k in labelled} for k in shown],
-        "annotations": [
-            {"id": at, "image_id": k + 1000, "category_id": 1, "track_id": who, "bbox": box}
-            for at, (k, who, box) in enumerate(rows(frames))
-        ],
-        "categories": [{"id": 1, "name": "person"}],
-    }
-    path.write_text(json.dumps(content))
-    return path
-
-
-def cvat(path: Path, frames: Iterable[int], first: int, last: int, step: int = 1, key: str = "task") -> Path:
-    tracks = "".join(
-        f'<track id="{who}" label="person">'
-        + "".join(
-            f'<box frame="{k}" xtl="{x}" ytl="{y}" xbr="{x + w}" ybr="{y + h}" outside="0" occluded="0"/>'
-            for k, owner, (x, y, w, h) in rows(frames)
-            if owner == who
-        )
-        + "</track>"
-        for who in range(PEOPLE)
-    )
-    about = f"<start_frame>{first}</start_frame><stop_frame>{last}</stop_frame><frame_filter>step={step}</frame_filter>"
-    path.write_text(f"<annotations><meta><{key}>{about}</{key}></meta>{tracks}</annotations>")
-    return path
-
-
-def yolo(path: Path, frames: Iterable[int], empty: Iterable[int] = ()) -> Path:
-    path.mkdir()
-    for k in (*frames, *empty):
-        lines = [
-            f"0 {(x + w / 2) / SIZE[0]:.9f} {(y + h / 2) / SIZE[1]:.9f} {w / SIZE[0]:.9f} {h / SIZE[1]:.9f} 1 {who}"
-            for _, who, (x, y, w, h) in rows([k])
-        ]
-        (path / f"{k:06}.txt").write_text("\n".join(lines) if k in frames else "")
     return path
 
 
@@ -125,7 +75,6 @@ PART, THIRD, TWELFTH = range(20, 30), range(20, 51, 3), range(0, PICTURES, 12)
 WAYS = {
     "mot": Way(lambda p: mot(p / "t.txt", PART), PART, "labels"),
     "mot from 0": Way(lambda p: mot(p / "t.txt", [0, 3], 0), range(4), "labels", first_frame="truth=0,tracks=1"),
-    "kitti": Way(lambda p: kitti(p / "t.txt", PART), PART, "labels"),
     "sdd": Way(lambda p: sdd(p / "t.txt", PART), PART, "labels"),
     "csv": Way(lambda p: csv(p / "t.csv", PART), PART, "labels", first_frame={"truth": 0}),
     "one frame": Way(lambda p: mot(p / "t.txt", [7]), [7], "labels"),
@@ -134,19 +83,9 @@ WAYS = {
     "every twelfth": Way(lambda p: mot(p / "t.txt", TWELFTH), TWELFTH, None),
     "all": Way(lambda p: mot(p / "t.txt", range(PICTURES)), range(PICTURES), None),
     "nearly all": Way(lambda p: mot(p / "t.txt", range(3, 58)), range(PICTURES), None),
-    "images of COCO": Way(lambda p: coco(p / "t.json", PART), PART, "file", first_frame={"truth": 0}),
-    "images of COCO from the first on": Way(lambda p: coco(p / "t.json", range(10)), range(10), "file"),
-    "images that are not labelled": Way(lambda p: coco(p / "t.json", PART, range(PICTURES)), PART, "file"),
-    "a task of CVAT": Way(lambda p: cvat(p / "t.xml", PART, 20, 29), PART, "file"),
-    "a job of CVAT": Way(lambda p: cvat(p / "t.xml", PART[:5], 20, 29, key="job"), PART, "file"),
-    "a task of CVAT in steps": Way(lambda p: cvat(p / "t.xml", THIRD, 20, 50, 3), THIRD, "file"),
-    "files of YOLO": Way(lambda p: yolo(p / "t", PART[2:4], [*PART[:2], *PART[4:]]), PART, "file", first_frame={"truth": 0}),
-    "files of YOLO with boxes": Way(lambda p: yolo(p / "t", PART), PART, "labels", first_frame={"truth": 0}),
     "a range": Way(lambda p: mot(p / "t.txt", [22, 25]), PART, "frames", frames="21:31"),
     "two ranges": Way(lambda p: mot(p / "t.txt", [5, 6, 22]), [5, 6, *PART], "frames", frames="6:8, 21:31"),
-    "an open range": Way(lambda p: kitti(p / "t.txt", PART), range(20, PICTURES), "frames", frames="20:"),
     "all by a range": Way(lambda p: mot(p / "t.txt", PART), range(PICTURES), "frames", frames=":"),
-    "a part of a task": Way(lambda p: cvat(p / "t.xml", THIRD, 20, 50, 3), THIRD[:4], "frames", frames="0:30"),
 }  # fmt: skip
 
 
@@ -164,6 +103,10 @@ def scored(scores: mcaptrack.Scores) -> dict[str, Any]:
 
 @pytest.mark.parametrize("way", one_in(2, WAYS.values()), ids=WAYS)
 def test_a_file_and_the_log_that_it_is_ingested_into_give_the_same_scores(tmp_path, clip, way, recwarn):
+    assert_same_scores(tmp_path, clip, way)
+
+
+def assert_same_scores(tmp_path: Path, clip: Path, way: Way) -> None:
     """Tracks of every picture: right in all that were labelled but one, with a ghost that is there all the time."""
     truth, path = way.make(tmp_path), tmp_path / "log.mcap"
     wrong = way.labelled[len(way.labelled) // 2]
@@ -251,16 +194,6 @@ def test_tracks_that_are_added_to_a_log_count_as_its_labels_do(tmp_path, clip):
     assert codes(result.warnings) == ["clock"]
     assert "as those of /camera/truth" in result.warnings[0].message
     assert mcaptrack.evaluate(path, similarity="iou").score("MOTA") == pytest.approx(47 / 50)
-
-
-def test_numbers_of_images_are_those_of_pictures_if_they_fit(tmp_path, clip):
-    for frames, first in ((range(20, 30), 20), (range(70, 130), 0), (range(51, 61), 50)):
-        path = tmp_path / f"{first}.mcap"
-        result = mcaptrack.ingest(clip, path, truth=coco(tmp_path / "gt.json", frames))
-        with log.read(path) as opened:
-            assert next(iter(opened.frames("/camera/truth", TRACKS))).index == first
-        assert codes(result.warnings) == ["clock"]
-        assert f"its first image has the number {frames[0]}, and is" in result.warnings[0].message
 
 
 def test_ranges_of_frames_are_slices():
@@ -363,20 +296,7 @@ def test_forecasts_with_a_past_that_was_not_labelled_are_not_judged():
     assert part.people == 0 or part.people < whole.people
 
 
-def kitti_3d(path: Path, frames: Iterable[int]) -> Path:
-    path.write_text("".join(f"{k} 1 Car 0 0 0 1 2 3 4 1.5 1.6 4.0 {k / 2} 1.5 10 0.0\n" for k in frames))
-    return path
-
-
-def test_boxes_in_space_count_from_the_first_label_to_the_last(tmp_path):
-    tracks = kitti_3d(tmp_path / "tracks.txt", range(60))
-    for frames, given, false in ((PART, None, 0), ([20, 21, 26], None, 4), (PART, "22:25", 0), ([20, 22, 24], None, 0)):
-        truth = kitti_3d(tmp_path / "truth.txt", frames)
-        scores = mcaptrack.evaluate(
-            tracks, truth=truth, label_format="kitti-3d", fps=FPS, similarity="metres", gate_m=2, frames=given
-        )
-        assert (scores.score("FP"), scores.score("FN")) == (false, 0)
-        assert scores.labelled["tracks"] == ((given, "frames") if given else (None, None))
+def test_tables_with_times_take_no_frames(tmp_path):
     (tmp_path / "t.csv").write_text("t,id,x_m,y_m,length_m\n0.1,1,2,3,1\n0.2,1,2,3,1\n")
     with pytest.raises(McaptrackError, match=r"has times, which say what it describes; leave `frames=` out"):
         mcaptrack.ingest(tmp_path / "t.csv", tmp_path / "x.mcap", role="truth", frames="1:")

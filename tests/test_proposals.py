@@ -166,7 +166,7 @@ class Scene:
 SCENES: dict[str, Callable[[Scene], str]] = {
     "cli/group.py:resolve_command:info": lambda s: s.says("LOG"),
     "cli/files.py:logs:drop": lambda s: s.says("drop", "/camera/video", "LOG"),
-    "sources/ingest/labels/format.py:unknown:ingest": lambda s: s.says("ingest", "plane.txt", "-o", "b.mcap"),
+    "sources/ingest/labels/format.py:_instead:ingest": lambda s: s.says("ingest", "plane.txt", "-o", "b.mcap"),
     "tables/export/__init__.py:_note_left_out:export": lambda s: s.says(
         "export", "LOG", "--topic", "/camera/video", "-o", "tables"
     ),

@@ -131,7 +131,7 @@ def test_each_track_has_its_colour_and_labels_are_read_on_black():
         assert (np.dot(shade, [0.299, 0.587, 0.114]) > 0.45) == (legible(shade) == shade).all()
 
 
-def test_names_decide_about_colours_and_numbers_about_unknown_names():
+def test_names_decide_about_colours_and_numbers_about_unknown():
     assert class_colour(3, "car") == class_colour(8, "LARGE_VEHICLE") == class_colour(1, "Car")
     assert class_colour(1, "person") == class_colour(5, "pedestrian") != class_colour(3, "car")
     assert class_colour(5, "scar") != class_colour(5, "car")

@@ -125,10 +125,10 @@ def min_iou(shown: str | None = None) -> Option:
 
 def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | None = None) -> Option:
     """The option that chooses a detector, tracker or so on of the registry by name; ``shown`` is its default."""
-    from mcaptrack.registry import names, own_names
+    from mcaptrack.registry import names, own
 
     text = (
-        f"{intro.format(kind=kind)}: {', '.join(own_names(kind))}, one of an installed package, or module:Class.\n\n"
+        f"{intro.format(kind=kind)}: {', '.join(own(kind))}, one of an installed package, or module:Class.\n\n"
         "Or a transform."
     )
     return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)

@@ -402,12 +402,12 @@ def _with_options(base: Transform, options: Mapping[str, Value]) -> Transform:
         raise McaptrackError(
             f"{base!r:.80} is no transform: it is no dataclass; give a name, or an object of a transform"
         )
-    own_names = [f.name for f in fields(base) if not f.metadata.get("context")]
+    own = [f.name for f in fields(base) if not f.metadata.get("context")]
     for name in options:
-        if name not in own_names:
+        if name not in own:
             raise McaptrackError(
-                f"{type(base).__name__} has no parameter {name}; {did_you_mean(name, own_names)}"
-                f"there are {', '.join(own_names) or 'none'}"
+                f"{type(base).__name__} has no parameter {name}; {did_you_mean(name, own)}"
+                f"there are {', '.join(own) or 'none'}"
             )
     return replace(base, **options)
 

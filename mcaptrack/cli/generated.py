@@ -120,10 +120,10 @@ def class_limits() -> str:
 
 
 def label_formats() -> str:
-    """The built-in formats of label files, as a table in Markdown."""
-    from mcaptrack.registry import BUILT_IN, find
+    """The formats of label files, of the core and of extensions, as a table in Markdown."""
+    from mcaptrack.registry import find, own
 
-    forms = {name: find("label_format", name).cls for name in BUILT_IN["label_format"]}
+    forms = {name: find("label_format", name).cls for name in own("label_format")}
     rows = (f"| `{name}` | {form.title} | {form.row} |" for name, form in forms.items())
     return "\n".join(["| `--format` | | a row, or a file |", "|---|---|---|", *rows])
 

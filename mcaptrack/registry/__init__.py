@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
@@ -123,31 +123,10 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         },
         "label_format": {
             "mot": f"{_LABELS}.mot:Mot",
-            "kitti": f"{_LABELS}.kitti:Kitti",
             "sdd": f"{_LABELS}.sdd:Sdd",
             "trajnet": f"{_LABELS}.positions:Trajnet",
             "obsmat": f"{_LABELS}.positions:Obsmat",
-            "youtube-vis": f"{_LABELS}.youtube_vis:YoutubeVis",
-            "coco": f"{_LABELS}.coco:Coco",
-            "voc": f"{_LABELS}.voc:Voc",
-            "cvat": f"{_LABELS}.cvat:Cvat",
-            "trajnet++": f"{_LABELS}.trajnetpp:TrajnetPP",
-            "bdd": f"{_LABELS}.bdd:Bdd",
-            "jrdb": f"{_LABELS}.jrdb:Jrdb",
-            "label-studio": f"{_LABELS}.label_studio:LabelStudio",
-            "labelme": f"{_LABELS}.labelme:Labelme",
-            "via": f"{_LABELS}.via:Via",
-            "datumaro": f"{_LABELS}.datumaro:Datumaro",
-            "darknet": f"{_LABELS}.darknet:Darknet",
-            "mots": f"{_LABELS}.masks:Mots",
-            "levelx": f"{_LABELS}.levelx:LevelX",
-            "supervision": f"{_LABELS}.delimited:Supervision",
             "csv": f"{_LABELS}.delimited:Csv",
-            "kitti-frames": f"{_LABELS}.kitti:KittiFrames",
-            "kitti-3d": f"{_LABELS}.kitti:Kitti3d",
-            "nuscenes": f"{_LABELS}.nuscenes:NuScenes",
-            "argoverse": f"{_LABELS}.argoverse:Argoverse",
-            "yolo": f"{_LABELS}.yolo:Yolo",
             "records": f"{_LABELS}.records:Records",
         },
         # By the name of the type of message, as in ROS 1 and Foxglove: drawings. Others are read by their fields.
@@ -160,7 +139,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "recording": {},
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
-            "mot": "mcaptrack.tables.box_files:MotFile",
+            "mot": "mcaptrack.sources.box_files:MotFile",
         },
         "judge": {},
         # What is made of the results of stages at the end of a run.
@@ -249,26 +228,31 @@ def names(kind: Kind) -> tuple[str, ...]:
     return (*BUILT_IN[kind], *sorted({point.name for point in points(kind)}))
 
 
-def own_names(kind: Kind) -> tuple[str, ...]:
-    """The names of a kind in mcaptrack: built-in ones, the default first, then those of extensions. Imports nothing."""
-    return (*BUILT_IN[kind], *sorted({point.name for point in points(kind) if point.is_own}))
+def own(kind: Kind) -> dict[str, str]:
+    """Module and class of what mcaptrack itself has of a kind, in the core and in extensions, by name."""
+    return {**BUILT_IN[kind], **{point.name: point.value for point in sorted(points(kind)) if point.is_own}}
 
 
 def points(kind: Kind) -> list[Point]:
     """The entry points of a kind; those with a name that is taken don't count."""
-    return [point for point in entry_points(_group(kind)) if not _owner(kind, point)]
+    listed = entry_points(_group(kind))
+    own = {point.name for point in listed if point.is_own}
+    return [point for point in listed if not _owner(kind, point, own)]
 
 
 def ignored(kind: Kind) -> dict[str, str]:
     """Why entry points of a kind don't count, by their title. Imports nothing."""
-    owners = {titled(kind, point.name, point.package): _owner(kind, point) for point in entry_points(_group(kind))}
+    listed = entry_points(_group(kind))
+    own = {point.name for point in listed if point.is_own}
+    owners = {titled(kind, point.name, point.package): _owner(kind, point, own) for point in listed}
     return {what: f"{what} is ignored: there is {owner}; rename it" for what, owner in owners.items() if owner}
 
 
-def _owner(kind: Kind, point: Point) -> str:
-    """The entry with the name of an entry point, which can't have it: a built-in one, or a command; "" if none."""
-    is_extension = any(own.is_own and own.name == point.name for own in entry_points(_group(kind)))
-    if point.name in BUILT_IN[kind] or (is_extension and not point.is_own):
+def _owner(kind: Kind, point: Point, own: Set[str]) -> str:
+    """The entry with the name of an entry point, which can't have it: a built-in one, one of those that are our
+    ``own``, or a command; "" if none.
+    """
+    if point.name in BUILT_IN[kind] or (point.name in own and not point.is_own):
         return f"a built-in {titled(kind, point.name)}"
     taken = names("command") if kind == "stage" else BUILT_IN["command"] if kind == "finisher" else ()
     return f"a {titled('command', point.name)}" if point.name in taken else ""

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, names, others, own_names
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, names, others, own
 from mcaptrack.schema import (
     APPEARANCE,
     CAMERA_MOTION,
@@ -110,7 +110,7 @@ class Stage:
     @cached_property
     def default(self) -> type[Transform]:
         """Its default transform."""
-        entry = find(self.kind, own_names(self.kind)[0]) if self.kind else find("stage", self.name)
+        entry = find(self.kind, next(iter(own(self.kind)))) if self.kind else find("stage", self.name)
         cls: type[Transform] = entry.cls
         return cls
 
@@ -129,7 +129,7 @@ class Stage:
         """Its built-in transforms by name, the default first."""
         if self.kind is None:
             return {self.name: self.default}
-        return {name: find(self.kind, name).cls for name in own_names(self.kind)}
+        return {name: find(self.kind, name).cls for name in own(self.kind)}
 
     def find(self, name: str, distribution: str = "") -> Entry:
         """Find a transform of this stage by name (see ``mcaptrack.registry``).

@@ -31,9 +31,9 @@ from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, Frame
 from mcaptrack.schema.classes import PERSON, class_name, class_names
 from mcaptrack.sources import foreign
+from mcaptrack.sources.box_files import boxes_topic
 from mcaptrack.sources.cameras import Camera, cameras
 from mcaptrack.sources.video import is_video_codec
-from mcaptrack.tables.box_files import boxes_topic
 from mcaptrack.viewing.serving import WebViewer
 
 Progress = Callable[[str, int, int], None]

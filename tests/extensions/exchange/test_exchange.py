@@ -18,12 +18,12 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange.cvat import KEYFRAME_PX, CvatFile
-from mcaptrack.extensions.exchange.text import KittiFile
+from mcaptrack.extensions.exchange.kitti import KittiFile
 from mcaptrack.registry import find
 from mcaptrack.schema import TRACKS
+from mcaptrack.sources.box_files import BoxFile, ExportedBoxes, MotFile
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
-from mcaptrack.tables.box_files import BoxFile, ExportedBoxes, MotFile
 
 ALL = WantedClasses("all")
 NAMES = {1: "person", 2: "bicycle", 3: "traffic light", 7: 'a "b" <c> & d'}

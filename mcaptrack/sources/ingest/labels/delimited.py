@@ -1,6 +1,6 @@
 """Read tables of boxes with a header, separated by commas, semicolons or tabs.
 
-Any CSV of boxes in pictures, that of supervision, and boxes in metres, with headings in radians or degrees, or
+Any CSV of boxes in pictures, and boxes in metres, with headings in radians or degrees, or
 quaternions. Columns are those that the user names, or are guessed from common headers.
 
 Letters: N rows, F frames.
@@ -38,8 +38,6 @@ from mcaptrack.sources.ingest.labels.text import (
     states_number,
 )
 
-#: Columns that supervision writes before those of the user.
-SUPERVISION: Final = ("x_min", "y_min", "x_max", "y_max", "class_id", "confidence", "tracker_id")
 _DELIMITERS: Final = ",;\t|"
 #: Where one of these separates cells, a comma in a number is a decimal comma.
 _NOT_COMMAS: Final = (";", "\t", "|", " ")
@@ -52,8 +50,6 @@ _NAME: Final = re.compile(r"[A-Za-z][\w.%-]*")
 _DEEPEST: Final = 2
 #: Between cells of rows that come from JSON.
 SEPARATOR: Final = "\x1f"
-#: The column that counts frames from 0, as examples of supervision add it.
-_FRAME_INDEX: Final = "frame_index"
 #: The columns of MOTChallenge, in which a comment may name them.
 _MOT_COLUMNS: Final = {"frame": 0, "id": 1, "x": 2, "y": 3, "w": 4, "h": 5}
 #: Keys of columns that make a box.
@@ -289,38 +285,28 @@ class Csv(Format):
     title = "tables with a header"
     row = "columns by their names: `frame,x,y,w,h,score,class,id`"
     takes = ("columns",)
+    rank = 1
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row names columns, or a comment before it."""
         return is_table(file)
 
+    def header(self, file: LabelFile) -> list[str]:
+        """The names of columns."""
+        return header_of(file.path, file.row) or (comment_header(file.path, file.row) if file.row else [])
+
+    def opened(self, file: LabelFile) -> Opened:
+        """The table. Raises McaptrackError if it is none."""
+        return opened(file)
+
     def holds_3d(self, file: LabelFile, columns: Mapping[str, str]) -> bool:
-        """Whether the columns are those of boxes in metres, by their names, or as the user has it."""
-        return holds_boxes_3d(file.path, file.row, columns)
+        """Whether the columns are those of boxes or positions in metres, by their names, or as the user has it."""
+        return are_metres(self.header(file), columns)
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a table."""
-        if self.holds_3d(file, asked.columns):
-            return read_table_3d(opened(file), asked.columns)
-        return read_table(opened(file), "csv", asked.columns)
-
-
-class Supervision(Format):
-    """Tables of the CSVSink of supervision, and JSON of its JSONSink."""
-
-    title = "supervision"
-    row = f"`{','.join(SUPERVISION)},...`, or JSON with these keys"
-    takes = ("columns",)
-
-    def recognises(self, file: LabelFile) -> bool:
-        """Whether the columns, or the keys, are those of supervision."""
-        if file.is_json:
-            return isinstance(file.json, list) and "x_min" in file.keys if file.keys else False
-        return set(SUPERVISION) <= set(header_of(file.path, file.row)) if file.row else False
-
-    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
-        """The rows of a table, or of JSON: objects with the same keys."""
-        return read_table(records(file) if file.is_json else opened(file), "supervision", asked.columns)
+        read = read_table_3d if self.holds_3d(file, asked.columns) else read_table
+        return read(self.opened(file), asked.columns)
 
 
 def records(file: LabelFile) -> Opened:
@@ -351,8 +337,8 @@ def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     return out
 
 
-def read_table(table: Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
-    """The rows of a table of boxes in pictures, as those of the format ``name``. Raises McaptrackError."""
+def read_table(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
+    """The rows of a table of boxes in pictures. Raises McaptrackError."""
     path, header = table.path, table.header
     places = choose_columns(table.where, header, chosen)
     frames, ids = FrameNames(), TrackIds()
@@ -374,7 +360,7 @@ def read_table(table: Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
 
     cells = _Cells(table, places, {"frame": frame_of, "id": id_of, "t": time_of})
     track_id, said = ids.of(path, cells.column("id"))
-    remarks, facts = [cells.remark, *said], LabelFacts(path, name)
+    remarks, facts = [cells.remark, *said], LabelFacts(path)
     are_rows = "id" in places and header[places["id"]].lower() == "id" and "id" not in chosen
     if are_rows and len(np.unique(track_id)) == len(track_id) > 1:
         remarks.append(f"{path}: every box has another {header[places['id']]}, so it numbers rows, not tracks")
@@ -395,8 +381,6 @@ def read_table(table: Opened, name: str, chosen: Mapping[str, str]) -> BoxTable:
         facts.times_s, rows.frame = np.unique(seconds, return_inverse=True)
         facts.first_frame = 0
         _warn_of_zone(rows, without_zone)
-    if name == "supervision" and header[places.get("frame", 0)].lower() == _FRAME_INDEX:
-        facts.first_frame = 0
     return rows.with_boxes(cells.stacked(key for key in _OF_BOXES if key in places))
 
 
@@ -656,12 +640,6 @@ def _is_of_program(header: Sequence[str]) -> bool:
     return any(names >= set(required) for required in _OF_PROGRAMS)
 
 
-def holds_boxes_3d(path: Path, first: str, chosen: Mapping[str, str]) -> bool:
-    """Whether a table has 3D boxes, by its first line and the columns that are ``chosen`` by key."""
-    header = header_of(path, first) or (comment_header(path, first) if first else [])
-    return are_metres(header, chosen)
-
-
 def hold_places(header: Sequence[str]) -> bool:
     """Whether any of the columns holds a number of a place, by its name."""
     plain = {*_plain(header)}
@@ -704,7 +682,7 @@ def read_table_3d(table: Opened, chosen: Mapping[str, str]) -> BoxTable:
         track_id[is_known] = numbered(known_ids)
         if not are_numbers(known_ids):
             remarks.append(f"{path}: its ids are texts; tracks are numbered from 1 on as they come")
-    facts = LabelFacts(path, "csv", is_timed="t" in places)
+    facts = LabelFacts(path, is_timed="t" in places)
     facts.name((cells.names if "name" in places else cells.classes).names)
     boxes = np.column_stack([cells.stacked((*_PLACE, *_SIZE)), heading])
     kind = cells.column("name" if "name" in places else "class")

@@ -1,7 +1,6 @@
-"""Formats of labels: each is a class in a module of its own, and a line in the registry.
+"""Formats of labels: each is a class in a module of its own, and an entry point, or in the core a line in the registry.
 
-To add one, write a module like ``sdd``, name it in ``registry.BUILT_IN["label_format"]``, and add a file of it to
-tests/test_border.py. Nothing else names a format.
+To add one, write a module of an extension, name it in pyproject.toml, and write a test with a file of it.
 """
 
 from __future__ import annotations
@@ -13,10 +12,11 @@ from collections.abc import Mapping
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, Final
 
 from mcaptrack.errors import McaptrackError, call, list_names
 from mcaptrack.files import read_json, visible
+from mcaptrack.installed import missing_parts
 from mcaptrack.registry import names
 from mcaptrack.sources.ingest.decompression import opened
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
@@ -46,8 +46,6 @@ _OTHERS: Final = {
     b"\x80": "a pickle of Python, which could run anything; save it as CSV, Parquet or JSON",
     b"FEA1": "a table of Feather V1; save it as Parquet, or as Feather V2",
 }
-
-Part = TypeVar("Part")
 
 
 class LabelFile:
@@ -112,7 +110,7 @@ class LabelFile:
                 pass
         for magic, kind in _OTHERS.items():
             if self.head.startswith(magic):
-                raise McaptrackError(f"{self.path} is {kind}: that is read as labels")
+                raise McaptrackError(f"{self.path} is {kind}: that is read as labels{_not_installed()}")
 
     @property
     def is_json(self) -> bool:
@@ -172,13 +170,17 @@ class LabelFile:
 
     def unknown(self) -> McaptrackError:
         """The error for a file of no known format, with what it is instead."""
+        instead = self._instead()
+        return McaptrackError(f"{instead}{_not_installed()}" if instead else f"{self.path} holds no boxes")
+
+    def _instead(self) -> str:
         formats = ", ".join(names("label_format"))
         if self.is_folder:
             held = list_names([path.name for path in self.entries], _LISTED) or "nothing"
             hint = instead_of_images(self.entries)
             hint = hint or "; give the label file, or the folder that label files lie in, with `label_format=`"
             looked = f"looked in {', '.join(PLACES)}, and in itself for files of {formats}"
-            return McaptrackError(
+            return (
                 f"{self.path} holds no images ({', '.join(IMAGE_SUFFIXES)}) and no labels that are known; {looked}; "
                 f"it holds {held}{hint}"
             )
@@ -187,45 +189,41 @@ class LabelFile:
             keys = f" with {', '.join(self.keys)}"[:300] if self.keys else ""
             is_of_pictures = {"data", "annotations"} <= set(self.keys) or "annotation_id" in self.keys
             hint = "; export tasks of Label Studio with pictures as COCO or Pascal VOC" if is_of_pictures else ""
-            return McaptrackError(f"{self.path} is JSON ({kind}{keys}) of no label format ({formats}){hint}")
+            return f"{self.path} is JSON ({kind}{keys}) of no label format ({formats}){hint}"
         number, line = next(lines_of(self.path, MAX_LINE), (0, ""))
         if not number or self.is_json:
-            return McaptrackError(f"{self.path} holds no boxes")
+            return ""
         text = f"a row of {len(split(line))} columns fits no label format ({formats}): {line.strip()[:_SHOWN]}"
         if "," in line and any(cell[:1].isalpha() for cell in split(line)):
             text += "; a table with names of classes needs a first line that names its columns, separated by commas, "
             text += "semicolons or tabs: frame,id,class,left,top,width,height,score"
         if [len(split(line)) for _, line in islice(lines_of(self.path, MAX_LINE), 4)] == [3, 3, 3]:
             text += f"; a ground plane is given with the video: {call('ingest', 'VIDEO', ground_plane=self.path)}"
-        return McaptrackError(f"{self.path}:{number}: {text}")
+        return f"{self.path}:{number}: {text}"
 
 
-def chosen_part(path: Path, parts: Mapping[str, Part], wanted: str | None, noun: str, where: str = "") -> Part:
-    """The part of a file, a ``noun``, with this name, or the only one.
-
-    Raises McaptrackError if there is none, or if there are several and none is named.
-    """
-    if wanted is None and len(parts) == 1:
-        return next(iter(parts.values()))
-    if wanted is None or wanted not in parts:
-        what = f"no {noun} {wanted!r:.60}" if wanted else f"{len(parts)} {noun}s"
-        listed = list_names(sorted(parts), _LISTED)
-        raise McaptrackError(f"{path} has {what}{where}; choose one with `scene=`: {listed}")
-    return parts[wanted]
+def _not_installed() -> str:
+    missing = missing_parts("label_format")
+    return f"; {missing}" if missing else ""
 
 
 class Format:
     """A format of labels.
 
     ``title`` and ``row`` describe it in documents, ``takes`` are options that it reads. ``in_parts``: a row says all
-    about itself, so that long files may be read in parts.
+    about itself, so that long files may be read in parts. ``rank``: of several that recognise a file, the one with the
+    least reads it, or else the first by name; it is below 0 where a wider format recognises the same files, and above 0
+    for what recognises any table or folder. ``name`` is that of its entry.
     """
 
+    name: str = ""
+    rank: ClassVar[int] = 0
     title: ClassVar[str] = ""
     row: ClassVar[str] = ""
     takes: ClassVar[tuple[str, ...]] = ()
     in_space: bool = False
     reads_folders: ClassVar[bool] = False
+    reads_files: ClassVar[bool] = True
     in_parts: ClassVar[bool] = False
 
     def recognises(self, file: LabelFile) -> bool:

@@ -66,7 +66,7 @@ class Mot(Format):
         what = "MOTChallenge (frame, id, left, top, width, height, score, ...)"
         values, at = read_numbers(file.path, file.lines(), what, 8, parse, _split)
         score, kind = values[:, 6], values[:, 7]
-        facts = LabelFacts(file.path, "mot", first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
+        facts = LabelFacts(file.path, first_frame=0 if (values[:, 0] == 0).any() else 1, named_by="format")
         facts.is_first_assumed = facts.first_frame == 1  # some programs number frames from 0 in this format, too
         facts.not_counting, facts.scores_truth = "score 0", False
         table = BoxTable(

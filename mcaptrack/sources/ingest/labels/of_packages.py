@@ -18,7 +18,7 @@ from mcaptrack.files import refuse_special
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
 from mcaptrack.notices import warn
-from mcaptrack.registry import Entry, blamed, find, others
+from mcaptrack.registry import Entry, blamed, find, load, names, own
 from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable, LabelFacts
@@ -33,7 +33,7 @@ class FormatOfPackage(Format):
     reads_folders = True
 
     def __init__(self, entry: Entry, made: Any) -> None:
-        self.entry, self._made, self.in_space = entry, made, is_in_space(entry, made)
+        self.entry, self._made, self.in_space, self.name = entry, made, is_in_space(entry, made), entry.name
 
     @property
     def recognises_any(self) -> bool:
@@ -60,7 +60,7 @@ class FormatOfPackage(Format):
         """The boxes of a file."""
         path, boxes = file.path, self.boxes(file.path)
         with blamed(self.entry, f"gave what are no boxes of {path}"):
-            table = _table_of(path, self.entry.name, boxes, self.in_space)
+            table = _table_of(path, boxes, self.in_space)
         entry = self.entry
         table.facts.plugin = Plugin(entry.name, entry.implementation, entry.distribution, entry.version)
         return table
@@ -70,7 +70,7 @@ class FormatOfPackage(Format):
         return blamed(self.entry, "gave boxes that can't be labels")
 
 
-def _table_of(path: Path, name: str, given: LabelBoxes, in_space: bool) -> BoxTable:
+def _table_of(path: Path, given: LabelBoxes, in_space: bool) -> BoxTable:
     """Raise ValueError for what has another type, shape or range."""
     width = 7 if in_space else 4
     boxes = np.asarray(given.boxes, np.float64)
@@ -87,7 +87,7 @@ def _table_of(path: Path, name: str, given: LabelBoxes, in_space: bool) -> BoxTa
     if isinstance(first, bool) or not isinstance(first, int | np.integer):
         raise ValueError(f"first_frame={first!r:.40}, which is no whole number")
     facts = LabelFacts(
-        path, name, first_frame=int(first), times_s=times_s, labelled=labelled, frame_id=str(given.frame_id),
+        path, first_frame=int(first), times_s=times_s, labelled=labelled, frame_id=str(given.frame_id),
         states_labelled=given.labelled is not None,
     )  # fmt: skip
     facts.name(names)
@@ -168,7 +168,27 @@ def format_named(name: str) -> Format:
     Raises McaptrackError if there is none, or if it can't be used.
     """
     entry = find(_KIND, name)
-    return entry.cls() if entry.is_built_in else _made(entry)
+    if not entry.is_built_in:
+        return _made(entry)
+    made: Format = entry.cls()
+    made.name = name
+    return made
+
+
+def own_formats() -> list[Format]:
+    """The formats of mcaptrack, of the core and of extensions, in the order in which they are asked about a file."""
+    formats = []
+    for name, cls in _own_classes(tuple(own(_KIND).items())):
+        made = cls()
+        made.name = name
+        formats.append(made)
+    return formats
+
+
+@lru_cache(maxsize=4)
+def _own_classes(formats: tuple[tuple[str, str], ...]) -> list[tuple[str, type[Format]]]:
+    classes = [(name, load(name, value)) for name, value in formats]
+    return sorted(classes, key=lambda entry: (entry[1].rank, entry[0]))
 
 
 @lru_cache(maxsize=16)
@@ -182,13 +202,13 @@ def recognised(file: LabelFile) -> Format | None:
     Raises McaptrackError if several say so.
     """
     formats: dict[str, Format] = {}
-    for name in others(_KIND):
+    for name in sorted({*names(_KIND)} - {*own(_KIND)}):
         try:
             made = format_named(name)
             formats |= {name: made} if made.recognises(file) else {}
         except McaptrackError as error:
             warn(str(error), "other")
     if len(formats) > 1:
-        names = " and ".join(str(find(_KIND, name)) for name in formats)
-        raise McaptrackError(f"{file.path} is of the {names}; choose one with `label_format=`")
+        several = " and ".join(str(find(_KIND, name)) for name in formats)
+        raise McaptrackError(f"{file.path} is of the {several}; choose one with `label_format=`")
     return next(iter(formats.values()), None)

@@ -23,14 +23,13 @@ class _Positions(Format):
     """Rows of numbers: a frame, a track, and others, two of which are a position."""
 
     in_parts = True
-    name: ClassVar[str]
     columns: ClassVar[int]
     place: ClassVar[slice]
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""
         values, at = read_numbers(file.path, file.lines(), f"{self.title} ({self.row.strip('`')})", self.columns)
-        facts = LabelFacts(file.path, self.name, first_frame=0, interval_s=INTERVAL_S, named_by="format")
+        facts = LabelFacts(file.path, first_frame=0, interval_s=INTERVAL_S, named_by="format")
         facts.clock_of = f"{self.name}, a label every 0.4 s"
         return BoxTable(
             facts=facts, at=at, frame=values[:, 0], id=values[:, 1], xy_m=values[:, self.place],
@@ -41,7 +40,7 @@ class _Positions(Format):
 class Trajnet(_Positions):
     """Rows of TrajNet, separated by commas or blanks."""
 
-    name, title, row, columns, place = "trajnet", "TrajNet", "`frame id x y`", 4, slice(2, 4)
+    title, row, columns, place = "TrajNet", "`frame id x y`", 4, slice(2, 4)
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether the first row has 4 columns, and no names of columns."""
@@ -51,7 +50,7 @@ class Trajnet(_Positions):
 class Obsmat(_Positions):
     """Rows of an ETH obsmat, separated by blanks."""
 
-    name, title, row = "obsmat", "ETH obsmat", "`frame id x z y vx vz vy`"
+    title, row = "ETH obsmat", "`frame id x z y vx vz vy`"
     columns, place = 8, slice(2, 5, 2)
 
     def recognises(self, file: LabelFile) -> bool:

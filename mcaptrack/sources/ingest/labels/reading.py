@@ -16,12 +16,11 @@ import numpy as np
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import refuse_special, visible
-from mcaptrack.registry import BUILT_IN, entry_of
 from mcaptrack.schema.classes import ClassMap
 from mcaptrack.schema.spill import SpillFile, Stored
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, check
 from mcaptrack.sources.ingest.labels.format import PLACES, Format, LabelFile
-from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_named, recognised
+from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_named, own_formats, recognised
 from mcaptrack.sources.ingest.labels.roles import WantedClasses, rename, settled
 from mcaptrack.sources.ingest.labels.table import Asked, BoxTable, Extent
 from mcaptrack.sources.ingest.labels.text import lines_of, split
@@ -41,8 +40,7 @@ def known_format(file: LabelFile, label_format: str = _AUTO, columns: Mapping[st
     """
     if label_format != _AUTO:
         return format_named(label_format)
-    for name in BUILT_IN["label_format"]:
-        made = format_named(name)
+    for made in own_formats():
         if (not columns or "columns" in made.takes) and made.recognises(file):
             return made
     return format_named("records" if file.is_json else _TABLE) if columns else recognised(file)
@@ -127,13 +125,16 @@ def read_labels(
     if made is None:
         file.refuse_binary()
         raise file.unknown()
-    name = label_format if label_format != _AUTO else _name_of(made)
     for option in ("columns", "scene"):
         if getattr(asked, option) and option not in made.takes:
-            takers = [other.title for other in map(format_named, BUILT_IN["label_format"]) if option in other.takes]
-            raise McaptrackError(f"{path}: `{option}=` is for {', '.join(takers[::-1])}, not for {name}")
+            takers = ", ".join(other.title for other in own_formats() if option in other.takes)
+            takers = takers or "formats that aren't installed"
+            raise McaptrackError(f"{path}: `{option}=` is for {takers}, not for {made.name}")
     if file.is_folder and not made.reads_folders:
-        raise McaptrackError(f"{path} is a folder, and {name} labels are a file")
+        raise McaptrackError(f"{path} is a folder, and {made.name} labels are a file")
+    if not (file.is_folder or made.reads_files):
+        text = f"labels of {made.title} are a folder with a text file for each picture"
+        raise McaptrackError(f"{path} is not a folder; {text}")
     is_alike = role == "detections" or (role in ("tracks", None) and (wanted is None or wanted.is_people))
     if in_parts and made.in_parts and is_alike and class_map is None and path.stat().st_size >= _LONG_BYTES:
         table = _read_in_parts(file, made, replace(asked, role=role or "tracks"))
@@ -148,6 +149,7 @@ def read_labels(
 def read_by(made: Format, file: LabelFile, asked: Asked) -> BoxTable:
     """The rows of a file of a format. Raises McaptrackError as ``read_labels`` does."""
     table = made.read(file, asked)
+    table.facts.format = made.name
     table.facts.found_by = "content" if asked.label_format == _AUTO else "option"
     with made.checking() if isinstance(made, FormatOfPackage) else nullcontext():
         if asked.class_map is not None:
@@ -157,10 +159,6 @@ def read_by(made: Format, file: LabelFile, asked: Asked) -> BoxTable:
         table = settled(table, role, asked.classes).in_order()
         check(table, asked, OF_ROLE)
     return table
-
-
-def _name_of(made: Format) -> str:
-    return (made.entry if isinstance(made, FormatOfPackage) else entry_of("label_format", type(made))).name
 
 
 def read_homography(path: Path) -> tuple[float, ...]:
@@ -215,6 +213,7 @@ def _read_in_parts(file: LabelFile, made: Format, asked: Asked) -> BoxTable | No
         return None
     stored.append(_put(spilled, rest))
     facts = tables[0].facts
+    facts.format = made.name
     facts.labelled = np.unique(np.concatenate([part.labelled for part in tables]))
     facts.first_frame = min(part.first_frame for part in tables)
     facts.is_first_assumed = all(part.facts.is_first_assumed for part in tables)

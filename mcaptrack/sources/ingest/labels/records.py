@@ -5,22 +5,12 @@ Columns are those of tables with a header (``delimited``).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Final
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels.delimited import (
-    SEPARATOR,
-    Opened,
-    are_metres,
-    hold_places,
-    read_table,
-    read_table_3d,
-    records,
-    with_lists,
-)
-from mcaptrack.sources.ingest.labels.format import MAX_LINE, Format, LabelFile
-from mcaptrack.sources.ingest.labels.table import Asked, BoxTable
+from mcaptrack.sources.ingest.labels.delimited import SEPARATOR, Csv, Opened, hold_places, records, with_lists
+from mcaptrack.sources.ingest.labels.format import MAX_LINE, LabelFile
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -31,12 +21,12 @@ _ARROW: Final = b"ARROW1"
 _STREAM: Final = b"\xff\xff\xff\xff"
 
 
-class Records(Format):
+class Records(Csv):
     """Tables that other programs write, of boxes in pictures and in metres."""
 
     title = "tables in Parquet, Arrow, Feather or JSON"
     row = "the same columns in Parquet, Arrow or Feather, in JSON lines, or in a JSON list of objects"
-    takes = ("columns",)
+    rank = 3
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a file begins so, or is JSON of rows with a place in each."""
@@ -47,23 +37,13 @@ class Records(Format):
         except McaptrackError:
             return False
 
-    def holds_3d(self, file: LabelFile, columns: Mapping[str, str]) -> bool:
-        """Whether the columns are those of boxes or positions in metres."""
-        return are_metres(_table(file).header, columns)
+    def header(self, file: LabelFile) -> list[str]:
+        """The names of columns."""
+        return self.opened(file).header
 
-    def read(self, file: LabelFile, asked: Asked) -> BoxTable:
-        """The rows of a table."""
-        table = _table(file)
-        if are_metres(table.header, asked.columns):
-            rows = read_table_3d(table, asked.columns)
-            rows.facts.format = "records"
-            return rows
-        return read_table(table, "records", asked.columns)
-
-
-def _table(file: LabelFile) -> Opened:
-    """The columns of a file, and its rows as texts. Raises McaptrackError if it isn't a table."""
-    return records(file) if file.is_json else _of_arrow(file)
+    def opened(self, file: LabelFile) -> Opened:
+        """The columns of a file, and its rows as texts."""
+        return records(file) if file.is_json else _of_arrow(file)
 
 
 def _of_arrow(file: LabelFile) -> Opened:

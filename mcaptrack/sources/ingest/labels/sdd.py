@@ -43,7 +43,7 @@ class Sdd(Format):
             10,
             parse,
         )
-        facts = LabelFacts(file.path, "sdd", first_frame=0, names=names.names, numbering=_CLASSES, named_by="file")
+        facts = LabelFacts(file.path, first_frame=0, names=names.names, numbering=_CLASSES, named_by="file")
         facts.fps, facts.clock_of, facts.labelled = _FPS, self.title, np.unique(values[:, 5])
         table = BoxTable(
             facts=facts, at=at, frame=values[:, 5], id=values[:, 0], boxes_px=as_boxes(values[:, 1:5]),

@@ -102,7 +102,7 @@ class LabelFacts:
     """
 
     path: Path
-    format: str
+    format: str = ""
     found_by: str = ""
     first_frame: int | None = None
     is_first_assumed: bool = False

@@ -5,14 +5,13 @@ Letters: N rows, C columns.
 
 from __future__ import annotations
 
-import math
 import re
 from array import array
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from io import TextIOWrapper
 from pathlib import Path, PurePath
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.decompression import opened
-from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID
 
 #: Line numbers and lines, without empty lines and comments.
 Lines = Iterator[tuple[int, str]]
@@ -29,8 +28,6 @@ MAX_ROWS: Final = 10_000_000
 #: The largest number of characters of a row of numbers.
 MAX_ROW: Final = 4096
 _UTF16: Final = (BOM_UTF16_LE, BOM_UTF16_BE)
-#: Whole numbers of JSON can't be larger: as microseconds they are times.
-MAX_WHOLE: Final = 2**53
 #: The number of characters of a line that errors show.
 _LINE_SHOWN: Final = 60
 #: The number of class names of a file, at most: there are data sets with 21,841 classes.
@@ -76,19 +73,6 @@ def states_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value of JSON is a number."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def as_float(value: float) -> float:
-    """A number of JSON, also one that is too large."""
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf
 
 
 def split(line: str) -> list[str]:
@@ -239,16 +223,6 @@ class FrameNames:
             names = f"{''.join(self._around)!r:.40} and {''.join(around)!r:.40}"
             raise ValueError(f"the column of frames has names of several sequences, {names}")
         return int(match[2])
-
-
-def numbers_of_names(names: list[str]) -> list[int] | None:
-    """The frame numbers of pictures by their names; None if the names aren't numbered, or not uniquely."""
-    reader = FrameNames()
-    try:
-        numbers = [reader.number(name) for name in names]
-    except ValueError:
-        return None
-    return numbers if len(set(numbers)) == len(numbers) and max(numbers, default=0) <= MAX_FRAME else None
 
 
 def headings(quaternions: Floats, path: Path, at: Callable[[int], str]) -> tuple[Floats, Floats]:
