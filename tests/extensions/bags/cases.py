@@ -23,3 +23,10 @@ WORKS = {"export to a bag": (_prepare, _export, _export, 5)}
 WRITTEN = {
     name: partial(mcaptrack.export, form=form) for name, form in (("bag", "rosbag2"), ("old bag", "rosbag2-sqlite3"))
 }
+DEEP = {
+    "bags": (
+        "it reads recordings within the limits of `ingest`, and writes what views draw",
+        "foxglove.views.ground foxglove.views.people log.recording_files schema.encodings sources.fixed_frame "
+        "sources.foreign.definitions sources.ingest.decompression sources.ingest.plain_yaml sources.ingest.recording",
+    )
+}
