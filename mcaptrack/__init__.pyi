@@ -105,6 +105,7 @@ SCHEMA_VERSION: int
 # exporter rosbag2-sqlite3: mcaptrack.extensions.bags
 # recording rosbag: mcaptrack.extensions.bags
 # ending .bag: mcaptrack.extensions.bags
+# ending .bag.active: mcaptrack.extensions.bags
 # ending .db3: mcaptrack.extensions.bags
 # ending metadata.yaml: mcaptrack.extensions.bags
 # label_format argoverse: mcaptrack.extensions.exchange
