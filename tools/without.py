@@ -44,7 +44,10 @@ def install(folder: Path) -> None:
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     info = folder / "mcaptrack-0.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mcaptrack\nVersion: 0\n")
+    needs = [f"Requires-Dist: {package}\n" for package in project["dependencies"]]
+    for extra, packages in project["optional-dependencies"].items():
+        needs += [f"Provides-Extra: {extra}\n", *(f"Requires-Dist: {one}; extra == '{extra}'\n" for one in packages)]
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: mcaptrack\nVersion: 0\n{''.join(needs)}")
     groups = {"console_scripts": project["scripts"], **project["entry-points"]}
     lines = [line for name, own in groups.items() for line in (f"[{name}]", *(f"{k} = {v}" for k, v in own.items()))]
     (info / "entry_points.txt").write_text("\n".join(lines))
