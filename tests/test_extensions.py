@@ -467,6 +467,9 @@ def test_an_mcap_file_that_a_format_lists_is_left_as_it_is_and_its_list_is_updat
     Path("lists").rename("b/lists")
     Path("b/c.mcap").write_bytes(Path("b/lists/a.mcap").read_bytes())
     outcome = done("info", "b", "--json")
+    assert [result["log"] for result in json.loads(outcome.out)["results"]] == ["b/c.mcap", "b/lists/a.mcap"]
+    Path("b/lists/d.mcap").write_bytes(Path("b/c.mcap").read_bytes())  # now it has several files
+    outcome = done("info", "b", "--json")
     assert [result["log"] for result in json.loads(outcome.out)["results"]] == ["b/c.mcap"]
     assert "b/lists is a list, not an MCAP file; " in outcome.err
     assert "its files are left out" in outcome.err

@@ -18,7 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import place_of, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, sibling
 from mcaptrack.log import results_path
-from mcaptrack.log.recording_files import format_of, listing_of, not_mcap, refuse_non_mcap
+from mcaptrack.log.recording_files import format_of, listing_of, logs_in, not_mcap, refuse_non_mcap
 from mcaptrack.notices import warn
 
 #: The argument that stands for a list of names on standard input.
@@ -220,8 +220,8 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
 def _logs_in(folder: Path, leave_out: str, *, is_named: bool = False) -> Iterator[NamedLog]:
     """Yield all logs in a folder and below it, in order of their names.
 
-    A folder with files that are listed as parts of one recording holds no logs: it is left out with a warning, or
-    refused if a user named it.
+    The files of a folder that are listed as parts of one recording are no logs: they are left out with a warning. One
+    file that is a whole recording is a log. A folder of a recording that a user named is refused.
     """
 
     def unreadable(error: OSError) -> None:
@@ -230,10 +230,11 @@ def _logs_in(folder: Path, leave_out: str, *, is_named: bool = False) -> Iterato
     for place, folders, files in os.walk(folder, onerror=unreadable):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         names = [name for name in sorted(files) if name.lower().endswith(_SUFFIX) and not name.startswith(".")]
-        if names and listing_of(Path(place, names[0])):
+        is_top = is_named and Path(place) == folder
+        if names and (is_top or len(logs_in(Path(place))) > 1) and listing_of(Path(place, names[0])):
             recognised = format_of(Path(place))
             text = not_mcap(Path(place), str(recognised.answer) if recognised else "a recording")
-            if is_named and Path(place) == folder:
+            if is_top:
                 raise McaptrackError(text)
             warn(f"{text}; its files are left out", "left-out")
             continue
