@@ -71,8 +71,9 @@ def missing_extension(name: str, kind: str = "name") -> str:
     place, own = rf"{re.escape(_EXTENSIONS)}\.(\w+)", re.escape(name)
     in_python = kind in ("name", "command")
     match = re.search(rf"^from {place}\S* import {own} as" if in_python else rf"^# {kind} {own}: {place}$", stub, re.M)
-    folder = f"mcaptrack/extensions/{match[1]}" if match else ""
-    return f"{name} is an extension that isn't installed; install mcaptrack again, with {folder}" if folder else ""
+    if not match or any(point.is_own and point.value.split(".")[2] == match[1] for point in declared().points):
+        return ""
+    return f"{name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/{match[1]}"
 
 
 def _is_extension(name: str) -> bool:

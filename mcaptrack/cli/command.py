@@ -62,6 +62,8 @@ def _message(error: Any) -> str:
 def _unknown_option(error: Any) -> str:
     """Return the message about an unknown option: which commands have it, and which option may be meant."""
     name, context = error.option_name, error.ctx
+    if missing := missing_extension(name.removeprefix("--"), "finisher"):
+        return missing
     text = f"no such option: {name}"
     if context is None or context.parent is None:
         return f"{text}{nearest(name, error.possibilities or ())}"

@@ -13,7 +13,7 @@ from mcaptrack import log
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.registry import names
-from mcaptrack.schema.provenance import FUSE, VIEW, Provenance, digest
+from mcaptrack.schema.provenance import FUSE, INGEST, REFINE, VIEW, Provenance, digest
 from mcaptrack.sources.camera_motion import motion_topic, planes_in
 from mcaptrack.sources.cameras import camera_at, chain_of, is_plane, name_above, provenance_of
 from mcaptrack.sources.corrections import ANSWERS, CORRECTED, corrections_of
@@ -46,9 +46,9 @@ def is_stale(opened: log.Log, topic: str) -> bool:
 
 
 def is_finished(topic: str, how: Provenance) -> bool:
-    """Return whether a finisher, installed or not, made a channel: below its input, and neither a stage nor a view."""
-    is_stage = how.transform in STAGES or bool(how.plugins)
-    return not is_stage and how.transform != VIEW and bool(how.input) and topic.startswith(f"{how.input}/")
+    """Return whether a finisher, installed or not, made a channel: below its input, and nothing else makes such ones."""
+    is_other = how.transform in STAGES or how.transform in (INGEST, VIEW, FUSE, REFINE) or bool(how.plugins)
+    return not is_other and bool(how.input) and topic.startswith(f"{how.input}/")
 
 
 def missing_finisher(opened: log.Log, topic: str) -> str:
