@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, Literal, TypeAlias
 
+__all__ = ["Role", "Similarity"]
+
 #: How pictures are stored.
 ImageFormat = Literal["auto", "h264", "h265", "jpeg", "png"]
 #: Units of lengths in a calibration.

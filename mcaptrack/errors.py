@@ -13,6 +13,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+__all__ = ["DamagedError", "McaptrackError", "call", "command", "list_names", "offer"]
+
 
 class McaptrackError(Exception):
     """A fault in the input, the options or the machine that the user can fix.

@@ -22,6 +22,8 @@ from mcaptrack.errors import McaptrackError, list_names, similar
 from mcaptrack.location import SCHEMES, Location, Url, hide_secrets, shortened
 from mcaptrack.processes import MARK_DIGITS, has_ended, mark_of
 
+__all__ = ["is_same_file", "place_of", "publish_bytes", "read_json", "refuse_overwrite"]
+
 
 @contextmanager
 def publish(path: Path) -> Iterator[Path]:

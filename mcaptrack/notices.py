@@ -19,6 +19,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, Literal, NamedTuple, get_args
 
+__all__ = ["Notice", "collected", "warn"]
+
 #: The codes of warnings, for programs. docs/warnings.md explains them.
 Code = Literal[
     "assumed-ground-plane",

@@ -6,6 +6,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+import mcaptrack
+
 EXTENSIONS = Path(__file__).parent / "extensions"
 
 
@@ -17,3 +21,8 @@ def of_extensions(table: str) -> dict[Any, Any]:
         assert not entries.keys() & own.keys(), f"{path}: {table} has what another extension has"
         entries |= own
     return entries
+
+
+def needs(*names: str) -> pytest.MarkDecorator:
+    """Skip tests of what the core does for an extension, where its names in Python are gone."""
+    return pytest.mark.skipif(not {*names} <= {*mcaptrack.__all__}, reason="an extension is gone")

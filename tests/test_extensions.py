@@ -29,7 +29,7 @@ from mcaptrack.api.finishing import Finishers
 from mcaptrack.choices import BagFormat, BoxFormat, TableFormat
 from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, KINDS
+from mcaptrack.registry import BUILT_IN, KINDS, others
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources import fixed_frame
@@ -38,6 +38,8 @@ from tests.commands import call, done
 from tests.logs import provenance_of, recorder
 from tools import pages
 
+#: A command and a class of an extension; of the core, where there is no extension.
+COMMAND_OF_ONE, CLASS_OF_ONE = next(iter(others("command")), "track"), next(iter(others("name")), "RunResult")
 PAGE = pages.blocks(pages.ROOT / "docs" / "extend.md")
 FILES = {block.marks["file"]: block.text for block in PAGE if "file" in block.marks}
 BOXES = "0;a;person;10;20;30;60\n1;b;dog;90;50;40;30\n1;a;person;12;20;30;60\n"
@@ -538,21 +540,24 @@ def test_a_page_of_a_package_stands_beside_the_player_and_one_that_breaks_is_lef
 
 
 def test_a_name_that_is_not_there_proposes_one_of_an_extension():
-    with pytest.raises(AttributeError, match="did you mean report"):
-        mcaptrack.reprot  # noqa: B018
+    with pytest.raises(AttributeError, match=f"did you mean {COMMAND_OF_ONE}"):
+        getattr(mcaptrack, f"{COMMAND_OF_ONE}s")
 
 
 def test_names_of_extensions_and_of_the_core_are_not_replaced(site):
-    add(site, "command", "train", "raise ImportError")
-    install(site, {"mcaptrack.names": dict.fromkeys(("TrainResult", "Notice", "log"), "another:Part")}, "more", "1.0")
+    add(site, "command", COMMAND_OF_ONE, "raise ImportError")
+    install(site, {"mcaptrack.names": dict.fromkeys((CLASS_OF_ONE, "Notice", "log"), "another:Part")}, "more", "1.0")
     assert "another 2.0" not in done("--help").out
-    assert [getattr(mcaptrack, name).__module__.partition(".")[0] for name in ("train", "TrainResult", "Notice")] == [
-        "mcaptrack"
-    ] * 3
+    assert [
+        getattr(mcaptrack, name).__module__.partition(".")[0] for name in (COMMAND_OF_ONE, CLASS_OF_ONE, "Notice")
+    ] == ["mcaptrack"] * 3
     assert mcaptrack.log is log
     ignored = json.loads(done("doctor", "--json").out)["plugins"]
-    assert "there is a built-in command train" in ignored["command train (another 2.0)"]
-    assert "there is a built-in name TrainResult" in ignored["name TrainResult (more 1.0)"]
+    assert f"there is a built-in command {COMMAND_OF_ONE}" in ignored[f"command {COMMAND_OF_ONE} (another 2.0)"]
+    assert (
+        CLASS_OF_ONE == "RunResult"
+        or f"there is a built-in name {CLASS_OF_ONE}" in ignored[f"name {CLASS_OF_ONE} (more 1.0)"]
+    )
 
 
 def test_help_loads_neither_packages_nor_their_metadata(site):

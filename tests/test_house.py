@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +21,8 @@ from mcaptrack.installed import declared
 
 TESTS = Path(__file__).parent
 ROOT = TESTS.parent
-POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+POINTS = PROJECT["project"]["entry-points"]
 EXTENSIONS = sorted(path.parent.name for path in (ROOT / "mcaptrack" / "extensions").glob("*/__init__.py"))
 #: Groups of what users choose by name, beside commands and names in Python.
 CHOSEN = POINTS.keys() - {f"mcaptrack.{kind}s" for kind in ("command", "name", "page", "player", "viewer")}
@@ -168,3 +173,63 @@ def test_the_core_names_no_extension():
     for path in (ROOT / "mcaptrack").rglob("*.py"):
         if "extensions" not in path.relative_to(ROOT / "mcaptrack").parts:
             assert not [name for name in EXTENSIONS if f"extensions.{name}" in path.read_text()], path
+
+
+#: Modules of the core that aren't public, and the one extension that needs them.
+DEEP = {
+    "notebook": ("the player shows what `view` shows", "foxglove.messages viewing.links"),
+    "render": (
+        "it writes pictures as their channel says, and draws what views draw",
+        "cli.many foxglove.views.ground foxglove.views.projected foxglove.views.styles geometry.pinhole "
+        "schema.resampling sources.calibrations sources.fixed_frame sources.foreign.definitions sources.video.pixels",
+    ),
+    "report": (
+        "it shows all that is evaluated",
+        "evaluation.aligned evaluation.events evaluation.forecasts evaluation.people evaluation.zones "
+        "foxglove.views.people geometry.zones tables.catalogue tables.export.contents viewing.background viewing.charts",
+    ),
+    "review": (
+        "its answers are written as the channels of a stage are",
+        "pipeline.rebuild pipeline.write sources.sidecar transforms.retrack.options",
+    ),
+    "training": (
+        "it makes the weights that predictors read, of labels",
+        "geometry.mixtures predictors.forecast predictors.linear predictors.lstm predictors.red predictors.weights "
+        "sources.ingest.labels.reading sources.ingest.labels.roles sources.walks",
+    ),
+    "tuning": (
+        "it makes transforms with other settings, and writes these",
+        "api.running cli.chosen cli.config tables.compared transforms.guarded transforms.protocol",
+    ),
+}
+
+
+def names_from_the_core(path: Path) -> Iterator[tuple[str, str]]:
+    """The modules of the core that a module of an extension imports, and the names of them that it uses."""
+    tree, modules = ast.parse(path.read_text()), {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and re.match(r"mcaptrack\b(?!\.extensions)", node.module):
+            for alias in node.names:
+                if find_spec(node.module).submodule_search_locations and find_spec(f"{node.module}.{alias.name}"):
+                    modules[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+                else:
+                    yield node.module, alias.name
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in modules:
+            yield modules[node.value.id], node.attr
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_extensions_use_public_names_of_public_modules(extension):
+    """Public are the rooms that offer what they import, and modules with ``__all__``."""
+    rooms = next(o["module"] for o in PROJECT["tool"]["mypy"]["overrides"] if o.get("implicit_reexport"))
+    deep = set()
+    for path in (ROOT / "mcaptrack" / "extensions" / extension).rglob("*.py"):
+        for module, name in names_from_the_core(path):
+            public = getattr(import_module(module), "__all__", None)
+            assert not name.startswith("_") or name.endswith("__"), f"{path}: {module}.{name}"
+            if public is None and module not in rooms:
+                deep.add(module.removeprefix("mcaptrack."))
+            elif public is not None and module != "mcaptrack":
+                assert name in public, f"{path}: {module} has no public name {name}"
+    assert deep == {*DEEP.get(extension, ("", ""))[1].split()}

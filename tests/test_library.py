@@ -28,6 +28,7 @@ from mcaptrack.errors import call as proposed
 from mcaptrack.sources import demo
 from mcaptrack.transforms import ByteTrack
 from tests.commands import GROUP, LACKS, call, done
+from tests.extension_cases import of_extensions
 from tests.sources import PACKAGE, texts
 from tests.worlds import small_scene
 
@@ -183,18 +184,6 @@ class TestRefused:
                 lambda: mcaptrack.track("log.mcap", output="b.mcap", sidecar=True),
                 "`sidecar=True` and `output=` are two places",
             ),
-            "a tracker of a stage without one": (
-                lambda: mcaptrack.tune("log.mcap", stage="sample", tracker="sort"),
-                "the stage sample has no tracker; leave `tracker=` out",
-            ),
-            "a range that ends before it begins": (
-                lambda: mcaptrack.tune("log.mcap", search={"min_iou": (0.5, 0.1)}),
-                "`search=` needs a range from low to high for min_iou, not 0.5 to 0.1",
-            ),
-            "a parameter that can't be searched": (
-                lambda: mcaptrack.tune("log.mcap", search=["min_ious"]),
-                "`search=` has min_ious, which can't be searched; did you mean min_iou? there are max_age_s",
-            ),
             "a URL": (lambda: mcaptrack.info("https://host/a.mcap"), "https://host/a.mcap is a URL"),
             "what exists": (lambda: mcaptrack.recover("log.mcap", "log.mcap"), "both input and output"),
             "frames per second": (lambda: mcaptrack.ingest("video.mp4", "b.mcap", fps=0), "`fps=` needs a number"),
@@ -212,13 +201,12 @@ class TestRefused:
                 "there is no stage trak; `stages=",
             ),
             "no channels": (lambda: mcaptrack.drop("log.mcap", []), "name the channels to remove with `topics=`"),
-            "no logs": (lambda: mcaptrack.report([], "a.html"), "there is no log to report on"),
             **{
                 f"a folder to {name}": (
                     lambda name=name: getattr(mcaptrack, name)("."),
                     ". is a folder, not an MCAP file",
                 )
-                for name in ("check", "export", "render", "recover", "report")
+                for name in ("check", "export", "recover")
             },
             "no choice": (
                 lambda: mcaptrack.detections([[1, 2, 3, 4]], box_format="nonsense"),
@@ -247,6 +235,7 @@ class TestRefused:
                 "there is no score idf1; did you mean IDF1? there are",
             ),
             "what is there": (lambda: mcaptrack.open("log.mcap", create=True), "open it without `create=True`"),
+            **of_extensions("REFUSED"),
         }.values(),
     )
     def test_errors_are_one_line_that_names_parameters(self, place, work, words):

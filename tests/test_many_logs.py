@@ -55,7 +55,6 @@ def test_outputs_go_to_a_folder_under_the_names_of_the_logs(folder):
 
 
 def test_commands_that_combine_logs_take_folders_and_lists(folder, monkeypatch):
-    done("report", "logs", "-o", "page.html")
     data = json.loads(done("evaluate", "logs", "--json").out)
     assert {one["sequence"] for one in data["results"]} == {"a", "b", "COMBINED"}
     rows = done("query", "logs", "select count(distinct recording) as n from tracks", "--format", "csv").out

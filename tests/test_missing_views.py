@@ -59,7 +59,6 @@ def test_logs_of_the_longest_names_are_shown_where_their_tracks_are(without_view
         assert any(f"of at most {most} tracks" in note for note in server.notes)
         assert len(server.logs) == 2
         assert len(list(temporary.iterdir())) == 1
-    mcaptrack.render(path, tmp_path / "a.gif", width=64, end_s=0.2)
     assert path.read_bytes() == content
     assert list(temporary.iterdir()) == []
 

@@ -24,7 +24,7 @@ from tests.tiers import thorough
 
 MUTANTS = int(os.environ.get("MUTANTS", "0"))
 FIRST = int(os.environ.get("FIRST_MUTANT", "0"))
-COMMANDS = sorted(READING.keys() - {"train"})
+COMMANDS = sorted(READING)
 #: A command, and what has to hold of what it wrote, by the exit code.
 Work = tuple[list[object], Callable[[int], bool]]
 

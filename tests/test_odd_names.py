@@ -45,7 +45,6 @@ def test_logs_of_all_names_are_used_as_others_are(template, tmp_path, monkeypatc
         ["export", "--force"],
         ["query", "select count(*) > 0 as many from tracks", "--json"],
         ["export", "--format", "rosbag2"],
-        ["report"],
         *of_extensions("NAMED").values(),
         ["recover"],
         ["track", "--sidecar", "--force"],
@@ -77,7 +76,7 @@ def test_names_that_no_file_can_have_are_refused_in_one_line(command):
 def test_names_beside_a_log_fit_and_differ(parts):
     names = {part * (250 // len(part.encode())) for part in parts if part.strip(".")}
     paths = [Path(f"{name}.mcap") for name in names]
-    for beside in (results_path, journal_of, lambda path: sibling(path, ".report.html")):
+    for beside in (results_path, journal_of, lambda path: sibling(path, ".page.html")):
         found = [beside(path).name for path in paths]
         assert len(set(found)) == len(paths)
         assert all(len(name.encode()) <= 255 for name in found)

@@ -23,7 +23,9 @@ from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.many import ManyOptions
 from mcaptrack.cli.settings import Setting
 from mcaptrack.errors import McaptrackError
-from tests.commands import GROUP, LACKS, Terminal, call, done
+from mcaptrack.transforms import TRANSFORMS
+from tests.commands import GROUP, Terminal, call, done
+from tests.extension_cases import of_extensions
 
 
 @pytest.fixture
@@ -155,21 +157,10 @@ def test_texts_of_options_are_numbers_and_names_for_the_library(folder, asked):
     """What is none of these is in tests/printed.txt."""
     for said, gates in (("0.5,1,2", (0.5, 1.0, 2.0)), (" 1 ", (1.0,)), ("0.001", (0.001,))):
         assert asked("evaluate", "x.mcap", "--gate-m", said)["gate_m"] == gates
-    for said, search in (
-        *(("min-iou", ("min_iou", None)), ("--min-iou", ("min_iou", None))),
-        *(("min-iou=0.1:0.5", ("min_iou", (0.1, 0.5))), (" max-age-s =1:2", ("max_age_s", (1.0, 2.0)))),
-    ):
-        assert asked("tune", "x.mcap", f"--search={said}")["search"] == dict([search])
     for said, seconds in (("90s", 90), ("90", 90), (" 1.5M ", 90), ("2h", 7200), ("10 m", 600), (None, None)):
         assert ManyOptions(timeout=said).for_fleet()["timeout_s"] == seconds
-    for words, study, tracker in (
-        ([], "mcaptrack.sort.trials.jsonl", None),
-        (["--tracker", "own:It"], "mcaptrack.own.It.trials.jsonl", "own:It"),
-        (["--stage", "retrack", "-o", "to/b.toml"], "to/b.retrack.trials.jsonl", None),
-        (["--study", "mine"], "mine", None),
-    ):
-        given = asked("tune", "x.mcap", *words)
-        assert (given["study"], given["tracker"]) == (Path(study), tracker)
+    for words, values in of_extensions("GIVEN").items():
+        assert asked(*words).items() >= values.items(), words
 
 
 def test_options_that_concern_a_single_log_make_it_one_of_many(monkeypatch):
@@ -187,17 +178,16 @@ def test_options_that_concern_a_single_log_make_it_one_of_many(monkeypatch):
 # What commands give to the functions of the same names
 
 
-OF_FUNCTIONS = ("demo", "drop", "evaluate", "events", "export", "ingest", "recover", "render", "report", "train")
 FIRST = {"drop": ["x.mcap", "/a"], "demo": [], "query": ["x.mcap", "select 1"]}
 
 
 @pytest.mark.parametrize("twice", [["-o", "a.html", "-ob.html"], ["--output=a.html", "-o", "b.html"]])
 def test_an_option_of_one_value_is_not_given_two(folder, twice):
-    outcome = call("report", "x.mcap", *twice)
+    outcome = call("info", "x.mcap", *twice)
     assert (outcome.code, "--output is given as a.html and as b.html; give one" in outcome.err) == (2, True), (
         outcome.err
     )
-    assert "can't be" in call("report", "x.mcap", "-o", "a.html", "-o", "a.html", "--", "-ob.html").err
+    assert "can't be" in call("info", "x.mcap", "-o", "a.html", "-o", "a.html", "--", "-ob.html").err
 
 
 def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_are_there(tmp_path, monkeypatch):
@@ -238,7 +228,7 @@ def test_tables_of_two_logs_of_one_name_are_not_written_to_one_folder(folder, as
     assert (call("export", *words).code, call("export", *words).err.count("\n")) == (1, 1)
 
 
-@pytest.mark.parametrize("command", sorted({*OF_FUNCTIONS, "tune", "view", "query", "info", "check"} - LACKS))
+@pytest.mark.parametrize("command", sorted(GROUP.commands.keys() & {*mcaptrack.__all__} - {"models", *TRANSFORMS}))
 def test_notes_are_printed_unless_quiet_and_details_with_verbose(command, folder, monkeypatch):
     def called(*_: Any, **__: Any) -> None:
         logging.getLogger("mcaptrack").info("a note")

@@ -136,7 +136,7 @@ def test_outputs_may_be_missing_or_more_and_go_with_their_class(logs, place, beg
     assert f"{main}/debug" in now or not name.endswith("More")
     if kind == "retracker":  # nothing is left of outputs that the former one had, nor what was made of them
         assert not [topic for topic in now if topic.startswith(("retracks/online", "retracks/predictions"))]
-        for words in (["check"], ["evaluate"], ["info"], ["report", "-o", "r.html"], ["export", "-o", "t"]):
+        for words in (["check"], ["evaluate"], ["info"], ["export", "-o", "t"]):
             done(words[0], "a.mcap", *words[1:], "-q")
         with log.read(Path("a.mcap")) as opened:
             assert not any(b"retracks/online" in (opened.attachment(layout) or b"") for layout in ATTACHMENTS)

@@ -23,6 +23,7 @@ from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import STAGES
 from tests.commands import call, done, made_log
 from tests.distributions import package
+from tests.extension_cases import needs
 from tests.logs import provenance_of
 
 MODULE = """
@@ -325,6 +326,7 @@ def test_help_reads_no_file_of_settings(place):
     assert call("track", "--tracker", "single", "--help").code == 0
 
 
+@needs("tune")
 def test_tune_names_a_tracker_that_fails(place):
     """In a run, when it is made with values to try, and at the ends of a range."""
     (place / "gt.txt").write_text("".join(f"{n},1,10,10,5,5,1,-1,-1,-1\n" for n in range(1, 9)))

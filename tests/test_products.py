@@ -257,13 +257,12 @@ def test_logs_that_are_used_together_have_names_of_their_own_or_are_refused(name
     else:
         alone = [mcaptrack.query(log, "select count(*) as n from tracks").to_pydict()["n"] for log in logs]
         assert sorted(answer.to_pydict()["n"]) == sorted(n for some in alone for n in some)
-    try:
-        page = mcaptrack.report(logs, tmp_path / "page.html")
-    except McaptrackError as error:
-        assert "rename one" in str(error)
-        assert contents(tmp_path) == before
-    else:
-        assert len({one["name"] for one in page.data["logs"]}) == 2
+    for names_of in of_extensions("TOGETHER").values():
+        try:
+            assert len(set(names_of(logs, tmp_path))) == 2
+        except McaptrackError as error:
+            assert "rename one" in str(error)
+            assert contents(tmp_path) == before
 
 
 def test_a_log_by_two_names_does_not_count_twice(tmp_path, finished):
@@ -271,10 +270,7 @@ def test_a_log_by_two_names_does_not_count_twice(tmp_path, finished):
     link.symlink_to(finished)
     rows = "select count(*) as n from tracks"
     assert mcaptrack.query([finished, link], rows).to_pydict() == mcaptrack.query(finished, rows).to_pydict()
-    for refused in (
-        lambda: mcaptrack.report([finished, link], tmp_path / "a.html"),
-        lambda: mcaptrack.evaluate([link, finished]),
-    ):
+    for refused in (lambda: mcaptrack.evaluate([link, finished]),):
         with pytest.raises(McaptrackError, match=r"walk\.mcap is named twice; name it once"):
             refused()
 

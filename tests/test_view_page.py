@@ -18,13 +18,12 @@ import mcaptrack
 from mcaptrack.errors import McaptrackError
 from tests.browser import browser, needs_browser
 from tests.commands import done
+from tests.extension_cases import needs
 from tests.reader import Reader
 from tests.test_serving import ask
 from tests.worlds import ns, write_eventful
 
-pytestmark = pytest.mark.skipif(
-    not {"report", "Player"} <= {*mcaptrack.__all__}, reason="the pages that it shows are of extensions"
-)
+pytestmark = needs("report", "Player")  # the pages that it shows
 
 
 @pytest.fixture(scope="module")

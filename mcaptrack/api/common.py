@@ -16,6 +16,20 @@ from mcaptrack.files import is_same_file, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, is_remote, parse
 from mcaptrack.notices import Notice
 
+__all__ = [
+    "Notes",
+    "as_path",
+    "detail",
+    "locations_of",
+    "log_file",
+    "log_location",
+    "names_of",
+    "optional_path",
+    "paths_of",
+    "warn_unused",
+    "warnings_about",
+]
+
 #: Where routine notes go ("/camera/tracks is missing: running track"): INFO, and DEBUG for details.
 _LOGGER: Final = logging.getLogger("mcaptrack")
 

@@ -39,6 +39,8 @@ from typing import (
 from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.installed import missing_extension
 
+__all__ = ["Argument", "Option", "checked", "declared"]
+
 P = ParamSpec("P")
 T = TypeVar("T")
 _More = Callable[[Collection[str]], Mapping[str, inspect.Parameter]]

@@ -16,6 +16,8 @@ from mcaptrack.errors import McaptrackError
 if TYPE_CHECKING:
     from mcaptrack.sources.ingest import IngestOptions
 
+__all__ = ["Classes", "Format", "LabelFps", "label_options", "warn_of_unused"]
+
 #: The heading in the help.
 READING: Final = "Reading of label files"
 #: What a file in the working folder may give for frames per second.

@@ -12,6 +12,27 @@ from mcaptrack.choices import Point
 if TYPE_CHECKING:
     from mcaptrack.registry import Kind
 
+__all__ = [
+    "FILES",
+    "LABELS",
+    "LOGS",
+    "SCORES",
+    "Camera",
+    "EachLog",
+    "Force",
+    "GroundPlane",
+    "MinIou",
+    "PathLike",
+    "Progress",
+    "Reports",
+    "Topic",
+    "chooser",
+    "gate_m",
+    "no_progress",
+    "output",
+    "similarity",
+]
+
 PathLike = str | os.PathLike[str]
 #: Called with the name of a stage, the amount that is done, and the total.
 Progress = Callable[[str, int, int], None]

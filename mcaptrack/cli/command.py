@@ -20,6 +20,8 @@ from mcaptrack.errors import similar
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 
+__all__ = ["warn_unused"]
+
 #: The exception of Typer for a command line that it can't parse.
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
 

@@ -30,6 +30,8 @@ from mcaptrack.location import Location, is_remote, parse
 from mcaptrack.notices import Notice
 from mcaptrack.streams import LostOutputError
 
+__all__ = ["Talk", "expand", "print_json"]
+
 P = ParamSpec("P")
 
 

@@ -35,6 +35,8 @@ from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 from mcaptrack.registry import blamed, find
 
+__all__ = ["Once"]
+
 T = TypeVar("T")
 #: Heading of the options of all commands.
 COMMON: Final = LAST_PANELS[-1]

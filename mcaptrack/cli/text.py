@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
+__all__ = ["console", "counted", "show"]
+
 WRONG_USAGE: Final = 2
 _STDOUT, _STDERR = 1, 2
 Level = Literal["debug", "info", "warning", "error"]

@@ -47,6 +47,18 @@ from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES
 
+__all__ = [
+    "Candidate",
+    "EvaluateOptions",
+    "EvaluationInput",
+    "EvaluationRow",
+    "combined",
+    "evaluate",
+    "ground_truth_of_log",
+    "sequence_of_log",
+    "set_means",
+]
+
 COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)
 #: The channels of a camera that are scored, and the channels of forecasts made from them.

@@ -14,6 +14,8 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 
+__all__ = ["Occupancy", "occupancy"]
+
 #: Two positions of a track that are further apart in time don't say where the person was in between.
 MAX_GAP_S: Final = 2.0
 #: The usual size of a cell, and the largest number of cells along a side; larger places have larger cells.

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.schema.classes import PEOPLE
 
+__all__ = ["COUNT", "colours"]
+
 Rgba = tuple[float, float, float, float]
 
 # Okabe and Ito's palette for colour-blind people, without black; then the same, lighter and darker.

@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = ["Bools", "Floats", "Image", "Ints"]
+
 #: Measured values: coordinates, scores, seconds.
 Floats = NDArray[np.float64]
 #: Whole numbers of a fixed width: ids, counts, times in nanoseconds.

@@ -12,6 +12,8 @@ from datetime import UTC, datetime
 from fractions import Fraction
 from typing import Final
 
+__all__ = ["NS_PER_S", "seconds_to_ns"]
+
 NS_PER_S: Final = 1_000_000_000
 #: Earlier times are not dates but seconds since something began: the year 1980.
 FIRST_DATE_NS: Final = 315_532_800 * NS_PER_S

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mcaptrack.geometry.arrays import Bools, Ints
 
+__all__ = ["find_rows", "group_index", "ragged_range", "run_ends", "run_starts"]
+
 
 def group_index(counts: ArrayLike) -> Ints:
     """For each member the group it belongs to.

@@ -24,6 +24,8 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import STAGES
 
+__all__ = ["Camera", "camera_at", "cameras", "find_camera", "provenance_of", "repaired_tracks"]
+
 #: The default name of a camera.
 DEFAULT_CAMERA: Final = "camera"
 #: The topics of ingested channels, below the name of their camera.

@@ -21,6 +21,8 @@ from mcaptrack.schema.framing import filtered_rows, frame_times, unique_values
 from mcaptrack.schema.resampling import interval_ns, resample
 from mcaptrack.sources.cameras import camera_at
 
+__all__ = ["ANSWERS", "CORRECTED"]
+
 #: The topic of corrections, below the name of their camera.
 CORRECTED: Final = "corrected"
 #: The topic of answers to questions about identities (rows of Decisions), below the name of their camera.

@@ -24,6 +24,8 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import VIDEO, cameras
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray, read_head
 
+__all__ = ["Pictures"]
+
 #: The backward search for a key picture: messages in the second step, the factor for each further step, and the maximum
 #: in one step.
 _STEP, _FURTHER, _MOST = 8, 4, 512

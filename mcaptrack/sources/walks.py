@@ -49,6 +49,7 @@ class Crowd:
 
     @classmethod
     def start(cls, rng: np.random.Generator) -> Crowd:
+        """Place people in scenes, with their paces, goals and groups."""
         shape = (SCENES, PEOPLE)
         side = np.exp(rng.uniform(np.log(30), np.log(150), (SCENES, 1)))
         kind = rng.choice(4, shape, p=_PACES)

@@ -26,6 +26,8 @@ from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.ingest.labels.mot import MOT_CLASSES
 from mcaptrack.sources.pictures import size_of_pictures
 
+__all__ = ["BoxFile", "ExportedBoxes", "boxes_topic", "joined_lines", "merged_classes", "score_text", "unscored"]
+
 #: The id of boxes without one.
 NO_ID: Final = -1
 #: Below the name of a camera, the best first: re-tracked boxes of every picture before those of the tracker.

@@ -17,6 +17,8 @@ from markupsafe import Markup
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
 from mcaptrack.viewing.charts import WIDTH, Axis, Line, line_chart, round_most, thinned, time_ticks
 
+__all__ = ["NONE", "clock", "counted", "number", "percent", "plain", "policy", "render", "short", "tick_marks", "times"]
+
 #: Printed in place of a number that is missing.
 NONE: Final = "\N{EN DASH}"
 _MAX_FIXED: Final = 1e6

@@ -18,6 +18,8 @@ from mcaptrack.pipeline import RobotPath
 from mcaptrack.viewing.legend import BACKGROUND
 from mcaptrack.viewing.painting import text_size
 
+__all__ = ["ABOVE_PX", "LabelPlaces", "Sight", "drawing", "grid", "ground", "robot", "sight_of", "sights"]
+
 _GRID: Final = (0.2, 0.22, 0.25, 1.0)
 _INK: Final = (0.85, 0.87, 0.9, 1.0)
 _ROBOT: Final = (*styles.WHITE, styles.ROBOT_ALPHA)

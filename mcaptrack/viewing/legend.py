@@ -18,6 +18,8 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.painting import draw, put_text, text_size
 
+__all__ = ["BACKGROUND", "INK", "tracker_name", "with_legend"]
+
 #: The colours of the strip and of its text: blue, green, red.
 BACKGROUND, INK = (32, 28, 26), (235, 230, 225)
 #: Narrower videos have no legend: it couldn't be read.

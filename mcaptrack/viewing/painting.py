@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.notices import warn
 
+__all__ = ["CLOSED", "draw", "message_at", "put_text", "scaled", "strokes", "text_size", "without_repeated"]
+
 #: The size of text that OpenCV draws at a scale of 1, and the least one in a video.
 _TEXT_PX: Final = 24.0
 _LEAST_TEXT_PX: Final = 9.0

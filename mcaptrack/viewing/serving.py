@@ -36,6 +36,8 @@ from mcaptrack.installed import missing_extension
 from mcaptrack.log import Log
 from mcaptrack.registry import find, names
 
+__all__ = ["AS_MANY_AS_FIT", "LOOPBACK", "Choice", "LogPage", "Page", "Server", "WebViewer"]
+
 LOOPBACK: Final = "127.0.0.1"
 _LOCAL: Final = (LOOPBACK, "localhost")
 #: The hosts that stand for all addresses of this machine.

@@ -18,6 +18,8 @@ from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.mixtures import Tails, log_density, mahalanobis_squared, mass_within, normal_tails
 from mcaptrack.geometry.ragged import cross_pairs, find_rows, group_index, ragged_range, run_ends, run_starts
 
+__all__ = ["LEVELS", "Displacement", "forecast_scores"]
+
 #: The association threshold in m^2 at which single numbers are reported (tau in the paper).
 TAU_M2: Final = 2.0
 

@@ -25,3 +25,5 @@ from mcaptrack.sources.foreign.picture_messages import picture_decoder as pictur
 from mcaptrack.sources.foreign.picture_messages import picture_reader as picture_reader
 from mcaptrack.sources.foreign.picture_messages import pictures as pictures
 from mcaptrack.sources.foreign.picture_messages import stamps as stamps
+
+__all__ = ["Picture", "holds_boxes", "holds_pictures", "is_compressed", "picture_reader", "pictures"]

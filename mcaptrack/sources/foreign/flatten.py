@@ -29,6 +29,8 @@ from mcaptrack.sources.foreign.definitions import MessageType, defined, is_defin
 if TYPE_CHECKING:
     from mcaptrack.columns import ProtobufColumns, RosColumns
 
+__all__ = ["message_decoder", "message_type_of"]
+
 T = TypeVar("T")
 Path = tuple[str, ...]
 

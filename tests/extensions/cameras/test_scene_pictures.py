@@ -26,7 +26,6 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.demo import PLACES, Pedestrian, Pose, SyntheticScene, three_cameras
 from mcaptrack.sources.video import write_mp4
 from mcaptrack.viewing.links import find_moments
-from tests.commands import done
 from tests.logs import write_with_views
 
 FPS, NS = 2, 1_000_000_000
@@ -141,8 +140,6 @@ def test_layouts_and_videos_show_the_scene_on_the_pictures(path: Path, tmp_path:
         views, pictures = pipeline.find_views(opened, "/right")
     assert (pictures, views[0]) == ("/right/video", "/world/retracks/full/view/image/right/video")
     assert "drawing the tracks of /world on /right/video; `topic=` names those of /right" in warnings[0].message
-    told = done("render", path, "--camera", "right", "-o", tmp_path / "a.gif", "--width", "64", "--end-s", "0.5").err
-    assert "/world/retracks/full/view/image/right/video" in told
 
 
 def test_links_are_to_events_of_the_scene_as_its_ids_are_those_on_the_pictures(path: Path, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ USES = {
     ]
 }
 TOPICS = {"render": ("tracks", lambda p, t, f: mcaptrack.render(p, f / "a.mp4", topic=t, end_s=0.3).views)}
+REFUSED = {"a folder for a video": (lambda: mcaptrack.render("."), ". is a folder, not an MCAP file")}
 WRITTEN = {name: lambda path, output: mcaptrack.render(path, output=output) for name in ("a.mp4", "a.gif")}
 PROPOSALS = {
     "pipeline/drawing.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import tempfile
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
+import mcaptrack
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.render.video import RenderOptions, render
@@ -22,7 +25,7 @@ from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.legend import with_legend
 from mcaptrack.viewing.painting import draw, message_at
-from tests.commands import call, printed
+from tests.commands import call, done, printed
 from tests.logs import recorder
 from tests.robots import write_log
 
@@ -275,3 +278,18 @@ def test_a_video_of_which_no_picture_can_be_decoded_is_named(template, tmp_path)
     ):
         render(opened, "/eye", (), tmp_path / "a.gif", RenderOptions())
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_video_of_a_log_in_a_store_is_written_here(store, template):
+    done("render", store.put("night/a.mcap", template))
+    assert (os.listdir(), store.names()) == (["a.mp4"], ["night/a.mcap"])
+
+
+def test_views_that_a_log_lacks_are_drawn_and_the_log_stays_as_it_is(template, tmp_path, monkeypatch):
+    path = tmp_path / ("a" * 250 + ".mcap")
+    mcaptrack.drop(template, "*/view/*", output=path)
+    content = path.read_bytes()
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    mcaptrack.render(path, tmp_path / "a.gif", width=64, end_s=0.2)
+    assert (path.read_bytes(), [*(tmp_path / "temporary").iterdir()]) == (content, [])

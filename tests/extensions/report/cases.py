@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import mcaptrack
+from tests.commands import done
 
 READING = {"report": lambda log, out: [log, "-o", out / "report.html"]}
 EFFECTS = {
@@ -13,6 +14,23 @@ EFFECTS = {
         {"camera": "--camera other", "output": "-o b.html", "force": ("report a.mcap -o old.html", "--force")},
     )
 }
+REFUSED = {
+    "no logs for a page": (lambda: mcaptrack.report([], "a.html"), "there is no log to report on"),
+    "a folder for a page": (lambda: mcaptrack.report("."), ". is a folder, not an MCAP file"),
+}
+TOGETHER = {
+    "report": lambda logs, folder: [log["name"] for log in mcaptrack.report(logs, folder / "page.html").data["logs"]]
+}
+
+
+def _topics(path: Path, folder: Path) -> list[str]:
+    """The channels in the table of a page."""
+    done("report", path, "-o", folder / "a.html")
+    page = (folder / "a.html").read_text().replace("<wbr>", "")  # where names may be broken over lines
+    return re.findall(r"<th scope=.row.[^>]*><bdi><code>(/[^<]+)<", page)
+
+
+TOPICS_IN_ORDER = {"report": _topics}
 WRITTEN = {"a.html": lambda path, output: mcaptrack.report(path, output=output)}
 
 

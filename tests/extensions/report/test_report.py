@@ -6,6 +6,7 @@ import base64
 import hashlib
 import itertools
 import json
+import os
 import re
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from jinja2 import UndefinedError
 
 import mcaptrack
 from mcaptrack import foxglove, log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
 from mcaptrack.evaluation.events import MatchRule, find_events
 from mcaptrack.evaluation.people import Interval, Intervals
@@ -39,6 +41,7 @@ from mcaptrack.transforms import Predict
 from mcaptrack.viewing import charts
 from mcaptrack.viewing.charts import Axis, Bars, Line
 from mcaptrack.viewing.formatting import environment, plain
+from tests import robots
 from tests.commands import call, done, printed
 from tests.logs import add_rows, write_channels
 from tests.reader import Reader
@@ -640,3 +643,32 @@ def test_rules_that_differ_in_their_limit_are_said_together():
 def test_a_result_is_shown_in_a_line():
     page = mcaptrack.ReportResult(Path("page.html"), 12, {"many": [0] * 1000}, ())
     assert repr(page) == f"ReportResult({str(page.page)!r}, 12 bytes)"
+
+
+def test_a_recording_with_boxes_of_other_software_has_tracks_on_its_page(tmp_path):
+    path = tmp_path / "boxes.mcap"
+    robots.write_log(path, "/front/image_raw", boxes="/front/detections")
+    done("run", path, "--topic", "/front/detections", "--no-tables", "-q")
+    done("report", path, "-o", tmp_path / "r.html", "-q")
+    assert "There are no tracks here" not in (tmp_path / "r.html").read_text()
+
+
+def test_the_page_of_a_log_in_a_store_is_written_here(store, template):
+    done("report", store.put("night/a.mcap", template))
+    assert (os.listdir(), store.names()) == (["a.report.html"], ["night/a.mcap"])
+
+
+def test_a_log_by_two_names_is_named_twice(finished, tmp_path):
+    link = tmp_path / "link.mcap"
+    link.symlink_to(finished)
+    with pytest.raises(McaptrackError, match=r"walk\.mcap is named twice; name it once"):
+        mcaptrack.report([finished, link], tmp_path / "a.html")
+
+
+def test_the_page_has_scores_of_classes(tmp_path):
+    rows = "".join(f"{n},{who},{n},{5 * who},{kind}\n" for n in range(30) for who, kind in ((1, "person"), (2, "cart")))
+    (tmp_path / "a.csv").write_text(f"frame,id,x_m,y_m,class\n{rows}")
+    for role, place in (("tracks", "output"), ("truth", "into")):
+        mcaptrack.ingest(tmp_path / "a.csv", role=role, fps=10, **{place: tmp_path / "a.mcap"})
+    mcaptrack.report(tmp_path / "a.mcap", tmp_path / "a.html")
+    assert "within 1 m on the ground, cart" in (tmp_path / "a.html").read_text()

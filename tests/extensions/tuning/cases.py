@@ -41,6 +41,34 @@ TOPICS = {
         lambda p, t, f: mcaptrack.tune(p, stage="track", topic=t, trials=1, study=f / "a.jsonl").scores,
     )
 }
+REFUSED = {
+    "a tracker of a stage without one": (
+        lambda: mcaptrack.tune("log.mcap", stage="sample", tracker="sort"),
+        "the stage sample has no tracker; leave `tracker=` out",
+    ),
+    "a range that ends before it begins": (
+        lambda: mcaptrack.tune("log.mcap", search={"min_iou": (0.5, 0.1)}),
+        "`search=` needs a range from low to high for min_iou, not 0.5 to 0.1",
+    ),
+    "a parameter that can't be searched": (
+        lambda: mcaptrack.tune("log.mcap", search=["min_ious"]),
+        "`search=` has min_ious, which can't be searched; did you mean min_iou? there are max_age_s",
+    ),
+}
+#: What the function gets of words on the command line.
+GIVEN = {
+    ("tune", "x.mcap", *words): values
+    for words, values in {
+        ("--search=min-iou",): {"search": {"min_iou": None}},
+        ("--search=--min-iou",): {"search": {"min_iou": None}},
+        ("--search=min-iou=0.1:0.5",): {"search": {"min_iou": (0.1, 0.5)}},
+        ("--search= max-age-s =1:2",): {"search": {"max_age_s": (1.0, 2.0)}},
+        (): {"study": Path("mcaptrack.sort.trials.jsonl"), "tracker": None},
+        ("--tracker", "own:It"): {"study": Path("mcaptrack.own.It.trials.jsonl"), "tracker": "own:It"},
+        ("--stage", "retrack", "-o", "to/b.toml"): {"study": Path("to/b.retrack.trials.jsonl"), "tracker": None},
+        ("--study", "mine"): {"study": Path("mine"), "tracker": None},
+    }.items()
+}
 WRITTEN = {"a.trials.jsonl": lambda path, output: mcaptrack.tune(path, study=output, trials=3)}
 _SCORES = {"IDF1": 0.75, "MOTA": 0.5, "HOTA": 0.25, "IDSW": 1, "FP": 2, "FN": 3}
 
