@@ -177,6 +177,13 @@ def test_the_core_names_no_extension():
 
 #: Modules of the core that aren't public, and the one extension that needs them.
 DEEP = {
+    "cameras": (
+        "it writes a scene as the channels of a stage are written, and finds fusers as transforms are found",
+        "api.running cli.flags cli.many cli.running foxglove.views.people geometry.assignment geometry.neighbours "
+        "geometry.pinhole pipeline.checks pipeline.choice_of_cameras pipeline.pictures pipeline.rebuild "
+        "pipeline.several pipeline.staleness pipeline.write schema.frame_columns schema.ground_plane "
+        "sources.fixed_frame sources.sidecar transforms.guarded transforms.protocol",
+    ),
     "notebook": ("the player shows what `view` shows", "foxglove.messages viewing.links"),
     "render": (
         "it writes pictures as their channel says, and draws what views draw",

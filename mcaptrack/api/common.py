@@ -18,6 +18,7 @@ from mcaptrack.notices import Notice
 
 __all__ = [
     "Notes",
+    "as_location",
     "as_path",
     "detail",
     "locations_of",
@@ -26,6 +27,7 @@ __all__ = [
     "names_of",
     "optional_path",
     "paths_of",
+    "split_names",
     "warn_unused",
     "warnings_about",
 ]

@@ -18,7 +18,7 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.ragged import run_starts
 
-__all__ = ["GroundPlane", "Planes", "is_estimated", "origin_of", "plane_at"]
+__all__ = ["GroundPlane", "Planes", "is_assumed", "is_estimated", "origin_of", "plane_at", "runs_of_planes"]
 
 #: The height of a person, for guessing the scale of a scene from its boxes.
 PERSON_HEIGHT_M = 1.7

@@ -24,6 +24,8 @@ from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.cameras import detections_topic, provenance_of
 from mcaptrack.transforms import Stage, Transform
 
+__all__ = ["Member", "Progress", "Say", "SceneMaker"]
+
 T = TypeVar("T")
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]

@@ -13,7 +13,17 @@ from mcaptrack.geometry.ragged import group_index
 from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 
-__all__ = ["frame_times", "has_any", "join_frames", "joined_parts", "row_ends", "split_rows"]
+__all__ = [
+    "JoinedFrames",
+    "frame_numbers",
+    "frame_times",
+    "has_any",
+    "join_frames",
+    "joined_parts",
+    "nearest_times",
+    "row_ends",
+    "split_rows",
+]
 
 #: The number of rows that are computed with at once where a channel may have more than fit into memory.
 PART_ROWS: Final = 2**16
