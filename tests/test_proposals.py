@@ -15,7 +15,7 @@ from unittest.mock import patch
 import pytest
 
 import mcaptrack
-from mcaptrack import log
+from mcaptrack import log, pipeline
 from mcaptrack.cli.flags import with_flags
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
@@ -154,6 +154,12 @@ class Scene:
             mcaptrack.run("next.mcap", follows=self.path)
         return with_flags(str(refused.value))
 
+    def without_views(self) -> str:
+        """Look for views of a log that nothing was found in."""
+        with log.read(self.untracked().path) as opened, pytest.raises(McaptrackError) as refused:
+            pipeline.find_views(opened, "/camera")
+        return with_flags(str(refused.value))
+
     def untracked(self) -> Scene:
         return self.ingested("clip.mp4", "--truth", "truth.txt", "--ground-plane", "plane.txt")
 
@@ -200,6 +206,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG"
     ),
     "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
+    "pipeline/drawing.py:find_views:run": Scene.without_views,
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,

@@ -67,11 +67,10 @@ METHODS: Mapping[str, tuple[str, Callable[[Path, str, Path], Any]]] = {
     "array": ("tracks", _reads(lambda r, t: len(r.array("tracks", t)))),
     "frames": ("tracks", _reads(lambda r, t: _times(r.frames(t)))),
     "messages": ("tracks", _reads(lambda r, t: [m.log_time for _, _, m, _ in r.messages(t)])),
-    "show": ("tracks", _reads(lambda r, t: r.show(0.2, topic=t).views)),
     "supervision": ("tracks", _reads(lambda r, t: _times(r.supervision(t)))),
-}
-#: A topic that these make, and that need not be there.
-MAKES = {"write"}
+} | of_extensions("TOPICS_OF_RECORDINGS")
+#: A topic that these make, and that need not be there; and what an extension shows.
+MAKES = {"write", "show"}
 
 
 def _taking(where: object) -> set[str]:

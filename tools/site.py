@@ -40,9 +40,8 @@ class Completed(griffe.Extension):
 def on_config(config: Any) -> Any:
     """The settings, with the pages of the extensions that are there in the list of pages."""
     pages = [path.relative_to(ROOT / "docs").as_posix() for path in sorted((ROOT / "docs").glob("extensions/*.md"))]
-    named = {"Extensions": pages}
+    named = {"Extensions": sorted(pages, key=lambda page: (page != "extensions/extensions.md", page))}
     config.nav = [named if entry == {"Extensions": "EXTENSIONS"} else entry for entry in config.nav]
-    config.nav = [entry for entry in config.nav if entry != {"Extensions": []}]
     return config
 
 

@@ -18,7 +18,7 @@ from mcaptrack.schema import TRACKS, EventKind, Frame
 from mcaptrack.schema.classes import UNKNOWN, class_name, is_person, majority
 from mcaptrack.schema.framing import join_frames
 
-__all__ = ["PEOPLE", "describe", "nouns_of"]
+__all__ = ["PEOPLE", "SUFFIX", "describe", "nouns_of"]
 
 Level = Literal["DEBUG", "INFO", "WARNING", "ERROR"]
 

@@ -18,7 +18,18 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.ragged import run_starts
 
-__all__ = ["GroundPlane", "Planes", "is_assumed", "is_estimated", "origin_of", "plane_at", "runs_of_planes"]
+__all__ = [
+    "PERSON_HEIGHT_M",
+    "GroundPlane",
+    "Planes",
+    "is_assumed",
+    "is_estimated",
+    "moved_planes",
+    "origin_of",
+    "plane_at",
+    "runs_of_planes",
+    "scene_planes",
+]
 
 #: The height of a person, for guessing the scale of a scene from its boxes.
 PERSON_HEIGHT_M = 1.7

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from mcaptrack.pipeline.plan import plan_all, plan_stage
     from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice
     from mcaptrack.pipeline.runner import Report, input_of, outdated_by, run
-    from mcaptrack.pipeline.staleness import is_stale, missing_finisher, read_planes, warn_clock_jumps
+    from mcaptrack.pipeline.staleness import is_outdated, is_stale, missing_finisher, read_planes, warn_clock_jumps
     from mcaptrack.pipeline.summary import Summary, summarise
     from mcaptrack.pipeline.views import with_views
-    from mcaptrack.pipeline.write import LAYOUTS, attachment_of, layout_path
+    from mcaptrack.pipeline.write import LAYOUTS, Made, RunState, attachment_of, layout_path
     from mcaptrack.sources.cameras import Camera, camera_at, camera_to_name, find_camera, scenes_of
 
 _NAMES: Final = {
@@ -35,10 +35,10 @@ _NAMES: Final = {
     "mcaptrack.pipeline.plan": "plan_all plan_stage",
     "mcaptrack.pipeline.planes": "AS_BEFORE PlaneChoice",
     "mcaptrack.pipeline.runner": "Report input_of outdated_by run",
-    "mcaptrack.pipeline.staleness": "is_stale missing_finisher read_planes warn_clock_jumps",
+    "mcaptrack.pipeline.staleness": "is_outdated is_stale missing_finisher read_planes warn_clock_jumps",
     "mcaptrack.pipeline.summary": "Summary summarise",
     "mcaptrack.pipeline.views": "with_views",
-    "mcaptrack.pipeline.write": "LAYOUTS attachment_of layout_path",
+    "mcaptrack.pipeline.write": "LAYOUTS Made RunState attachment_of layout_path",
     "mcaptrack.sources.cameras": "Camera camera_at camera_to_name find_camera scenes_of",
 }
 _MODULES: Final = {name: module for module, names in _NAMES.items() for name in names.split()}

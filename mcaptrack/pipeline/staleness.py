@@ -46,7 +46,7 @@ def is_stale(opened: log.Log, topic: str) -> bool:
 
 
 def is_finished(topic: str, how: Provenance) -> bool:
-    """Return whether a finisher, installed or not, made a channel: below its input, and nothing else makes such ones."""
+    """Return whether a finisher, installed or not, made a channel: below its input, as nothing else does."""
     is_other = how.transform in STAGES or how.transform in (INGEST, VIEW, FUSE, REFINE) or bool(how.plugins)
     return not is_other and bool(how.input) and topic.startswith(f"{how.input}/")
 

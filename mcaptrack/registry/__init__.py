@@ -39,7 +39,7 @@ from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.installed import Point, declared, distribution_of, entry_points, missing_extension
 from mcaptrack.registry.guard import Guard, contained_import
 
-__all__ = ["Entry", "blamed", "find"]
+__all__ = ["Entry", "blamed", "find", "others"]
 
 Kind = Literal[
     "detector",

@@ -15,6 +15,7 @@ from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 
 __all__ = [
     "JoinedFrames",
+    "filtered_rows",
     "frame_numbers",
     "frame_times",
     "has_any",
@@ -23,6 +24,7 @@ __all__ = [
     "nearest_times",
     "row_ends",
     "split_rows",
+    "thinned",
 ]
 
 #: The number of rows that are computed with at once where a channel may have more than fit into memory.

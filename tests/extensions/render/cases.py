@@ -31,10 +31,10 @@ USES = {
     ]
 }
 TOPICS = {"render": ("tracks", lambda p, t, f: mcaptrack.render(p, f / "a.mp4", topic=t, end_s=0.3).views)}
+UNUSED = {"render": ("render", {"log": "log.mcap", "output": "a.gif", "gif": True, "end_s": 0.2}, "gif")}
 REFUSED = {"a folder for a video": (lambda: mcaptrack.render("."), ". is a folder, not an MCAP file")}
 WRITTEN = {name: lambda path, output: mcaptrack.render(path, output=output) for name in ("a.mp4", "a.gif")}
 PROPOSALS = {
-    "pipeline/drawing.py:find_views:run": lambda s: s.untracked().says("render", "LOG"),
     "extensions/render/blur/recording.py:blurrable:run": lambda s: s.ingested("clip.mp4").says(
         "render", "LOG", "--blur", "people", "-o", "c.mcap"
     ),
