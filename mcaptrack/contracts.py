@@ -23,19 +23,9 @@ if TYPE_CHECKING:
     from mcaptrack.api.reading import LogReader
 
 __all__ = [
-    "UNKNOWN_VECTOR",
-    "Box",
-    "Box3d",
-    "Exporter",
-    "Finished",
-    "LabelBoxes",
-    "LabelFormat",
-    "MessageReader",
-    "Quaternion",
-    "ReportSection",
-    "SectionTable",
-    "Vector",
-]
+    "UNKNOWN_VECTOR", "Box", "Box3d", "Exporter", "Finished", "LabelBoxes", "LabelFormat", "MessageReader",
+    "Quaternion", "ReportSection", "SectionTable", "Vector",
+]  # fmt: skip
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -14,22 +14,12 @@ from typing import Any, NamedTuple
 import pytest
 from typer.main import get_command
 
-import mcaptrack
 from mcaptrack.api.running import RunResult
 from mcaptrack.cli import app
 from tests.extension_cases import of_extensions
 from tests.worlds import write_clip
 
 GROUP = get_command(app)
-_PACKAGE = Path(mcaptrack.__file__).parent
-#: Extensions and their names, in Python or of other kinds.
-_NAMES = re.findall(
-    r"^(?:from|# \w+ ([\w-]+):) mcaptrack\.extensions\.(\w+)(?:\S* import (\w+))?",
-    (_PACKAGE / "__init__.pyi").read_text(),
-    re.M,
-)
-#: What the package lacks because extensions were taken away (tools/without.py); none, usually.
-LACKS = {part or name for part, folder, name in _NAMES if not (_PACKAGE / "extensions" / folder).is_dir()}
 #: Commands that change no file except the one that -o names.
 ONLY_READ = ("check", "docs", "doctor", "evaluate", "info", "query", "view")
 

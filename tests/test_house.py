@@ -18,6 +18,7 @@ import pytest
 import yaml
 
 from mcaptrack.installed import declared
+from tests.extension_cases import of_extensions
 
 TESTS = Path(__file__).parent
 ROOT = TESTS.parent
@@ -175,48 +176,6 @@ def test_the_core_names_no_extension():
             assert not [name for name in EXTENSIONS if f"extensions.{name}" in path.read_text()], path
 
 
-#: Modules of the core that aren't public, and the one extension that needs them.
-DEEP = {
-    "cameras": (
-        "it writes a scene as the channels of a stage are written, and finds fusers as transforms are found",
-        "api.running cli.flags cli.many cli.running foxglove.views.people geometry.assignment geometry.neighbours "
-        "geometry.pinhole pipeline.checks pipeline.choice_of_cameras pipeline.pictures pipeline.rebuild "
-        "pipeline.several pipeline.staleness pipeline.write schema.frame_columns schema.ground_plane "
-        "sources.fixed_frame sources.sidecar transforms.guarded transforms.protocol",
-    ),
-    "notebook": ("the player shows what `view` shows", "foxglove.messages viewing.links"),
-    "render": (
-        "it writes pictures as their channel says, and draws what views draw",
-        "cli.many foxglove.views.ground foxglove.views.projected foxglove.views.styles geometry.pinhole "
-        "schema.resampling sources.calibrations sources.fixed_frame sources.foreign.definitions sources.video.pixels",
-    ),
-    "report": (
-        "it shows all that is evaluated",
-        "evaluation.aligned evaluation.events evaluation.forecasts evaluation.people foxglove.views.people "
-        "tables.catalogue tables.export.contents viewing.background viewing.charts",
-    ),
-    "review": (
-        "its answers are written as the channels of a stage are",
-        "pipeline.rebuild pipeline.write sources.sidecar transforms.retrack.options",
-    ),
-    "training": (
-        "it makes the weights that predictors read, of labels",
-        "geometry.mixtures predictors.forecast predictors.linear predictors.lstm predictors.red predictors.weights "
-        "sources.ingest.labels.reading sources.ingest.labels.roles sources.walks",
-    ),
-    "tuning": (
-        "it makes transforms with other settings, and writes these",
-        "api.running cli.chosen cli.config tables.compared transforms.guarded transforms.protocol",
-    ),
-    "zones": (
-        "its counts are written, drawn and reported as those of the core are",
-        "api.running cli.many evaluation.intervals evaluation.world_tracks foxglove.annotations foxglove.views.ground "
-        "foxglove.views.image foxglove.views.people geometry.camera_path pipeline.checks pipeline.motion "
-        "pipeline.pictures pipeline.staleness pipeline.write schema.frame_columns viewing.background viewing.charts",
-    ),
-}
-
-
 def names_from_the_core(path: Path) -> Iterator[tuple[str, str]]:
     """The modules of the core that a module of an extension imports, and the names of them that it uses."""
     tree, modules = ast.parse(path.read_text()), {}
@@ -234,7 +193,7 @@ def names_from_the_core(path: Path) -> Iterator[tuple[str, str]]:
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
 def test_extensions_use_public_names_of_public_modules(extension):
-    """Public are the rooms that offer what they import, and modules with ``__all__``."""
+    """Public are the rooms that offer what they import, and modules with ``__all__``; the cases of each name others."""
     rooms = next(o["module"] for o in PROJECT["tool"]["mypy"]["overrides"] if o.get("implicit_reexport"))
     deep = set()
     for path in (ROOT / "mcaptrack" / "extensions" / extension).rglob("*.py"):
@@ -245,4 +204,5 @@ def test_extensions_use_public_names_of_public_modules(extension):
                 deep.add(module.removeprefix("mcaptrack."))
             elif public is not None and module != "mcaptrack":
                 assert name in public, f"{path}: {module} has no public name {name}"
-    assert deep == {*DEEP.get(extension, ("", ""))[1].split()}
+    _, modules = of_extensions("DEEP").get(extension, ("", ""))
+    assert deep == {*modules.split()}

@@ -137,7 +137,7 @@ def test_pages_that_help_and_errors_name_are_in_the_wheel(shipped):
     named = [(where, page) for where, text in said() for page in re.findall(r"`mcaptrack docs (\w+)`", text)]
     assert {page for _, page in named} >= {"tables", "sql"}
     for where, page in named:
-        assert {f"mcaptrack/docs/{page}.md", f"mcaptrack/docs/{page.upper()}.md"} & shipped, where
+        assert {f"mcaptrack/docs/{name}.md" for name in (page, page.upper(), f"extensions/{page}")} & shipped, where
 
 
 def test_help_and_errors_name_no_file_of_the_repository():

@@ -13,28 +13,10 @@ if TYPE_CHECKING:
     from mcaptrack.registry import Kind
 
 __all__ = [
-    "FILES",
-    "LABELS",
-    "LOGS",
-    "SCORES",
-    "Camera",
-    "EachLog",
-    "Force",
-    "GroundPlane",
-    "MinIou",
-    "Output",
-    "PathLike",
-    "Progress",
-    "Reports",
-    "Sidecar",
-    "Topic",
-    "Views",
-    "chooser",
-    "gate_m",
-    "no_progress",
-    "output",
+    "FILES", "LABELS", "LOGS", "SCORES", "Camera", "EachLog", "Force", "GroundPlane", "MinIou", "Output",
+    "PathLike", "Progress", "Reports", "Sidecar", "Topic", "Views", "chooser", "gate_m", "no_progress", "output",
     "similarity",
-]
+]  # fmt: skip
 
 PathLike = str | os.PathLike[str]
 #: Called with the name of a stage, the amount that is done, and the total.

@@ -48,16 +48,9 @@ from mcaptrack.sources.cameras import camera_at
 from mcaptrack.transforms import STAGES
 
 __all__ = [
-    "Candidate",
-    "EvaluateOptions",
-    "EvaluationInput",
-    "EvaluationRow",
-    "combined",
-    "evaluate",
-    "ground_truth_of_log",
-    "sequence_of_log",
-    "set_means",
-]
+    "Candidate", "EvaluateOptions", "EvaluationInput", "EvaluationRow", "combined", "evaluate",
+    "ground_truth_of_log", "sequence_of_log", "set_means",
+]  # fmt: skip
 
 COMBINED: Final = "COMBINED"
 DEFAULT_GATES_M: Final = (0.5, 1.0, 2.0)

@@ -14,18 +14,9 @@ from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 
 __all__ = [
-    "JoinedFrames",
-    "filtered_rows",
-    "frame_numbers",
-    "frame_times",
-    "has_any",
-    "join_frames",
-    "joined_parts",
-    "nearest_times",
-    "row_ends",
-    "split_rows",
-    "thinned",
-]
+    "JoinedFrames", "filtered_rows", "frame_numbers", "frame_times", "has_any", "join_frames", "joined_parts",
+    "nearest_times", "row_ends", "split_rows", "thinned",
+]  # fmt: skip
 
 #: The number of rows that are computed with at once where a channel may have more than fit into memory.
 PART_ROWS: Final = 2**16

@@ -9,3 +9,10 @@ def _views(path, topic, _) -> tuple[str, ...]:
 
 
 TOPICS_OF_RECORDINGS = {"show": ("tracks", _views)}
+#: Modules of the core that aren't public, and why it needs them.
+DEEP = {
+    "notebook": (
+        "the player shows what `view` shows",
+        "foxglove.messages viewing.links",
+    )
+}

@@ -41,3 +41,12 @@ PROPOSALS = {
     "extensions/render/comparing.py:find_panels:run": lambda s: s.untracked().says("render", "LOG", "--compare"),
     "extensions/render/heat_map.py:_channel:run": lambda s: s.ingested("clip.mp4").says("render", "LOG", "--heatmap"),
 }
+#: Modules of the core that aren't public, and why it needs them.
+DEEP = {
+    "render": (
+        "it writes pictures as their channel says, and draws what views draw",
+        "cli.many foxglove.views.ground foxglove.views.projected foxglove.views.styles geometry.pinhole "
+        "schema.resampling sources.calibrations sources.fixed_frame sources.foreign.definitions "
+        "sources.video.pixels",
+    )
+}

@@ -47,3 +47,12 @@ PROPOSALS = {
     "extensions/report/sections.py:scores:run": lambda s: _text(s.ingested("clip.mp4")),
     "extensions/report/sections.py:forecasts:predict": lambda s: _text(s.without("*predictions*")),
 }
+#: Modules of the core that aren't public, and why it needs them.
+DEEP = {
+    "report": (
+        "it shows all that is evaluated",
+        "evaluation.aligned evaluation.events evaluation.forecasts evaluation.people "
+        "foxglove.views.people tables.catalogue tables.export.contents viewing.background "
+        "viewing.charts",
+    )
+}

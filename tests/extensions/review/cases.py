@@ -25,3 +25,10 @@ PROPOSALS = {
     "extensions/review/questions.py:solve:run": lambda s: s.untracked().says("review", "LOG"),
     "extensions/review/command.py:show:review": _answered,
 }
+#: Modules of the core that aren't public, and why it needs them.
+DEEP = {
+    "review": (
+        "its answers are written as the channels of a stage are",
+        "pipeline.rebuild pipeline.write sources.sidecar transforms.retrack.options",
+    )
+}

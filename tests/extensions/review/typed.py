@@ -1,5 +1,3 @@
-"""The names of this extension in Python, as the script of a user has them: type checkers read it, and it is never run."""
-
 import mcaptrack
 
 review: mcaptrack.Review = mcaptrack.review("log.mcap", questions=3)

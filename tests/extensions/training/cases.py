@@ -35,3 +35,11 @@ PROPOSALS = {
     "extensions/training/command.py:show:predict": _trained,
     "extensions/training/sources.py:_from_log:run": _without_tracks,
 }
+#: Modules of the core that aren't public, and why it needs them.
+DEEP = {
+    "training": (
+        "it makes the weights that predictors read, of labels",
+        "geometry.mixtures predictors.forecast predictors.linear predictors.lstm predictors.red predictors.weights "
+        "sources.ingest.labels.reading sources.ingest.labels.roles sources.walks",
+    )
+}

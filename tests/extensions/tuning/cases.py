@@ -104,3 +104,10 @@ def _printed(to: Any) -> None:
 
 
 PRINTED = {"tuning": _printed}
+#: Modules of the core that aren't public, and why it needs them.
+DEEP = {
+    "tuning": (
+        "it makes transforms with other settings, and writes these",
+        "api.running cli.chosen cli.config tables.compared transforms.guarded transforms.protocol",
+    )
+}

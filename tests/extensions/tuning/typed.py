@@ -1,5 +1,3 @@
-"""The names of this extension in Python, as the script of a user has them: type checkers read it, and it is never run."""
-
 import mcaptrack
 
 best: mcaptrack.TuneResult = mcaptrack.tune(["log.mcap"], search={"min_iou": (0.1, 0.4)}, trials=2)

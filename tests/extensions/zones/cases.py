@@ -136,3 +136,12 @@ def _printed(to: Any) -> None:
 
 
 PRINTED = {"zones": _printed}
+#: Modules of the core that aren't public, and why it needs them.
+DEEP = {
+    "zones": (
+        "its counts are written, drawn and reported as those of the core are",
+        "api.running cli.many evaluation.intervals evaluation.world_tracks foxglove.annotations foxglove.views.ground "
+        "foxglove.views.image foxglove.views.people geometry.camera_path pipeline.checks pipeline.motion "
+        "pipeline.pictures pipeline.staleness pipeline.write schema.frame_columns viewing.background viewing.charts",
+    )
+}
