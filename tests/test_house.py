@@ -63,9 +63,10 @@ for module in pkgutil.walk_packages(mcaptrack.__path__, "mcaptrack.") if core el
         except ImportError as error:
             broken.append(str(error))
 commands = {name: call(name, "x") for name in names if name.islower()}
+options = {name: call("info", f"--{name}", "x") for name in commands}
 loaded = [name for name in sys.modules if name.startswith("mcaptrack.extensions.")] if core else []
 print(json.dumps({
-    "help": call("--help"), "names": said, "all": mcaptrack.__all__, "commands": commands, "broken": broken,
+    "help": call("--help"), "names": said, "all": mcaptrack.__all__, "commands": commands, "options": options, "broken": broken,
     "where": mcaptrack.__file__, "loaded": loaded,
 }))
 """
@@ -120,6 +121,7 @@ def test_without_an_extension_the_rest_works_and_what_is_missing_is_named(gone, 
             if group == "commands":
                 assert (f"\n  {name} " in said["help"]) is is_there
                 assert (f"mcaptrack: {text}{room_of(value)}\n" == said["commands"][name]) is not is_there
+                assert (f"mcaptrack: {text}{room_of(value)}; " in said["options"][name]) is not is_there
     for group in CHOSEN:
         for name, value in POINTS[group].items():
             text = f"{name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/"

@@ -17,8 +17,8 @@ from mcaptrack.location import Location, Url, is_remote, parse
 from mcaptrack.notices import Notice
 
 __all__ = [
-    "Notes", "as_path", "detail", "locations_of", "log_file", "log_location", "names_of", "optional_path",
-    "paths_of", "warn_unused", "warnings_about",
+    "Notes", "as_location", "as_path", "detail", "locations_of", "log_file", "log_location", "names_of",
+    "optional_path", "paths_of", "split_names", "warn_unused", "warnings_about",
 ]  # fmt: skip
 
 #: Where routine notes go ("/camera/tracks is missing: running track"): INFO, and DEBUG for details.

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from mcaptrack.registry import Kind
 
 __all__ = [
-    "FILES", "LABELS", "LOGS", "SCORES", "Camera", "EachLog", "Force", "GroundPlane", "MinIou", "Output", "PathLike",
-    "Progress", "Reports", "Sidecar", "Topic", "chooser", "gate_m", "no_progress", "output", "similarity",
+    "FILES", "LABELS", "LOGS", "SCORES", "Camera", "EachLog", "Force", "GroundPlane", "MinIou", "Output",
+    "PathLike", "Progress", "Reports", "Sidecar", "Topic", "Views", "chooser", "gate_m", "no_progress", "output",
+    "similarity",
 ]  # fmt: skip
 
 PathLike = str | os.PathLike[str]

@@ -64,15 +64,12 @@ def _message(error: Any) -> str:
 def _unknown_option(error: Any) -> str:
     """Return the message about an unknown option: which commands have it, and which option may be meant."""
     name, context = error.option_name, error.ctx
-    if missing := missing_extension(name.removeprefix("--"), "finisher"):
+    if missing := missing_extension(name.removeprefix("--").removeprefix("no-")):
         return missing
     text = f"no such option: {name}"
     if context is None or context.parent is None:
         return f"{text}{nearest(name, error.possibilities or ())}"
     theirs = {command: _options_of(command_class) for command, command_class in context.parent.command.commands.items()}
-    word = name.strip("-").removeprefix("no-")
-    if word not in theirs and (missing := missing_extension(word)):
-        return f"{text}: {missing}"
     if having := [command for command, options in theirs.items() if name in options]:
         text += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
     own_options = theirs.get(context.info_name, [])

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Image", "Ints"]
+__all__ = ["Bools", "Floats", "Image", "Indices", "Ints"]
 
 #: Measured values: coordinates, scores, seconds.
 Floats = NDArray[np.float64]

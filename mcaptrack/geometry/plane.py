@@ -19,8 +19,8 @@ from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.ragged import run_starts
 
 __all__ = [
-    "PERSON_HEIGHT_M", "GroundPlane", "Planes", "is_estimated", "moved_planes", "origin_of", "plane_at",
-    "scene_planes",
+    "PERSON_HEIGHT_M", "GroundPlane", "Planes", "is_assumed", "is_estimated", "moved_planes", "origin_of",
+    "plane_at", "runs_of_planes", "scene_planes",
 ]  # fmt: skip
 
 #: The height of a person, for guessing the scale of a scene from its boxes.

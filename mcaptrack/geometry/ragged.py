@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mcaptrack.geometry.arrays import Bools, Ints
 
-__all__ = ["find_rows", "group_index", "ragged_range", "run_ends", "run_starts"]
+__all__ = ["find_rows", "group_index", "ragged_range", "run_ends", "run_starts", "table_of"]
 
 
 def group_index(counts: ArrayLike) -> Ints:

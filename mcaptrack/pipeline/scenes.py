@@ -24,6 +24,8 @@ from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.cameras import detections_topic, provenance_of
 from mcaptrack.transforms import Stage, Transform
 
+__all__ = ["Member", "Progress", "Say", "SceneMaker"]
+
 T = TypeVar("T")
 Say = Callable[[str], None]
 Progress = Callable[[str, int, int], None]
@@ -83,6 +85,10 @@ def _usual() -> Iterator[tuple[Entry, SceneMaker]]:
             yield entry, maker
 
 
+def _nothing() -> str:
+    return missing_extension("fuse") or "nothing that is installed makes such a scene"
+
+
 def _joinable(maker: SceneMaker, opened: log.Log, cameras: Sequence[str]) -> tuple[list[str], str]:
     return ([], maker.off) if maker.off else maker.joinable(opened, cameras)
 
@@ -112,7 +118,7 @@ class Scenes:
             if joined:
                 return joined, why
             reasons.append(why)
-        return [], "; ".join(reasons) or missing_extension("fuse")
+        return [], "; ".join(reasons) or _nothing()
 
     def join(self, opened: log.Log, cameras: Sequence[str], prefix: str, progress: Progress) -> Mapping[str, Made]:
         """Return the channels of a scene of cameras that can be joined, by topic."""
@@ -135,8 +141,7 @@ class Scenes:
         answers = self._answers(lambda maker: maker.join_again(opened, prefix, force, adds, say, progress))
         channels = next((answer for answer in answers if answer is not None), None)
         if channels is None and is_stale(opened, topic):
-            why = "what made it isn't installed" if self._makers else missing_extension("fuse")
-            warn(f"{topic} is out of date, and stays as it is: {why}", "out-of-date")
+            warn(f"{topic} is out of date, and stays as it is: {_nothing()}", "out-of-date")
         return channels or {}
 
     def maker_of(self, how: Provenance) -> tuple[Stage, Transform] | None:

@@ -15,7 +15,7 @@ from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 
 __all__ = [
     "JoinedFrames", "filtered_rows", "frame_numbers", "frame_times", "has_any", "join_frames", "joined_parts",
-    "row_ends", "split_rows", "thinned",
+    "nearest_times", "row_ends", "split_rows", "thinned",
 ]  # fmt: skip
 
 #: The number of rows that are computed with at once where a channel may have more than fit into memory.

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 from mcaptrack import __version__
 from mcaptrack.notices import known_code, warn
 
-__all__ = ["VIEW", "Provenance", "frame_id_of", "input_of"]
+__all__ = ["FUSE", "REFINE", "VIEW", "Provenance", "frame_id_of", "input_of"]
 
 #: Halves of characters (surrogates).
 _HALVES: Final = re.compile("[\ud800-\udfff]")

@@ -23,7 +23,7 @@ from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
 from mcaptrack.sources.fixed_frame import poses_at
 from mcaptrack.transforms import STAGES
 
-__all__ = ["path_of", "read_ground_truth", "tracks_topic"]
+__all__ = ["path_of", "planes_in", "read_ground_truth", "tracks_topic"]
 
 #: Positions that differ by no more than this, in metres, are those of a plane.
 _SAME_M: Final = 1e-6

@@ -24,7 +24,19 @@ from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import STAGES
 
-__all__ = ["Camera", "camera_at", "cameras", "find_camera", "provenance_of", "repaired_tracks"]
+__all__ = [
+    "Camera",
+    "camera_at",
+    "cameras",
+    "corrected_plane",
+    "detections_of",
+    "detections_topic",
+    "find_camera",
+    "given_plane",
+    "provenance_of",
+    "repaired_tracks",
+    "scenes_of",
+]
 
 #: The default name of a camera.
 DEFAULT_CAMERA: Final = "camera"

@@ -12,10 +12,6 @@ if TYPE_CHECKING:
     from mcaptrack.pipeline.scenes import SceneMaker
 
 _SEVERAL: Final = "Several cameras"
-_FUSE: Final = (
-    "Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.\n\n"
-    "Scenes that were made before are brought up to date."
-)
 _FUSER: Final = chooser(
     "fuser", "The {kind}, also where another one was used before", _SEVERAL, shown="as before, or feet"
 )
@@ -24,7 +20,15 @@ _FUSER: Final = chooser(
 @declared()
 def scenes(
     *,
-    fuse: Annotated[bool, Option(_SEVERAL, tuning=True, help=_FUSE)] = True,
+    fuse: Annotated[
+        bool,
+        Option(
+            _SEVERAL,
+            tuning=True,
+            help="Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.\n\n"
+            "Scenes that were made before are brought up to date.",
+        ),
+    ] = True,
     fuser: Annotated[str | Transform | None, _FUSER] = None,
 ) -> SceneMaker:
     """Make scenes of the cameras of a run, or none."""

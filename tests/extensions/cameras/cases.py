@@ -76,3 +76,13 @@ PROPOSALS = {
     "extensions/cameras/fusing.py:warn_disagreeing:calibrate": _with_a_plane_off,
     "extensions/cameras/fusing.py:_lack:detect": lambda s: s.without("/camera/[!vg]*").says("fuse", "LOG"),
 }
+#: Modules of the core that aren't public, which this extension alone needs, and the reason.
+DEEP = {
+    "cameras": (
+        "it writes a scene as the channels of a stage are written, and finds fusers as transforms are found",
+        "api.running cli.flags cli.many cli.running foxglove.views.people geometry.assignment geometry.neighbours "
+        "geometry.pinhole pipeline.checks pipeline.choice_of_cameras pipeline.pictures pipeline.rebuild "
+        "pipeline.several pipeline.staleness pipeline.write schema.frame_columns schema.ground_plane "
+        "sources.fixed_frame sources.sidecar transforms.guarded transforms.protocol",
+    )
+}
