@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
+from mcaptrack.schema import TRACKS
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import linking, motion_model
-from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Tracks
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import compatible, find_swaps, resolve_swaps
 from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
@@ -308,7 +310,9 @@ def test_the_limit_is_that_of_the_reference_however_many_steps_come_at_once(seed
     noise, found = InputNoise(STEP_S), []
     for low, high in ((0, cut), (cut, 60)):
         part = (place >= low) & (place < high)
-        found += noise.most_m(passed[low:high], step[low:high], place[part] - low, source[part], xy[part])
+        found += noise.most_m(
+            passed[low:high], np.searchsorted(place[part], np.arange(low, high + 1)), source[part], xy[part]
+        )
     assert found == pytest.approx(wanted)
 
 
@@ -319,19 +323,17 @@ def test_people_merged_into_one_detection_are_not_taken_for_noise():
     assert how.noise_m == pytest.approx(0.173, abs=0.001)
     rows = corrupt(truth, how, np.random.default_rng([1, 4, 2]))
     clock = np.arange(int(truth[:, 0].min()), int(truth[:, 0].max()) + 1)
-    run = LikelihoodPass(PROFILES["default"])
-    for (frame,) in Sample(start_ns=round(clock[0] * STEP_S * 1e9))(on_clock(rows, clock)):
-        run.step(frame)
-    run.finish()
+    samples = Sample(start_ns=round(clock[0] * STEP_S * 1e9))(on_clock(rows, clock))
+    run = LikelihoodPass(PROFILES["default"], PEOPLE, collect(TRACKS, (frame for (frame,) in samples)))
     assert run.noise_m < 0.5
 
 
 def test_ids_of_any_size_give_the_same_limit():
     """256 steps: with these ids, products of both wrap around."""
-    place, source = np.divmod(np.arange(256 * 20), 20)
+    source = np.arange(256 * 20) % 20
     at = 5.0 * source[:, None] + np.random.default_rng(3).normal(0, 0.4, (256 * 20, 2))
-    one, steps = np.ones(256, int), np.arange(256)
-    found = [InputNoise(STEP_S).most_m(one, steps, place, source * size, at) for size in (1, 2**56)]
+    one, ends = np.ones(256, int), 20 * np.arange(257)
+    found = [InputNoise(STEP_S).most_m(one, ends, source * size, at) for size in (1, 2**56)]
     assert found[0][-1] == pytest.approx(0.6, rel=0.1)
     assert found[0] == found[1]
 

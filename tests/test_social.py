@@ -111,7 +111,7 @@ class TestWhatPredictorsAreGiven:
         """However many tracks are predicted at once."""
         rng = np.random.default_rng(1)
         frames = [frame(n, {k: (0.4 * n, 2 * k + rng.normal(0, 0.05)) for k in range(5)}) for n in range(12)]
-        monkeypatch.setattr(likelihood, "_BATCH", 4)
+        monkeypatch.setattr(likelihood, "_SAMPLES", 4)
         list(replace(PROFILES[profile], predictor="tests.test_social:Watching")(frames))
         calls = [(xy_m, people) for xy_m, people in SEEN if len(xy_m)]
         for xy_m, people in calls:

@@ -38,10 +38,11 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.geometry.ragged import find_rows
-from mcaptrack.schema import Frame
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
-from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.assignments import Movers, Tracks
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import Trajectories, filtered, to_trajectories
@@ -92,13 +93,8 @@ def prepare(truth: np.ndarray, made: np.ndarray) -> Run:
     clock = np.arange(int(truth[:, 0].min()), int(truth[:, 0].max()) + 1)
     true = on_clock(truth, clock)
     samples = [frame for (frame,) in Sample(start_ns=true[0].t_ns)(on_clock(made[:, :4], clock))]
-    run = LikelihoodPass(DEFAULT)
-    for frame in samples:
-        run.step(frame)
-    run.finish()
-    times = np.array([frame.t_ns for frame in samples])
-    model = motion_model(DEFAULT, run.noise_m)
-    return Run(true, samples, (DEFAULT, model, run.assignments, run.samples, run.steps, times), made)
+    run = LikelihoodPass(DEFAULT, Movers(), collect(TRACKS, samples))
+    return Run(true, samples, (DEFAULT, motion_model(DEFAULT, run.noise_m), run), made)
 
 
 class _Reached(Exception):
@@ -127,7 +123,7 @@ def owners(run: Run, step: np.ndarray, xy_m: np.ndarray, length: np.ndarray) -> 
     """The true id at each of the positions (N, 2), or -1; ``length`` is that of the track of each."""
     owner = np.full(len(step), -1)
     order = np.argsort(step, kind="stable")
-    where = dict(zip(run.args[4], run.true, strict=True))
+    where = dict(zip(run.args[2].steps.tolist(), run.true, strict=True))
     for here in np.split(order, np.flatnonzero(np.diff(step[order])) + 1):
         people = where[int(step[here[0]])].rows
         off = np.hypot(*(xy_m[here, None, k] - people[name] for k, name in enumerate(("x_m", "y_m"))))

@@ -115,46 +115,6 @@ class Lives:
         return bool(max(np.diff(angle).max(), angle[0] + 2 * pi - angle[-1]) > pi)
 
 
-class Places:
-    """What became of the last 2000 tracks that were lost."""
-
-    def __init__(self) -> None:
-        self.all: list[tuple[np.ndarray, bool]] = []
-
-    def ratio(self, at: np.ndarray) -> float:
-        """The odds that it goes well within 2 m, compared with everywhere; 8 more are as everywhere."""
-        ended = self.all[-2000:]
-        well = (sum(good for _, good in ended) + 1) / (len(ended) + 2)
-        near = [good for there, good in ended if hypot(*(there - at)) <= 2]
-        return (near.count(True) / well + 8) / (near.count(False) / (1 - well) + 8)
-
-
-def at_odds(probability: float, ratio: float) -> float:
-    return probability * ratio / (1 - probability + probability * ratio)
-
-
-class Losses:
-    """Places where tracks were lost, of those that are lost, and the odds that these come back."""
-
-    def __init__(self) -> None:
-        self.lost = Places()
-        self.now: dict[int, tuple[np.ndarray, float]] = {}
-
-    def learn(self, people: list[Person], has: dict[int, Row], passed: int) -> None:
-        for name in [one for one in self.now if one not in {person.name for person in people}]:
-            place, _ = self.now.pop(name)
-            if passed == 1:
-                self.lost.all.append((place, False))
-        for name in [one for one in self.now if one in has]:
-            self.lost.all.append((self.now.pop(name)[0], True))
-        for p in people:
-            if p.name not in has and p.name not in self.now:
-                self.now[p.name] = (p.here, self.lost.ratio(p.here))
-
-    def ratio(self, name: int) -> float:
-        return self.now[name][1] if name in self.now else 1.0
-
-
 @dataclass
 class Left:
     """A track as it was last observed, under the name that it is written."""
@@ -315,7 +275,6 @@ class OnlineTracker:
         places: dict[tuple[int, int], Point] = {}
         lives = Lives(self.confirm, self.max_age)
         bends = Bends(1 / o.rate_hz)
-        losses = Losses()
         motion = Motion(self.noise_m, max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
         returns = Returns(motion, o, self.confirm)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
@@ -331,9 +290,8 @@ class OnlineTracker:
             }
             lives.learn(now, passed)
             lives.places += [one.here for one in self.people if one.name in has and one.hits >= self.confirm]
-            losses.learn(self.people, has, passed)
             returns.learn(self.people, has, step)
-            written = [one for one in self.people if self.is_written(one, now[one.name], lives, losses)]
+            written = [one for one in self.people if self.is_written(one, now[one.name], lives)]
             written += returns.name(written, step, has, self.people)
             shown = []
             for person in self.people:
@@ -362,7 +320,7 @@ class OnlineTracker:
             )
         return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
 
-    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives, losses: Losses) -> bool:
+    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives) -> bool:
         """Whether a track is written online."""
         o, (hits, missed, outside) = self.options, now
         if not o.adapt_online:
@@ -374,7 +332,7 @@ class OnlineTracker:
             return False
         if hits >= lives.lasting and not outside:
             return True
-        comes_back = at_odds(lives.comes_back(missed, outside), losses.ratio(person.name))
+        comes_back = lives.comes_back(missed, outside)
         return comes_back * lives.lasts(hits + 1) >= 0.5
 
     def forecast(self, row: Row, name: int, step: int, places: dict[tuple[int, int], Point]):

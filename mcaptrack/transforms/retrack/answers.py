@@ -41,13 +41,13 @@ class Answers(NamedTuple):
     log_odds: Floats
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], steps: Sequence[int], times_ns: Ints) -> Answers:
+    def of(cls, frames: Sequence[Frame], steps: Ints, times_ns: Ints) -> Answers:
         """The answers in frames of Decisions, about samples at ``steps``, which are at ``times_ns``."""
         joined = join_frames(DECISIONS, frames)
         rows, after_ns = joined.rows, joined.row_ns
         is_join = rows["kind"] == DecisionKind.JOINED
         before_ns = after_ns - np.where(is_join, np.round(rows["duration_s"] * NS_PER_S), 0).astype(np.int64)
-        step = np.array(steps, np.int64)[nearest_times(times_ns, np.stack([before_ns, after_ns], axis=1))]
+        step = steps[nearest_times(times_ns, np.stack([before_ns, after_ns], axis=1))]
         source = np.stack([np.where(is_join, rows["previous_id"], rows["source_id"]), rows["source_id"]], axis=1)
         yes = np.where(rows["kind"] == DecisionKind.LEFT_OUT, 1 - rows["probability"], rows["probability"])
         with np.errstate(divide="ignore"):

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, steps_passed
 from mcaptrack.geometry.ragged import find_rows, group_index
-from mcaptrack.schema import TRACKS, Frame, Rows
+from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.classes import first_classes
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import frame_numbers, has_any, joined_parts, row_ends, spans_of, split_rows, unique_values
@@ -41,91 +38,40 @@ class Tracks(NamedTuple):
         return np.lexsort((self.step, self.track))
 
 
-# The samples that are re-tracked: the columns that are computed with in memory, whole rows in a temporary file.
-#
-# A person who is seen for an hour has 9,000 samples at 2.5 Hz. What re-tracking may hold for each of them, from the
-# first step to the last, are numbers: the columns below (33 bytes), assignments, the states of its filters, and
-# what is seen of it (74 bytes, see ``appearance``). Rows of tracks (153 bytes) and of predictions (840 bytes for
-# each sample) are made part by part, and kept as ``FrameColumns``, most of which is not in memory. Letters: N
-# samples, F frames.
+def column(frames: FrameColumns, name: str) -> NDArray[Any]:
+    """A column of all rows of tracks, (N,).
+
+    A person who is seen for an hour has 9,000 samples at 2.5 Hz. What re-tracking holds for each of them, from the
+    first step to the last, are numbers: some columns, assignments, the states of its filters, and what is seen of it
+    (74 bytes, see ``appearance``). Rows of tracks (153 bytes) and of predictions (840 bytes for each sample) are made
+    part by part, and kept as ``FrameColumns``, most of which is not in memory.
+    """
+    parts = [part.rows[name].copy() for _, _, part in joined_parts(TRACKS, frames)]
+    return np.concatenate([np.empty(0, TRACKS.dtype[name]), *parts])
 
 
-#: The columns of samples that are held in memory.
-HELD: Final = ("track_id", "class_id", "x_m", "y_m", "score", "observed")
-
-
-class LogSamples:
-    """The samples of one log: ``add`` each frame, then read them."""
-
-    def __init__(self) -> None:
-        self._collector = FrameCollector(TRACKS)
-        self._held = {name: bytearray() for name in HELD}
-        self._counts = array("q")
-
-    def add(self, frame: Frame) -> None:
-        """Add the samples of a frame."""
-        for name, held in self._held.items():
-            held.extend(frame.rows[name].tobytes())
-        self._counts.append(len(frame.rows))
-        self._collector.append(frame)
-
-    def extend(self, t_ns: Ints, numbers: Ints, ends: Ints, rows: Rows) -> None:
-        """Add the samples of F frames at once; the arguments are those of ``FrameCollector.extend``."""
-        for name, held in self._held.items():
-            held.extend(rows[name].tobytes())
-        self._counts.extend(np.diff(ends).tolist())
-        self._collector.extend(t_ns, numbers, ends, rows)
-
-    def __len__(self) -> int:
-        return len(self._held["observed"])
-
-    @property
-    def counts(self) -> Ints:
-        """The number of samples of each frame, (F,)."""
-        return np.array(self._counts, np.int64)
-
-    def column(self, name: str) -> NDArray[Any]:
-        """A column of all samples, (N,). One that isn't ``HELD`` is read from the file."""
-        if name in self._held:
-            return np.frombuffer(bytes(self._held[name]), TRACKS.dtype[name])
-        parts = [part.rows[name].copy() for _, _, part in joined_parts(TRACKS, self._frames)]
-        return np.concatenate([np.empty(0, TRACKS.dtype[name]), *parts])
-
-    @cached_property
-    def _frames(self) -> FrameColumns:
-        return self._collector.done()
-
-    def take(self, places: Ints) -> Rows:
-        """The rows of samples, as many as there are ``places``; nothing can be added any more."""
-        return self._frames.take(places)
-
-
-@dataclass
 class Assignments:
     """Assignments: each has a step, a track and a sample. Samples are named by step and input id."""
 
-    _steps: bytearray = field(default_factory=bytearray)
-    _tracks: bytearray = field(default_factory=bytearray)
-    _sources: bytearray = field(default_factory=bytearray)
-    _confirmed: list[tuple[int, Ints]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._parts = [np.empty((3, 0), np.int64)]
+        self._confirmed: list[tuple[int, Ints]] = []
 
     def add(self, step: Ints | int, tracks: Ints, sources: Ints) -> None:
         """Assign the samples of the input ids ``sources`` (C,) at ``step`` to ``tracks`` (C,)."""
-        for held, values in ((self._steps, step), (self._tracks, tracks), (self._sources, sources)):
-            held.extend(np.broadcast_to(np.asarray(values, np.int64), tracks.shape).tobytes())
+        self._parts.append(np.stack([np.broadcast_to(step, tracks.shape), tracks, sources]))
 
     def confirm(self, step: int, tracks: Ints) -> None:
         """Confirm assignments of ``tracks`` (C,) up to ``step``; once this was called, unconfirmed ones are dropped."""
         self._confirmed.append((step, tracks))
 
-    def of(self, samples: LogSamples, steps: Sequence[int]) -> tuple[Ints, Ints, Ints, Ints]:
+    def of(self, samples: FrameColumns, steps: Ints) -> tuple[Ints, Ints, Ints, Ints]:
         """Steps, tracks, input ids and samples of the assignments, in the order in which they were made; (C,) each.
 
         ``samples`` are those of all ``steps``. A track has one sample a step.
         """
-        step, track, source = (np.frombuffer(bytes(h), np.int64) for h in (self._steps, self._tracks, self._sources))
-        have = samples.column("track_id"), np.repeat(np.array(steps, np.int64), samples.counts)
-        row = find_rows(have, (source, step))
+        step, track, source = np.concatenate(self._parts, axis=1)
+        row = find_rows((column(samples, "track_id"), np.repeat(steps, np.diff(samples.ends))), (source, step))
         kept = np.flatnonzero((row >= 0) & self._is_confirmed(step, track))
         return step[kept], track[kept], source[kept], row[kept]
 
@@ -140,33 +86,20 @@ class Assignments:
 
 
 class OnlinePass:
-    """Online re-tracking of one log: ``step`` for each frame, ``finish``, then ``outputs``.
+    """Online re-tracking of one log: made of its samples, of which it has read all then.
 
-    It leaves for ``offline`` which track had which sample, the samples, the steps, and the noise of measured positions.
-    It may hold for the whole log what ``LogSamples`` says, and no rows.
+    It leaves for ``offline`` which track had which sample, the ``steps`` (F,) of the frames, and the noise of measured
+    positions. ``passed`` (F,) is by how many steps time advanced. It holds for the whole log what ``column`` says, and
+    no rows.
     """
 
     noise_m: float
 
-    def __init__(self, rate_hz: float, bridged_s: float) -> None:
-        self.assignments, self.samples = Assignments(), LogSamples()
-        self.steps: list[int] = []
-        self._rate_hz, self._bridged_s = rate_hz, bridged_s
-        self._last_ns: int | None = None
-
-    def advance(self, t_ns: int) -> int:
-        """Add the step of a time; returns by how many steps time advances."""
-        last_ns, self._last_ns = self._last_ns, t_ns
-        passed = 1 if last_ns is None else steps_passed(t_ns - last_ns, self._rate_hz, self._bridged_s)
-        self.steps.append(self.steps[-1] + passed if self.steps else 0)
-        return passed
-
-    def step(self, frame: Frame) -> None:
-        """One step: association, update, birth and termination of tracks."""
-        raise NotImplementedError
-
-    def finish(self) -> None:
-        """No more steps come."""
+    def __init__(self, frames: FrameColumns, rate_hz: float, bridged_s: float) -> None:
+        self.assignments, self.samples = Assignments(), frames
+        passed = [steps_passed(ns, rate_hz, bridged_s) for ns in np.diff(frames.t_ns).tolist()]
+        self.passed = np.array([1, *passed][: len(frames)], np.int64)
+        self.steps = np.cumsum(self.passed) - 1
 
     def outputs(self) -> tuple[FrameColumns, FrameColumns]:
         """The online tracks and their predictions, from the past alone, a frame for each step."""

@@ -21,7 +21,7 @@ from mcaptrack.predictors import Forecast, Predictor, make, predict_together
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
+from mcaptrack.transforms.retrack.assignments import Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import (
     ConsistencyOptions,
@@ -120,7 +120,7 @@ class ActiveTracks(NamedTuple):
 class ConsistencyPass(OnlinePass):
     """Algorithm 1 over one log."""
 
-    def __init__(self, options: ConsistencyOptions, movers: Movers = PEOPLE) -> None:
+    def __init__(self, options: ConsistencyOptions, _: Movers, frames: FrameColumns) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
         if horizon == 1 and options.distance != "now":
             raise McaptrackError(
@@ -128,7 +128,7 @@ class ConsistencyPass(OnlinePass):
                 f'"{options.distance}" compares predictions of one time made at different steps, which takes '
                 f'{2 / options.rate_hz:g} s at least; the distance "now" needs one step'
             )
-        super().__init__(options.rate_hz, options.bridged_s)
+        super().__init__(frames, options.rate_hz, options.bridged_s)
         self._options = options
         self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)
         self._holt = Holt(options.alpha, options.beta)
@@ -138,13 +138,11 @@ class ConsistencyPass(OnlinePass):
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
         self._online = FrameCollector(TRACKS), FrameCollector(PREDICTIONS)
         self._next_id = 1
+        for frame, step, passed in zip(frames, self.steps.tolist(), self.passed.tolist(), strict=True):
+            self._step(frame, step, passed)
 
-    def step(self, frame: Frame) -> None:
+    def _step(self, frame: Frame, step: int, passed: int) -> None:
         """One step: associate, update, age, start and terminate tracks."""
-        passed = self.advance(frame.t_ns)
-        step = self.steps[-1]
-        self.samples.add(frame)
-
         sources = frame.rows["track_id"]
         past, valid = self._histories.push(sources, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
         usable = valid[:, -self._options.min_history :].all(axis=1)

@@ -13,11 +13,12 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Ints
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import Planes
+from mcaptrack.geometry.ragged import group_index
 from mcaptrack.notices import warn
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, Frame, Rows
-from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
-from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.frame_columns import FrameColumns, collect
+from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows
 from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
@@ -26,6 +27,7 @@ from mcaptrack.transforms.retrack.assignments import (
     Movers,
     OnlinePass,
     at_pace_of_log,
+    column,
     join_classes,
     movers_of,
     split_classes,
@@ -121,9 +123,8 @@ class KeptIds(OnlinePass):
     """
 
     def __init__(self, options: RetrackOptions, movers: Movers, frames: FrameColumns) -> None:
-        super().__init__(options.rate_hz, LAST_NS / NS_PER_S)
+        super().__init__(frames, options.rate_hz, LAST_NS / NS_PER_S)
         self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
-        self._number: dict[int, int] = {}
         self._forecaster = Forecaster(
             options.predictor,
             options.horizon_s,
@@ -133,31 +134,20 @@ class KeptIds(OnlinePass):
             options.class_limits,
             adapt=options.follows_log,
         )
-        self.online = self._read(frames)
-
-    def _read(self, frames: FrameColumns) -> FrameColumns:
-        """The online tracks: frames with the samples under numbers of their own."""
-        out = FrameCollector(TRACKS)
-        for low, high, joined in joined_parts(TRACKS, frames):
-            for t_ns in joined.t_ns.tolist():
-                self.advance(t_ns)
-            rows = joined.rows.take(np.lexsort((joined.rows["track_id"], joined.frame)))
-            numbers = frames.numbers[low:high]
-            self.samples.extend(joined.t_ns, numbers, joined.ends, rows)
-            source = rows["track_id"].copy()
-            own = self._numbers(source)
-            self.assignments.add(np.array(self.steps[low:high], np.int64)[joined.frame], own, source)
-            online = rows.copy()
-            online["source_id"], online["track_id"] = source, own
-            out.extend(joined.t_ns, numbers, joined.ends, online)
-        return out.done()
-
-    def _numbers(self, source: Ints) -> Ints:
-        """The number of the track of each input id (R,): from 1 on in the order in which they come."""
+        source = column(frames, "track_id")
         ids, first, which = np.unique(source, return_index=True, return_inverse=True)
-        for number in ids[np.argsort(first)].tolist():
-            self._number.setdefault(number, len(self._number) + 1)
-        return np.array([self._number[number] for number in ids.tolist()], np.int64)[which]
+        number = np.empty(len(ids), np.int64)
+        frame = group_index(np.diff(frames.ends))
+        number[np.lexsort((ids, frame[first]))] = np.arange(1, len(ids) + 1)  # in the order in which they come
+        self.assignments.add(self.steps[frame], number[which], source)
+
+        def numbered(joined: JoinedFrames) -> Rows:
+            rows = joined.rows.take(np.lexsort((joined.rows["track_id"], joined.frame)))
+            rows["source_id"] = rows["track_id"]
+            rows["track_id"] = number[np.searchsorted(ids, rows["track_id"])]
+            return rows
+
+        self.online = mapped_rows(TRACKS, frames, numbered)
 
     def outputs(self) -> tuple[FrameColumns, FrameColumns]:
         return self.online, self._forecaster.predict_all(self.online)
@@ -165,7 +155,7 @@ class KeptIds(OnlinePass):
 
 def _retrack(
     options: Options,
-    new_pass: Callable[[Options, Movers], OnlinePass],
+    new_pass: Callable[[Options, Movers, FrameColumns], OnlinePass],
     frames: Iterable[Frame],
     seen: list[AppearanceCalibration] | None = None,
 ) -> Iterator[tuple[Frame, ...]]:
@@ -243,19 +233,19 @@ def _sampled(tracks: FrameColumns, at_ns: Ints, gap_s: float, planes: Planes) ->
 
 def _retracked(
     options: Options,
-    new_pass: Callable[[Options, Movers], OnlinePass],
+    new_pass: Callable[[Options, Movers, FrameColumns], OnlinePass],
     frames: FrameColumns,
     score: float,
     seen: list[AppearanceCalibration],
 ) -> list[Iterable[Frame]]:
     """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    online = KeptIds(options, movers, frames) if movers.on_ground else _passed(new_pass(options, movers), frames)
+    online = (KeptIds if movers.on_ground else new_pass)(options, movers, frames)
     run = online
     if options.follows_speed and not movers.on_ground and (paced := at_pace_of_log(movers, frames)) != movers:
-        movers, run = paced, _passed(new_pass(options, paced), frames)
+        movers, run = paced, new_pass(options, paced, frames)
     model = motion_model(options, run.noise_m, movers)
-    offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
+    offline = offline_tracks(options, model, run, movers)
     seen.extend([] if offline.calibration is None else [offline.calibration])
     times = frames.t_ns.tolist(), frames.numbers.tolist()
     causal, predictions = online.outputs()
@@ -263,14 +253,6 @@ def _retracked(
     of_log = {"": offline.tracks, "decisions": offline.decisions, APPEARANCE_OUTPUT: offline.looks}
     outputs |= {name: map(Frame, *times, rows) for name, rows in (of_log | {WORLDS_OUTPUT: offline.worlds}).items()}
     return [outputs[name] for name in options.writes]
-
-
-def _passed(run: OnlinePass, frames: FrameColumns) -> OnlinePass:
-    """A pass that has seen all frames."""
-    for frame in frames:
-        run.step(frame)
-    run.finish()
-    return run
 
 
 _PAPER: Final = RetrackByConsistency(

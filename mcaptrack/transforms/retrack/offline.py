@@ -22,11 +22,12 @@ from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_s
 from mcaptrack.notices import warn
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, BodyPart, DecisionKind, Frame, Rows
 from mcaptrack.schema.classes import first_classes, majority
+from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows, spans_of
 from mcaptrack.schema.resampling import ANGLES, LINEAR
 from mcaptrack.transforms.retrack.answers import CERTAIN, Answers
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Assignments, LogSamples, Movers, Tracks
+from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass, Tracks, column
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
@@ -167,7 +168,7 @@ class Decided(NamedTuple):
     hypotheses: Hypotheses
 
 
-def decision_rows(decided: Decided, model: MotionModel, samples: LogSamples, steps: Sequence[int]) -> Iterator[Rows]:
+def decision_rows(decided: Decided, model: MotionModel, samples: FrameColumns, steps: Ints) -> Iterator[Rows]:
     """The decisions at each of ``steps``: rows of Decisions, ordered by kind and track."""
     parts = _joined(decided, model.step_s), _persons(decided, model.step_s)
     at, rows = np.concatenate([places for places, _ in parts]), DECISIONS.joined([rows for _, rows in parts])
@@ -287,8 +288,8 @@ def appearance_rows(descriptors: Descriptors, track: Ints, times_ns: Ints) -> It
         rows[name] = np.repeat(values, len(BodyPart))
     rows["body_part"] = np.tile(list(BodyPart), len(ids))
     shares = mean_shares(descriptors.values[used], group, len(ids)).reshape(len(rows), len(BINS))
-    for name, column in zip(BINS, shares.T, strict=True):
-        rows[name] = column
+    for name, share in zip(BINS, shares.T, strict=True):
+        rows[name] = share
     at = np.repeat(last, len(BodyPart))
     order = np.argsort(at, kind="stable")
     ends = np.append(0, np.searchsorted(at[order], times_ns, "right")).tolist()
@@ -410,7 +411,7 @@ def vote(rows: Rows) -> tuple[int, int]:
 
 
 def rows_by_step(
-    rows: TrackRows, samples: LogSamples, xy_m: Floats | None, planes: Planes, steps: Sequence[int], times_ns: Ints
+    rows: TrackRows, samples: FrameColumns, xy_m: Floats | None, planes: Planes, steps: Ints, times_ns: Ints
 ) -> Iterator[Rows]:
     """The rows of tracks at each of ``steps``, at ``times_ns``, ordered by id; each track has the class of most of its
     rows.
@@ -422,7 +423,7 @@ def rows_by_step(
     rows = taken(rows, order)
     ends = np.append(0, np.searchsorted(rows.step, steps, "right"))
     votes = np.empty(len(order), [("track_id", np.int64), ("class_id", np.uint32)])
-    votes["track_id"], votes["class_id"] = rows.track, samples.column("class_id")[rows.before]
+    votes["track_id"], votes["class_id"] = rows.track, column(samples, "class_id")[rows.before]
     vote(votes)
     for low, high in spans_of(ends):
         here = slice(ends[low], ends[high])
@@ -438,7 +439,7 @@ def rows_by_step(
         yield from (part[start:end] for start, end in pairwise(bounds))
 
 
-def _rows(which: TrackRows, samples: LogSamples) -> Rows:
+def _rows(which: TrackRows, samples: FrameColumns) -> Rows:
     """Rows (R,) of tracks."""
     before, is_sample = samples.take(which.before), which.is_sample
     after, rows = before.copy(), before.copy()
@@ -454,23 +455,15 @@ def _rows(which: TrackRows, samples: LogSamples) -> Rows:
     return rows
 
 
-def offline_tracks(
-    options: RetrackOptions,
-    model: MotionModel,
-    assignments: Assignments,
-    samples: LogSamples,
-    steps: Sequence[int],
-    times_ns: Ints,
-    movers: Movers = PEOPLE,
-) -> Offline:
-    """The rows of all tracks at each of ``steps``, and those of further outputs if ``options`` writes them.
+def offline_tracks(options: RetrackOptions, model: MotionModel, run: OnlinePass, movers: Movers = PEOPLE) -> Offline:
+    """The rows of all tracks at each step, and those of further outputs if ``options`` writes them.
 
-    ``samples`` are those of all steps, ``times_ns`` the times of these; ``model`` is in the unit of ``movers``. A
-    sample that was assigned to two tracks goes to the one that had it first, unless both keep it (``shares_samples``),
-    as in the authors' program.
+    ``model`` is in the unit of ``movers``. A sample that was assigned to two tracks goes to the one that had it first,
+    unless both keep it (``shares_samples``), as in the authors' program.
     """
-    step, track, source, sample = assignments.of(samples, steps)
-    xy = np.stack([samples.column(name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
+    samples, steps, times_ns = run.samples, run.steps, run.samples.t_ns
+    step, track, source, sample = run.assignments.of(samples, steps)
+    xy = np.stack([column(samples, name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
     descriptors = options.stored_looks if options.looks is None else options.looks
     seen_ns = times_ns[np.searchsorted(steps, step)]
     look = np.full(len(step), -1) if descriptors is None else descriptors.find(seen_ns, source)
@@ -558,7 +551,7 @@ def _log_odds(
     trajectories: Trajectories,
     smoothed: State,
     rows: TrackRows,
-    samples: LogSamples,
+    samples: FrameColumns,
     movers: Movers,
     log: tuple[int, int],
     is_short: Bools,
@@ -570,18 +563,18 @@ def _log_odds(
     return scored_log_odds(
         smoothed.mean[:, :2] * movers.unit_m,
         trajectories.first,
-        rows.between(samples.column("score")),
-        samples.column("observed")[rows.before] & rows.is_sample,
+        rows.between(column(samples, "score")),
+        column(samples, "observed")[rows.before] & rows.is_sample,
         movers.usual_score,
         model.step_s,
     )
 
 
-def _worlds(options: RetrackOptions, decided: Decided, least_steps: int, samples: LogSamples) -> Worlds:
+def _worlds(options: RetrackOptions, decided: Decided, least_steps: int, samples: FrameColumns) -> Worlds:
     """The worlds of what was decided."""
     tracks, log_odds, kept, hypotheses = decided
     tracklets = hypotheses.tracklets
-    of_class = int(samples.column("class_id")[0])
+    of_class = int(column(samples, "class_id")[0])
     worlds = draw_worlds(
         options.drawn_worlds,
         hypotheses,

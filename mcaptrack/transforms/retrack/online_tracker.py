@@ -14,14 +14,13 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.neighbours import Pairing, near_pairs
-from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, StateRows, update
 
@@ -121,18 +120,15 @@ class OnlineLinks:
         self._link_count, self._estimated = 0, 0
         self._shifts = linking.prior_shifts(np.empty(0), np.empty(0))
 
-    def __call__(
-        self, steps: Ints, tick: Ints, tracks: Ints, state: State, is_observed: Bools, is_written: Bools
-    ) -> tuple[Ints, Bools]:
-        """The ids under which the tracks alive at each of F steps are written, (R,), and whether they are, (R,).
+    def __call__(self, seen: Alive, is_written: Bools) -> tuple[Ints, Bools]:
+        """The ids under which the tracks alive at some steps are written, (R,), and whether they are, (R,).
 
-        ``steps`` (F,) are the numbers of the steps, ``tick`` (R,) the index of the step of each track, rising;
-        ``tracks`` (5, R) and ``state`` (R,) are as in ``Step``. ``is_written`` (R,) says which are written in any case.
-        Nothing is known at a step that was not known then.
+        ``is_written`` (R,) says which are written in any case. Nothing is known at a step that was not known then.
         """
+        steps, _, tick, is_observed, tracks, state = seen
         if self._max_gap_steps <= 0:
             return np.asarray(tracks[IDS]), is_written
-        alive, which = self._known(steps, tick, tracks, state, is_observed)
+        alive, which = self._known(seen)
         count = len(tick)
         is_named = self._are_named(alive.ids)
         first = np.full(len(alive.ids), count)  # the row from which on a track is written that was not written before
@@ -225,38 +221,28 @@ class OnlineLinks:
         is_made[best[is_right]] = True
         return is_made
 
-    def _known(self, steps: Ints, tick: Ints, tracks: Ints, state: State, is_observed: Bools) -> tuple[_Known, Ints]:
+    def _known(self, seen: Alive) -> tuple[_Known, Ints]:
         """All tracks as known at the last step or when they were over, (K,), and the one that each row (R,) is of."""
-        before = self._alive
-        names, which = np.unique(np.concatenate([before.ids, tracks[IDS]]), return_inverse=True)
-        had, which = which[: len(before.ids)], which[len(before.ids) :]
-        ends = np.full(len(names), -1)
-        ends[which] = tick  # rising, so the last one stays
-        last_row = np.full(len(names), -1)
-        seen = np.flatnonzero(is_observed)
-        last_row[which[seen]] = seen
-        began = np.full(len(names), _NEVER)
-        np.minimum.at(began, which, steps[tick])
-        began[had] = before.began
-        (last, hits), mean, cov = (
-            np.zeros((2, len(names)), np.int64),
-            np.zeros((len(names), 4)),
-            np.zeros((len(names), 3)),
+        before, count = self._alive, len(self._alive.ids)
+        at, hits = seen.steps[seen.tick], seen.tracks[HITS]
+        ids, first, which = np.unique(
+            np.concatenate([before.ids, seen.tracks[IDS]]), return_index=True, return_inverse=True
         )
-        begun = State(np.zeros((len(names), 4)), np.zeros((len(names), 3)))
-        is_new = np.ones(len(names), bool)
-        is_new[had] = False
-        first_row = np.full(len(names), len(tick))
-        np.minimum.at(first_row, which, np.arange(len(tick)))
-        for column, at_birth, now_at in zip(begun, before.begun, state, strict=True):
-            column[had] = at_birth
-            column[is_new] = now_at[first_row[is_new]]
-        earlier, now = (before.last, before.hits, *before.state), (steps[tick], tracks[HITS], *state)
-        is_seen = last_row >= 0
-        for values, was, is_now in zip((last, hits, mean, cov), earlier, now, strict=True):
-            values[had] = was
-            values[is_seen] = is_now[last_row[is_seen]]
-        return _Known(names, began, last, np.append(steps, _NEVER)[ends + 1], hits, begun, State(mean, cov)), which
+        observed = np.concatenate([np.arange(count), count + np.flatnonzero(seen.is_observed)])
+        last = np.empty(len(ids), np.int64)
+        last[which[observed]] = observed  # rising, so the last one stays
+        ends = np.full(len(ids), -1)
+        ends[which[count:]] = seen.tick
+        known = _Known(
+            ids,
+            np.concatenate([before.began, at])[first],
+            np.concatenate([before.last, at])[last],
+            np.append(seen.steps, _NEVER)[ends + 1],
+            np.concatenate([before.hits, hits])[last],
+            taken(joined([before.begun, seen.state]), first),
+            taken(joined([before.state, seen.state]), last),
+        )
+        return known, which[count:]
 
     def _learn(self, log_odds: Floats, gap_s: Floats) -> None:
         """Learn from the best links so far how many are right after gaps of what length."""
@@ -307,6 +293,22 @@ class Step(NamedTuple):
     row: Ints
     mean: Floats
     cov: Floats
+
+
+class Alive(NamedTuple):
+    """The tracks alive at each of F steps, R in all, laid end to end.
+
+    ``steps`` (F,) are the numbers of the steps, ``passed`` (F,) is by how many time advanced to each, and ``tick`` (R,)
+    the index of the step of each track, rising. ``tracks`` (5, R) are as in ``Step``; ``is_observed`` (R,) says which
+    have an observation then, and ``state`` (R,) are their states.
+    """
+
+    steps: Ints
+    passed: Ints
+    tick: Ints
+    is_observed: Bools
+    tracks: Ints
+    state: State
 
 
 @dataclass
@@ -509,7 +511,7 @@ def _squared(off: Floats) -> Floats:
 # A track that is lost is written for a while, because most come back. Those that don't have left, or were false.
 # Which is likelier is learned in the same way, for each number of steps without an observation, for tracks that
 # have not lasted yet, and for those that would be outside of the area in which tracks were seen so far: most of
-# these have left it. It also depends on where the track was lost (``PlacesOfLosses``).
+# these have left it.
 #
 # Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have
 # lasted; A levels of steps without an observation.
@@ -529,106 +531,6 @@ def _lasting(confirm_hits: int) -> int:
 _LASTS, _RETURNS, _WEIGHT = 0.6, 0.8, 2.0
 #: Numbers of observations, and of steps without one, are counted in at most so many levels.
 _LEVELS: Final = 200
-
-
-# Where lost tracks come back and where they don't, as far as the log has shown.
-#
-# People go out at some places, and are missed for a moment at others. Whether a lost track comes back is told by
-# what became of those that were lost nearby, compared with the whole log. (Where a track began tells less of
-# whether it will last: people who are soon occluded look like false detections.)
-#
-# Letters: F steps; R tracks alive at these steps, end to end.
-
-
-Place: TypeAlias = tuple[float, float]
-
-#: Places are as near as this to be one.
-_NEAR_M: Final = 2.0
-#: Each place counts as if so many tracks like all others had been there before.
-_USUAL: Final = 8.0
-#: So many of the last tracks count.
-_LAST: Final = 2000
-#: What happens to tracks, in the order in which it is looked at within a step.
-_OVER, _BACK, _LOST = range(3)
-
-
-class PlaceOdds:
-    """The odds that something turns out well at places, compared with everywhere."""
-
-    def __init__(self) -> None:
-        self._xy_m = np.empty((2, _LAST))
-        self._is_good = np.zeros(_LAST, bool)
-        self._count = 0
-
-    def add(self, place: Place, is_good: bool) -> None:
-        """Count what became of something that was at a place."""
-        at = self._count % _LAST
-        self._xy_m[:, at], self._is_good[at] = place, is_good
-        self._count += 1
-
-    def ratio(self, place: Place) -> float:
-        """The odds that something at a place turns out well, as a ratio to those everywhere."""
-        count = min(self._count, _LAST)
-        is_good = self._is_good[:count]
-        share = (int(is_good.sum()) + 1) / (count + 2)
-        (x, y), (x_m, y_m) = place, self._xy_m[:, :count]
-        near = is_good[(x_m - x) ** 2 + (y_m - y) ** 2 <= _NEAR_M**2]
-        good = int(near.sum())
-        return (good / share + _USUAL) / ((len(near) - good) / (1 - share) + _USUAL)
-
-
-class PlacesOfLosses:
-    """Where tracks were lost, and what became of them: called with the steps of a log, some at a time."""
-
-    def __init__(self) -> None:
-        self._odds = PlaceOdds()
-        self._lost: dict[int, tuple[Place, float]] = {}  # where each lost track was lost, and the ratio there
-
-    def __call__(self, passed: Ints, tick: Ints, ids: Ints, is_observed: Bools, xy_m: Floats) -> Floats:
-        """The odds that lost tracks (R,) come back, as ratios to those of the whole log; 1 for others.
-
-        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the index of the step of each track, rising,
-        and ``xy_m`` (2, R) where it is. Nothing is known at a step that was not known then.
-        """
-        order = np.lexsort((tick, ids))
-        ids, tick, missed = ids[order], tick[order], ~is_observed[order]
-        starts = run_starts(ids)
-        first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
-        names = ids[first].tolist()
-        for name in self._lost.keys() - set(names):
-            self._end(name, is_told=bool(passed[0] == 1))
-        was_missed = np.append(False, missed[:-1])[: len(ids)]
-        was_missed[first] = [name in self._lost for name in names]
-        happened = (
-            last[missed[last] & (tick[last] < len(passed) - 1)],
-            np.flatnonzero(was_missed & ~missed),
-            np.flatnonzero(missed & ~was_missed),
-        )
-        row, what = np.concatenate(happened), np.repeat(range(len(happened)), [len(rows) for rows in happened])
-        when = tick[row] + (what == _OVER)
-        x_m, y_m = xy_m[:, order[row]].tolist()
-        ratio = np.ones(len(ids))  # at the row from which on it holds
-        ratio[first] = [self._lost[name][1] if name in self._lost else 1.0 for name in names]
-        events = zip(when.tolist(), what.tolist(), row.tolist(), ids[row].tolist(), x_m, y_m, strict=True)
-        for step, event, at, name, x, y in sorted(events):
-            if event == _OVER:
-                self._end(name, is_told=bool(passed[step] == 1))
-            elif event == _BACK:
-                self._odds.add(self._lost.pop(name)[0], True)
-                ratio[at] = 1.0
-            else:
-                ratio[at] = self._odds.ratio((x, y))
-                self._lost[name] = (x, y), float(ratio[at])
-        changes = np.union1d(first, row[what != _OVER])
-        out = np.empty(len(order))
-        out[order] = np.repeat(ratio[changes], np.diff(np.append(changes, len(order))))
-        return out
-
-    def _end(self, name: int, is_told: bool) -> None:
-        """A lost track is over; a gap of the log ends tracks without telling anything of them."""
-        place, _ = self._lost.pop(name)
-        if is_told:
-            self._odds.add(place, False)
 
 
 # Convex hulls that grow. Letters: N points, V vertices.
@@ -717,7 +619,6 @@ class ShownTracks:
         self._lasting = _lasting(confirm_hits)
         self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
         self._seen = GrowingHull()
-        self._places = PlacesOfLosses()
         # By level of observations: tracks that reached the next one or terminated, and those that terminated. By inside
         # and outside and level of steps without an observation: tracks that went on from there, and that came back.
         self._counts = np.zeros((2, self._levels + 1))
@@ -727,24 +628,20 @@ class ShownTracks:
         #: Of the last step: id, levels of observations and of steps without one, and whether outside, (4, K).
         self._last: Ints = np.empty((4, 0), np.int64)
 
-    def __call__(self, passed: Ints, tick: Ints, is_observed: Bools, tracks: Ints, xy_m: Floats) -> Bools:
-        """Which of the tracks alive at each of F steps are written, (R,).
-
-        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the number of the step of each row, rising;
-        ``tracks`` (5, R) and ``xy_m`` (2, R) are as in ``Step``. Nothing is known at a step that was not known then.
-        """
+    def __call__(self, alive: Alive) -> Bools:
+        """Which of the tracks alive at some steps are written, (R,). Nothing is known that was not known then."""
+        _, passed, tick, is_observed, tracks, state = alive
         is_confirmed, may_coast = tracks[HITS] >= self._confirm_hits, tracks[MISSED] <= self._coast
         if not self._adapts:
             is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
             return np.asarray(np.where(is_observed, is_confirmed, may_coast & is_old))
-        outside = ~self._inside(len(passed), tick, is_observed & is_confirmed, xy_m)
+        outside = ~self._inside(len(passed), tick, is_observed & is_confirmed, state.mean[:, :2].T)
         level, next_level = (self._level(tracks[HITS] + more) for more in (0, 1))
         age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
         lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
         lasting, where = level >= self._levels, outside.astype(np.intp)
-        ratio = self._places(passed, tick, tracks[IDS], is_observed, xy_m)
         early = lasts[tick, level] >= 0.5
-        comes_back = _at_odds(returns[tick, where, age], ratio) * lasts[tick, next_level] >= 0.5
+        comes_back = returns[tick, where, age] * lasts[tick, next_level] >= 0.5
         stays = may_coast & ((lasting & ~outside) | comes_back)
         return np.asarray(np.where(is_observed, early | is_confirmed, stays))
 
@@ -793,11 +690,6 @@ class ShownTracks:
         survives[:, -1] = 1.0
         stays_lost: Floats = 1 - (returns[1] + self._prior_returns) / (returns[0] + _WEIGHT)
         return _from_here_on(survives), 1 - _from_here_on(stays_lost)
-
-
-def _at_odds(probability: Floats, ratio: Floats) -> Floats:
-    """Probabilities (R,) with odds multiplied by ``ratio`` (R,)."""
-    return np.asarray(probability * ratio / (1 - probability + probability * ratio))
 
 
 def _counted(place: Ints, count: int, shape: tuple[int, ...]) -> Floats:

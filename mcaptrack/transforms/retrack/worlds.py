@@ -9,7 +9,7 @@ Letters: W worlds, K tracklets, E candidate links, P tracks.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -113,7 +113,7 @@ def draw_people(world: int, log_odds: Floats, seed: int = 0) -> Floats:
     return np.asarray(_KNOWN * log_odds + PERSON_NOISE * noise)
 
 
-def world_rows(worlds: Worlds, hypotheses: Hypotheses, step_s: float, steps: Sequence[int]) -> Iterator[Rows]:
+def world_rows(worlds: Worlds, hypotheses: Hypotheses, step_s: float, steps: Ints) -> Iterator[Rows]:
     """The rows of Worlds at each of ``steps``: those of the tracklets that begin there, by world and input id."""
     tracklets, count = hypotheses.tracklets, len(worlds.track)
     for low, high in pairwise(np.append(0, np.searchsorted(tracklets.begins, steps, "right")).tolist()):
