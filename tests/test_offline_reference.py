@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaptrack.geometry import assignment
 from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.frame_columns import collect
@@ -143,9 +144,9 @@ def test_links_are_the_same_without_a_table_of_all_pairs_and_in_batches_of_any_s
     step, name, *xy = map(np.array, zip(*placed, strict=True))
     tracks = tracks_of(step, name, name, np.stack(xy, axis=-1))
     whole = Hypotheses.of(model, tracks, 20.0).scored().best(0.1)
-    for constant, value in (("_TABLE_CELLS", 1), ("_BATCH", int(rng.integers(1, 9)))):
+    for module, constant, value in ((assignment, "LARGE_TABLE", 1), (linking, "_BATCH", int(rng.integers(1, 9)))):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(linking, constant, value)
+            patch.setattr(module, constant, value)
             assert Hypotheses.of(model, tracks, 20.0).scored().best(0.1).tolist() == whole.tolist()
 
 
@@ -167,8 +168,8 @@ def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alon
     rows = np.repeat(np.arange(count), 3)
     pairs = rows, np.minimum(rows + np.tile([0, 1, 2], count), count - 1)
     gain = np.random.default_rng(0).uniform(0.1, 5, len(rows))
-    linking._assigned(pairs, gain, (count, count))
-    _, most = held(lambda: linking._assigned(pairs, gain, (count, count)))
+    linking.best_links(*pairs, gain, count)
+    _, most = held(lambda: linking.best_links(*pairs, gain, count))
     assert most < 2_000_000
 
 

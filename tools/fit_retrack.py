@@ -43,11 +43,11 @@ from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
 from mcaptrack.transforms.retrack.assignments import Movers, Tracks
+from mcaptrack.transforms.retrack.decisions import draw_worlds, find_joins
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import Trajectories, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
-from mcaptrack.transforms.retrack.worlds import draw_worlds
 
 DEFAULT = PROFILES["default"]
 Found = TypeVar("Found")
@@ -265,7 +265,7 @@ def decisions_of(run: Run) -> tuple[Judged, Judged, Judged]:
     decided, model, *_ = reached("decision_rows", *run.args)
     tracks, people = decided.tracks, run.people(decided.tracks)
     begins, ends = sides_of(tracks, decided.hypotheses.tracklets, people)
-    link = offline.find_joins(decided, model.step_s).link
+    link = find_joins(decided, model.step_s).link
     sides = np.stack([ends[decided.hypotheses.before[link]], begins[decided.hypotheses.after[link]]])
     counts = (sides >= 0).any(axis=0)
     joins = Judged(decided.hypotheses.scored().log_odds()[link][counts], (sides[0] == sides[1])[counts])
@@ -285,7 +285,7 @@ def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
         50, choices, tracks.track[tracklets.first], decided.log_odds, decided.kept, DEFAULT.link_confidence, least_steps
     )
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
-    link = offline.find_joins(decided, run.args[1].step_s).link
+    link = find_joins(decided, run.args[1].step_s).link
     before, after = choices.before[link], choices.after[link]
     counts = (ends[before] >= 0) | (begins[after] >= 0)
     share = (some_worlds.track[:, before] == some_worlds.track[:, after]).mean(axis=0)

@@ -5,26 +5,28 @@ on is the person that ``previous_id`` was until ``duration_s`` before. Of kind "
 What is certain (0 or 1, a person said it) holds whatever else speaks against it; other probabilities, of judges, take
 the place of colours as evidence of the link.
 
+Corrections of people are in ``fix_tracks``.
+
 Letters: A answers, C assignments, K tracklets, E candidate links, P pieces of tracks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ragged import find_rows, run_starts
+from mcaptrack.geometry.ragged import find_rows, run_ends, run_starts
 from mcaptrack.notices import warn
 from mcaptrack.schema import DECISIONS, DecisionKind, Frame
 from mcaptrack.schema.framing import join_frames, nearest_times
 from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.decisions import favouring
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, best_next, following, named
 from mcaptrack.transforms.retrack.linking import chains
-from mcaptrack.transforms.retrack.worlds import favouring
 
 #: The log odds of what is certain: more than all evidence of a link.
 CERTAIN: Final = 100.0
@@ -174,3 +176,36 @@ class _Pieces:
         self.root[theirs] = low
         self._of[low] = mine + self._of.pop(high)
         return True
+
+
+def fix_tracks(tracks: Tracks, fixed: Collection[int]) -> Tracks:
+    """Tracks that people have corrected: all samples of a fixed input id have one track, and no other fixed one.
+
+    What a track has before the first sample of a fixed id, or after its last one, stays with it: a person who was
+    followed into the corrected part keeps the id. All else keeps its track, or gets a new one where a fixed id has
+    taken it.
+    """
+    order = tracks.order
+    is_fixed = np.isin(tracks.source[order], np.array(sorted(fixed), np.int64))
+    if not is_fixed.any():
+        return tracks
+    track, source = tracks.track[order], np.where(is_fixed, tracks.source[order], 0)
+    starts = run_starts(track, is_fixed, source)
+    first, piece = np.flatnonzero(starts), np.cumsum(starts) - 1
+    track, person, step, is_person = track[first], source[first], tracks.step[order[first]], is_fixed[first]
+    by_time = np.lexsort((step, person, ~is_person))[: np.count_nonzero(is_person)]
+    begins = run_starts(person[by_time])
+    is_first, is_last = np.zeros((2, len(first)), bool)
+    is_first[by_time], is_last[by_time] = begins, run_ends(begins)
+    same = track[1:] == track[:-1]
+    after, before = same & is_last[:-1] & ~is_person[1:], same & is_first[1:] & ~is_person[:-1]
+    person[:-1][before], person[1:][after] = person[1:][before], person[:-1][after]
+    is_person[:-1] |= before
+    is_person[1:] |= after
+    by_time = np.argsort(step, kind="stable")
+    names = np.stack([is_person, np.where(is_person, person, track)])[:, by_time]
+    _, begin, which = np.unique(names, axis=1, return_index=True, return_inverse=True)
+    out, node = np.empty(len(order), np.int64), np.empty(len(first), np.int64)
+    node[by_time] = named(begin[which.ravel()], track[by_time])
+    out[order] = node[piece]
+    return tracks._replace(track=out)

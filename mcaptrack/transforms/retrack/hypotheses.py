@@ -24,7 +24,7 @@ from mcaptrack.transforms.retrack.linking import (
     Fit,
     Gaps,
     TrackEnds,
-    assigned_links,
+    best_links,
     chains,
     features,
     features_of,
@@ -267,8 +267,7 @@ class Scored(NamedTuple):
 def best_next(before: Ints, after: Ints, gain: Floats, count: int) -> Ints:
     """The tracklet that follows each one (K,) by the best set of links (E,) with these gains; -1 where none does."""
     out = np.full(count, -1)
-    good = np.flatnonzero(gain > 0)
-    links = good[assigned_links(before[good], after[good], np.round(gain[good], 6), count)]
+    links = best_links(before, after, gain, count)
     out[before[links]] = after[links]
     return out
 

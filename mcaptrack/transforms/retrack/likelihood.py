@@ -22,7 +22,6 @@ from mcaptrack.schema.framing import JoinedFrames, join_frames, mapped_rows, spa
 from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, MotionModel, State
-from mcaptrack.transforms.retrack.offline import move_rows
 from mcaptrack.transforms.retrack.online_tracker import (
     HITS,
     IDS,
@@ -33,6 +32,7 @@ from mcaptrack.transforms.retrack.online_tracker import (
     ShownTracks,
 )
 from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptions
+from mcaptrack.transforms.to_video_rate import move_rows
 
 #: Frames with about so many samples are read, and their online tracks written, at once.
 _SAMPLES: Final = 2**12

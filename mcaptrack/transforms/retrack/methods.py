@@ -22,7 +22,7 @@ from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows
 from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
-from mcaptrack.transforms.retrack.appearance import AppearanceCalibration
+from mcaptrack.transforms.retrack.appearance import AppearanceCalibration, appearance_rows
 from mcaptrack.transforms.retrack.assignments import (
     Movers,
     OnlinePass,
@@ -37,7 +37,7 @@ from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.in_pictures import link_in_picture
 from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
-from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
+from mcaptrack.transforms.retrack.offline import offline_tracks
 from mcaptrack.transforms.retrack.options import (
     APPEARANCE_OUTPUT,
     WORLDS_OUTPUT,

@@ -213,7 +213,7 @@ class OnlineLinks:
         if not len(is_made):
             return is_made
         ends, begins = (np.unique(side, return_inverse=True)[1] for side in (links.lost, links.new))
-        best = linking.best_links(ends, begins, links.log_odds, len(is_made))
+        best = linking.best_links(ends, begins, links.log_odds - linking.MIN_LOG_ODDS, len(is_made))
         shifted = links.log_odds[best] + self._shifts[linking.gap_classes(links.gap_s[best])]
         is_right = shifted > np.where(is_first[best], self._least, self._sure)
         counts = best[is_settled[best] | is_right]
