@@ -21,7 +21,7 @@ from mcaptrack.sources.corrections import fixed_ids, with_corrections, without_f
 from mcaptrack.sources.ingest.label_job import with_new_ids
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.transforms import Retrack
-from mcaptrack.transforms.retrack.answers import fix_tracks
+from mcaptrack.transforms.retrack.decisions import fix_tracks
 from tests.commands import done
 from tests.test_offline_reference import tracks_of as assigned
 

@@ -22,9 +22,8 @@ from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.sources.ingest.labels.timeline import boxes_extent
 from mcaptrack.tables import build, rows
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack import identity_swaps, likelihood
-from mcaptrack.transforms.retrack.assignments import Movers
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms.retrack import identity_swaps, passes
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers
 from tests.awaiting import until
 from tests.memory import held
 
@@ -56,7 +55,7 @@ def small_blocks(monkeypatch):
     monkeypatch.setattr(rows, "GROUP_ROWS", 256)
     monkeypatch.setattr(rows, "_BUFFER_BYTES", 2**10)
     monkeypatch.setattr(build, "PIECE_ROWS", 256)
-    monkeypatch.setattr(likelihood, "_SAMPLES", 128)
+    monkeypatch.setattr(passes, "_SAMPLES", 128)
     monkeypatch.setattr(identity_swaps, "_CELLS", 64)
 
 

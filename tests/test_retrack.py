@@ -11,16 +11,15 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.hull import GrowingHull
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Rows, framing
+from mcaptrack.schema.by_class import join_classes, split_classes
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_odds_in_log, stand_throughout
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
-from mcaptrack.transforms.retrack.methods import KeptIds
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
-from mcaptrack.transforms.retrack.online_tracker import GrowingHull
+from mcaptrack.transforms.retrack.passes import PEOPLE, KeptIds, LikelihoodPass, Movers, movers_of, usual_score
 from tests.commands import call
 from tests.logs import provenance_of
 from tests.references.false_tracks import log_odds_in_log as in_log
@@ -479,8 +478,3 @@ def test_who_stands_for_the_whole_of_a_short_log_is_left_in_though_seen_now_and_
     found = tracked(paths)
     assert {11, 12, 13} < set(found)
     assert not {*range(20, 28)} & set(found)
-
-
-def test_places_far_away_are_places_too():
-    frames = walk(lambda n: {1: (1e12, 0.0), 3: (0.1 * (n % 3), 1.0)}, 12)
-    assert [len(result[1].rows) for result in DEFAULT(frames)] == [2] * 12

@@ -12,8 +12,8 @@ from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.transforms.retrack.assignments import column
 from mcaptrack.transforms.retrack.offline import TrackRows, rows_by_step
+from mcaptrack.transforms.retrack.passes import column
 from mcaptrack.transforms.to_video_rate import linked_tracks, mended_ends, move_rows, to_video_rate
 from tests.worlds import ns
 

@@ -112,7 +112,8 @@ def test_links_hold_in_as_many_worlds_as_are_likely():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(offline, "draw_worlds", lambda *given: args.append(given) or decisions.draw_worlds(*given))
         outputs_of(frames, worlds=1)
-    (_, hypotheses, *_), *_ = args
+    (_, decided, *_), *_ = args
+    hypotheses = decided.hypotheses
     tracklets = hypotheses.tracklets
     pair = hypotheses._replace(
         tracklets=tracklets._replace(

@@ -42,11 +42,10 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
-from mcaptrack.transforms.retrack.assignments import Movers, Tracks
 from mcaptrack.transforms.retrack.decisions import draw_worlds, find_joins
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.motion_model import Trajectories, filtered, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import Tracks, Trajectories, filtered, to_trajectories
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers, motion_model
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
 
 DEFAULT = PROFILES["default"]
@@ -178,7 +177,8 @@ class Pairs:
 
 def pairs_of(run: Run) -> Pairs:
     """The candidate links of a scene."""
-    model, tracks, *_ = reached("hypotheses_of", FITTED, *run.args[1:])
+    log, tracks = reached("hypotheses_of", FITTED, *run.args[1:])
+    model = log.model
     _, _, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     first, last = paths.first[:-1], paths.first[1:] - 1
     forward, backward = filtered(model, paths)
@@ -228,8 +228,8 @@ class Judged(NamedTuple):
 
 def choices_of(run: Run) -> Chosen:
     """What the ends and beginnings of tracklets should choose in a scene."""
-    model, tracks, max_gap_s, *_ = reached("hypotheses_of", *run.args)
-    tracklets, before, after, _, gap, terms, leaves, comes, _ = Hypotheses.of(model, tracks, max_gap_s)
+    log, tracks = reached("hypotheses_of", *run.args)
+    tracklets, before, after, _, gap, terms, leaves, comes, _ = Hypotheses.of(log.model, tracks, log.max_gap_s)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
     same = np.flatnonzero((ends[before] >= 0) & (ends[before] == begins[after]))
     right = []
@@ -279,11 +279,10 @@ def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
     """In how many of 50 worlds each join of a scene holds, and which joins are right; and the number of people, the
     number that was decided, and those that 5 %, 50 % and 95 % of the worlds don't exceed.
     """
-    _, decided, least_steps, _ = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
+    log, decided = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
+    least_steps = round(log.least_s * DEFAULT.rate_hz)
     tracks, choices, tracklets = decided.tracks, decided.hypotheses, decided.hypotheses.tracklets
-    some_worlds = draw_worlds(
-        50, choices, tracks.track[tracklets.first], decided.log_odds, decided.kept, DEFAULT.link_confidence, least_steps
-    )
+    some_worlds = draw_worlds(50, decided, DEFAULT.link_confidence, least_steps)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
     link = find_joins(decided, run.args[1].step_s).link
     before, after = choices.before[link], choices.after[link]
@@ -388,7 +387,7 @@ def held(seeds: list[int], steps: int) -> None:
     for run in runs(seeds, steps):
         outcomes.append(decisions_of(run))
         in_worlds.append(worlds_of(run))
-        rows = offline.offline_tracks(*run.args).tracks
+        rows = offline.offline_tracks(*run.args)[0][""]
         found = [frame._replace(rows=new) for frame, new in zip(run.samples, rows, strict=True)]
         for side, frames in zip(parts, (run.samples, found), strict=True):
             side.append(score(make_matchup(run.true, frames, "metres", GATE_M), "motmetrics"))

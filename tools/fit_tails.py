@@ -39,9 +39,8 @@ from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import JoinedFrames, join_frames
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack import likelihood
-from mcaptrack.transforms.retrack.assignments import Movers
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms import forecasts as made_by
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers
 
 STEPS, PAST = 12, 8
 #: People of a scene of walks, steps of each of their walks, and scenes and walks of a person in one draw.
@@ -117,7 +116,7 @@ def _keys(joined: JoinedFrames, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
 def distances(true: Positions, samples: list[Frame]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """For each predictor squared distances (N, T), and groups (N,), from samples and after re-tracking."""
     start = samples[0].t_ns
-    with patch.object(likelihood, "make", lambda *given: _Kept(make(*given))):
+    with patch.object(made_by, "make", lambda *given: _Kept(make(*given))):
         run = LikelihoodPass(PROFILES["default"], Movers(), collect(TRACKS, samples))
     kept = run._forecasts._predictor
     online, forecasts = map(list, run.outputs())

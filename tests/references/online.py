@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from math import exp, floor, hypot, inf, log, log10, pi, sqrt
+from math import exp, hypot, log, pi
 
 import numpy as np
 
@@ -115,6 +115,46 @@ class Lives:
         return bool(max(np.diff(angle).max(), angle[0] + 2 * pi - angle[-1]) > pi)
 
 
+class Places:
+    """What became of the last 2000 tracks that were lost."""
+
+    def __init__(self) -> None:
+        self.all: list[tuple[np.ndarray, bool]] = []
+
+    def ratio(self, at: np.ndarray) -> float:
+        """The odds that it goes well within 2 m, compared with everywhere; 8 more are as everywhere."""
+        ended = self.all[-2000:]
+        well = (sum(good for _, good in ended) + 1) / (len(ended) + 2)
+        near = [good for there, good in ended if hypot(*(there - at)) <= 2]
+        return (near.count(True) / well + 8) / (near.count(False) / (1 - well) + 8)
+
+
+def at_odds(probability: float, ratio: float) -> float:
+    return probability * ratio / (1 - probability + probability * ratio)
+
+
+class Losses:
+    """Places where tracks were lost, of those that are lost, and the odds that these come back."""
+
+    def __init__(self) -> None:
+        self.lost = Places()
+        self.now: dict[int, tuple[np.ndarray, float]] = {}
+
+    def learn(self, people: list[Person], has: dict[int, Row], passed: int) -> None:
+        for name in [one for one in self.now if one not in {person.name for person in people}]:
+            place, _ = self.now.pop(name)
+            if passed == 1:
+                self.lost.all.append((place, False))
+        for name in [one for one in self.now if one in has]:
+            self.lost.all.append((self.now.pop(name)[0], True))
+        for p in people:
+            if p.name not in has and p.name not in self.now:
+                self.now[p.name] = (p.here, self.lost.ratio(p.here))
+
+    def ratio(self, name: int) -> float:
+        return self.now[name][1] if name in self.now else 1.0
+
+
 @dataclass
 class Left:
     """A track as it was last observed, under the name that it is written."""
@@ -211,46 +251,6 @@ def log_density(off: np.ndarray, variance: float) -> float:
     return float(-(off**2).sum() / variance / 2 - log(2 * pi * variance))
 
 
-class Bends:
-    """How much tracks of the input bend: they can't have much more noise than that."""
-
-    def __init__(self, step_s: float) -> None:
-        self.step_s = step_s
-        self.places: dict[tuple[int, int], np.ndarray] = {}
-        self.found: list[tuple[int, int, int]] = []  # lag, step, and the sixteenth of a power of ten of the square
-
-    def limit(self, step: int, rows: list[Row]) -> float:
-        """The most that noise may be at a step with these observations."""
-        for row in rows:
-            name, here = row["track_id"], place(row)
-            self.places[name, step] = here
-            for lag in (1, 2, 3):
-                one, other = (self.places.get((name, step - back)) for back in (lag, 2 * lag))
-                if one is not None and other is not None:
-                    squared = max(((here - 2 * one + other) ** 2).sum(), 1e-8)
-                    self.found.append((lag, step, floor((log10(squared) + 8) * 16)))
-        variances = [self.variance(lag, step) for lag in (1, 2, 3)]
-        known = [one for one in variances if one is not None]
-        return max(1.5 * sqrt(max(known)), 0.3) if known else inf
-
-    def variance(self, lag: int, step: int) -> float | None:
-        """That of white noise with such bends: half of the squares are below the median, those of a minute ago count 1 / e."""
-        counts: dict[int, float] = {}
-        for of, then, level in self.found:
-            if of == lag:
-                counts[level] = counts.get(level, 0.0) + exp(-(step - then) * self.step_s / 60)
-        total = sum(counts.values())
-        if total < 30:
-            return None
-        below = 0.0
-        for level in sorted(counts):
-            if below + counts[level] >= total / 2:
-                power = (level + (total / 2 - below) / counts[level]) / 16 - 8
-                return 10**power / (12 * log(2))
-            below += counts[level]
-        raise AssertionError
-
-
 class OnlineTracker:
     CAP, GATE, CROWD_M, FRESH, FLOOR_M = 26.0, 40.0, 1.7, 4.0, 0.1
     WIDE, MERGED = 0.1, 4.0
@@ -274,15 +274,12 @@ class OnlineTracker:
         online, predictions = [], []
         places: dict[tuple[int, int], Point] = {}
         lives = Lives(self.confirm, self.max_age)
-        bends = Bends(1 / o.rate_hz)
+        losses = Losses()
         motion = Motion(self.noise_m, max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
         returns = Returns(motion, o, self.confirm)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
             passed = step - steps[at - 1] if at else 1
             seen = sorted((r for r in rows if r["observed"] or o.interpolated), key=lambda row: row["track_id"])
-            if o.noise_m is None:
-                self.most_noise_m = bends.limit(step, seen)
-                self.noise_m = min(self.noise_m, self.most_noise_m)
             has = self.step(seen, passed)
             now = {
                 one.name: (one.hits, 0 if one.name in has else one.missed, lives.is_outside(one.here))
@@ -290,8 +287,9 @@ class OnlineTracker:
             }
             lives.learn(now, passed)
             lives.places += [one.here for one in self.people if one.name in has and one.hits >= self.confirm]
+            losses.learn(self.people, has, passed)
             returns.learn(self.people, has, step)
-            written = [one for one in self.people if self.is_written(one, now[one.name], lives)]
+            written = [one for one in self.people if self.is_written(one, now[one.name], lives, losses)]
             written += returns.name(written, step, has, self.people)
             shown = []
             for person in self.people:
@@ -320,7 +318,7 @@ class OnlineTracker:
             )
         return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
 
-    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives) -> bool:
+    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives, losses: Losses) -> bool:
         """Whether a track is written online."""
         o, (hits, missed, outside) = self.options, now
         if not o.adapt_online:
@@ -332,7 +330,7 @@ class OnlineTracker:
             return False
         if hits >= lives.lasting and not outside:
             return True
-        comes_back = lives.comes_back(missed, outside)
+        comes_back = at_odds(lives.comes_back(missed, outside), losses.ratio(person.name))
         return comes_back * lives.lasts(hits + 1) >= 0.5
 
     def forecast(self, row: Row, name: int, step: int, places: dict[tuple[int, int], Point]):
@@ -430,4 +428,4 @@ class OnlineTracker:
             self.judged += len(outside)
             rate = max(0.01, 5 / (self.judged + 50))
             change = rate * sum(out - self.WIDE for out in outside)
-            self.noise_m = min(max(exp(log(noise_m) + change), 0.03), 0.8, self.most_noise_m)
+            self.noise_m = min(max(exp(log(noise_m) + change), 0.03), 0.8)

@@ -20,8 +20,7 @@ from reproduce import scenes
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Predict, Retrack
-from mcaptrack.transforms.retrack.assignments import Movers
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers
 
 
 def online(samples: list[Frame]) -> None:

@@ -20,7 +20,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.colour_histograms import BINS, mean_shares
 from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_starts
 from mcaptrack.schema import APPEARANCE, BodyPart, Rows
-from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.motion_model import Tracks
 
 #: The log likelihood ratio that the end of one track and the beginning of another are one person, for pairs of tracks
 #: (E,) that are numbered by ascending id.

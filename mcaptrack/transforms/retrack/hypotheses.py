@@ -19,7 +19,6 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
-from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.linking import (
     Fit,
     Gaps,
@@ -34,7 +33,7 @@ from mcaptrack.transforms.retrack.linking import (
     log_speed,
     pairs_in_reach,
 )
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Tracks, filtered, to_trajectories
 from mcaptrack.transforms.retrack.weights import Choices
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, filtered_rows, joined_parts, mapped_rows
 from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence
-from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.motion_model import Tracks
 from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: Tracks are cut at gaps of more seconds than that, and more than a missing frame.

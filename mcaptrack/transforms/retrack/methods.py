@@ -11,32 +11,20 @@ from typing import ClassVar, Final, TypeAlias, TypeVar
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Ints
-from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import Planes
-from mcaptrack.geometry.ragged import group_index
 from mcaptrack.notices import warn
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, Frame, Rows
+from mcaptrack.schema.by_class import join_classes, split_classes
 from mcaptrack.schema.frame_columns import FrameColumns, collect
-from mcaptrack.schema.framing import JoinedFrames, joined_parts, mapped_rows
+from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
 from mcaptrack.transforms.retrack.appearance import AppearanceCalibration, appearance_rows
-from mcaptrack.transforms.retrack.assignments import (
-    Movers,
-    OnlinePass,
-    at_pace_of_log,
-    column,
-    join_classes,
-    movers_of,
-    split_classes,
-    usual_score,
-)
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.in_pictures import link_in_picture
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.offline import offline_tracks
 from mcaptrack.transforms.retrack.options import (
     APPEARANCE_OUTPUT,
@@ -44,6 +32,16 @@ from mcaptrack.transforms.retrack.options import (
     ConsistencyOptions,
     LikelihoodOptions,
     RetrackOptions,
+)
+from mcaptrack.transforms.retrack.passes import (
+    KeptIds,
+    LikelihoodPass,
+    Movers,
+    OnlinePass,
+    at_pace_of_log,
+    motion_model,
+    movers_of,
+    usual_score,
 )
 from mcaptrack.transforms.to_video_rate import steady_s, to_metres
 
@@ -102,55 +100,6 @@ class RetrackByConsistency(ConsistencyOptions):
 
 
 Retracking: TypeAlias = Retrack | RetrackByConsistency
-
-
-# Online re-tracking of tracks in metres: input ids are kept.
-#
-# A tracker of 3D boxes associates in metres and at the boxes' own rate, which is more than samples can add. What is
-# left is done offline: to link tracks over long gaps, to leave out false ones, and to smooth. Letters: R rows, K
-# tracks.
-
-
-class KeptIds(OnlinePass):
-    """Online re-tracking that keeps the ids of the input.
-
-    Parameters
-    ----------
-    options : RetrackOptions
-    movers : Movers
-    frames : FrameColumns
-        Samples of tracks; each goes to the track of its input id.
-    """
-
-    def __init__(self, options: RetrackOptions, movers: Movers, frames: FrameColumns) -> None:
-        super().__init__(frames, options.rate_hz, LAST_NS / NS_PER_S)
-        self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
-        self._forecaster = Forecaster(
-            options.predictor,
-            options.horizon_s,
-            options.min_history,
-            options.rate_hz,
-            options.class_names,
-            options.class_limits,
-            adapt=options.follows_log,
-        )
-        source = column(frames, "track_id")
-        ids, first, which = np.unique(source, return_index=True, return_inverse=True)
-        number = np.empty(len(ids), np.int64)
-        frame = group_index(np.diff(frames.ends))
-        number[np.lexsort((ids, frame[first]))] = np.arange(1, len(ids) + 1)  # in the order in which they come
-        self.assignments.add(self.steps[frame], number[which], source)
-
-        def numbered(joined: JoinedFrames) -> Rows:
-            rows = joined.rows.take(np.lexsort((joined.rows["track_id"], joined.frame)))
-            rows["source_id"] = rows["track_id"]
-            rows["track_id"] = number[np.searchsorted(ids, rows["track_id"])]
-            return rows
-
-        self.online = mapped_rows(TRACKS, frames, numbered)
-
-    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
-        return self.online, self._forecaster.predict_all(self.online)
 
 
 def _retrack(
@@ -245,13 +194,12 @@ def _retracked(
     if options.follows_speed and not movers.on_ground and (paced := at_pace_of_log(movers, frames)) != movers:
         movers, run = paced, new_pass(options, paced, frames)
     model = motion_model(options, run.noise_m, movers)
-    offline = offline_tracks(options, model, run, movers)
-    seen.extend([] if offline.calibration is None else [offline.calibration])
-    times = frames.t_ns.tolist(), frames.numbers.tolist()
+    rows, calibration = offline_tracks(options, model, run, movers)
+    seen.extend([] if calibration is None else [calibration])
     causal, predictions = online.outputs()
     outputs: dict[str, Iterable[Frame]] = {"online": causal, "predictions": predictions}
-    of_log = {"": offline.tracks, "decisions": offline.decisions, APPEARANCE_OUTPUT: offline.looks}
-    outputs |= {name: map(Frame, *times, rows) for name, rows in (of_log | {WORLDS_OUTPUT: offline.worlds}).items()}
+    for name, of_frames in rows.items():
+        outputs[name] = map(Frame, frames.t_ns.tolist(), frames.numbers.tolist(), of_frames)
     return [outputs[name] for name in options.writes]
 
 

@@ -87,6 +87,25 @@ def update(state: StateRows, xy_m: Floats, noise_m: Floats | float) -> None:
     c *= 1 - of_place
 
 
+class Tracks(NamedTuple):
+    """Samples that are assigned to tracks, (C,) each: step, track, input id, sample, position (C, 2) in units, the
+    descriptor of what is seen of it, or -1, and the online track.
+    """
+
+    step: Ints
+    track: Ints
+    source: Ints
+    sample: Ints
+    xy_m: Floats
+    look: Ints
+    online: Ints
+
+    @property
+    def order(self) -> Ints:
+        """The order by track, then step."""
+        return np.lexsort((self.step, self.track))
+
+
 class Trajectories(NamedTuple):
     """Tracks laid end to end: one row for every step from a track's first to its last, also inside gaps.
 

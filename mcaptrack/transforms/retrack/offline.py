@@ -5,7 +5,7 @@ Letters: C assignments (a track has a sample at a step), R rows, K tracks, N row
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise, repeat
 from typing import Any, Final, NamedTuple
 
@@ -16,21 +16,22 @@ from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
-from mcaptrack.schema import APPEARANCE, DECISIONS, WORLDS, Rows
+from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, Rows
 from mcaptrack.schema.classes import majority
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import spans_of
 from mcaptrack.schema.resampling import ANGLES, LINEAR
-from mcaptrack.transforms.retrack.answers import CERTAIN, Answers, fix_tracks
-from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, appearance_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass, Tracks, column
+from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, appearance_rows
 from mcaptrack.transforms.retrack.decisions import (
+    CERTAIN,
     PERSON,
     SHORT,
+    Answers,
     Decided,
     Worlds,
     decision_rows,
     draw_worlds,
+    fix_tracks,
     world_rows,
 )
 from mcaptrack.transforms.retrack.false_tracks import log_odds_in_log, scored_log_odds
@@ -38,13 +39,14 @@ from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import resolve_swaps
 from mcaptrack.transforms.retrack.motion_model import (
     MotionModel,
-    State,
+    Tracks,
     Trajectories,
     smooth,
     smooth_in_log,
     to_trajectories,
 )
-from mcaptrack.transforms.retrack.options import RetrackOptions
+from mcaptrack.transforms.retrack.options import APPEARANCE_OUTPUT, WORLDS_OUTPUT, RetrackOptions
+from mcaptrack.transforms.retrack.passes import PEOPLE, Movers, OnlinePass, column
 from mcaptrack.transforms.retrack.weights import probability
 from mcaptrack.transforms.to_video_rate import move_rows
 
@@ -58,18 +60,6 @@ _SHORT: Final = -0.05
 _SWEEPS: Final = 2
 #: The number of times that encounters are examined again after identities were swapped.
 _ROUNDS: Final = 5
-
-
-class Offline(NamedTuple):
-    """The rows of all tracks at each step, ordered by id; the decisions at each step, what tracks look like, and the
-    identities in worlds, if they were asked for; how appearance tells people apart, None if nothing was seen of them.
-    """
-
-    tracks: Iterator[Rows]
-    decisions: Iterator[Rows]
-    looks: Iterator[Rows]
-    worlds: Iterator[Rows]
-    calibration: AppearanceCalibration | None
 
 
 # Rows of offline tracks: described by a few numbers each while tracks are decided about, then made part by part.
@@ -160,75 +150,149 @@ def _rows(which: TrackRows, samples: FrameColumns) -> Rows:
     return rows
 
 
-def offline_tracks(options: RetrackOptions, model: MotionModel, run: OnlinePass, movers: Movers = PEOPLE) -> Offline:
-    """The rows of all tracks at each step, and those of further outputs if ``options`` writes them.
+class Log(NamedTuple):
+    """A log that is decided about: the options, how what moves in it moves, and what was done online.
+
+    ``model`` is in the unit of ``movers``. ``appearance`` and ``answers`` also tell which tracks are one person.
+    """
+
+    options: RetrackOptions
+    model: MotionModel
+    movers: Movers
+    run: OnlinePass
+    appearance: Appearance | None
+    answers: Answers
+
+    @property
+    def max_gap_s(self) -> float:
+        """The longest gap of links."""
+        return self.options.link_s / self.movers.unit_m
+
+    @property
+    def least_s(self) -> float:
+        """The least seconds that tracks last."""
+        steps, share = self.run.steps, _CONFIRMED_SHARE if self.movers.on_ground else 1.0
+        return share * self.options.shortest_s((steps[-1] - steps[0]) * self.model.step_s)
+
+
+def offline_tracks(
+    options: RetrackOptions, model: MotionModel, run: OnlinePass, movers: Movers = PEOPLE
+) -> tuple[dict[str, Iterator[Rows]], AppearanceCalibration | None]:
+    """The rows of each output at each step, those of tracks ordered by id, and how appearance tells people apart.
 
     ``model`` is in the unit of ``movers``. A sample that was assigned to two tracks goes to the one that had it first,
     unless both keep it (``shares_samples``), as in the authors' program.
     """
     samples, steps, times_ns = run.samples, run.steps, run.samples.t_ns
-    step, track, source, sample = run.assignments.of(samples, steps)
-    xy = np.stack([column(samples, name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
+    tracks = _as_assigned(options, run, movers)
+    seen = Appearance.of(options.looks, tracks, model.step_s)
+    calibration = seen and seen.calibration
+    appearance = seen if calibration and calibration.tells_apart else None
+    log = Log(options, model, movers, run, appearance, Answers.of(options.answers, steps, times_ns))
+    empty = {"": TRACKS, "decisions": DECISIONS, APPEARANCE_OUTPUT: APPEARANCE, WORLDS_OUTPUT: WORLDS}
+    out: dict[str, Iterator[Rows]] = {name: repeat(schema.empty(), len(steps)) for name, schema in empty.items()}
+    if not len(tracks.step):
+        return out, calibration
+    tracks = _identified(log, tracks)
+    rows = TrackRows.of(tracks.step, tracks.track, tracks.sample)
+    _, _, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+    log_odds, kept = _people(log, tracks, rows, paths)
+    moved_m = None
+    if options.smooth:  # rows and trajectories are both ordered by track, then by step
+        moved_m = movers.unit_m * smooth_in_log(model, paths, options.noise_m is not None, movers.unit_m)
+    is_kept = kept[group_index(np.diff(paths.first))]
+    left = np.flatnonzero(is_kept & np.isin(rows.step, steps))  # inside gaps of the log there are no frames
+    shown_m = None if moved_m is None else moved_m[left]
+    out[""] = rows_by_step(taken(rows, left), samples, shown_m, options.ground_planes, steps, times_ns)
+    if DECISIONS in options.writes.values():
+        decided = Decided(tracks, log_odds, kept, hypotheses_of(log, tracks, is_final=True))
+        if options.drawn_worlds:
+            out[WORLDS_OUTPUT] = world_rows(_worlds(log, decided), decided.hypotheses, model.step_s, steps)
+        out["decisions"] = decision_rows(decided, model, samples, steps)
+    if (stored := options.stored_looks) is not None:
+        track_of, shown = np.full(len(stored.t_ns), -1), kept[np.unique(tracks.track, return_inverse=True)[1]]
+        looked = taken(tracks, shown & (tracks.look >= 0))
+        track_of[looked.look] = looked.track
+        out[APPEARANCE_OUTPUT] = appearance_rows(stored, track_of, times_ns)
+    return out, calibration
+
+
+def _as_assigned(options: RetrackOptions, run: OnlinePass, movers: Movers) -> Tracks:
+    """The tracks as they were online, with what was seen of them."""
+    step, track, source, sample = run.assignments.of(run.samples, run.steps)
+    xy = np.stack([column(run.samples, name)[sample] for name in ("x_m", "y_m")], axis=-1) / movers.unit_m
     descriptors = options.stored_looks if options.looks is None else options.looks
-    seen_ns = times_ns[np.searchsorted(steps, step)]
+    seen_ns = run.samples.t_ns[np.searchsorted(run.steps, step)]
     look = np.full(len(step), -1) if descriptors is None else descriptors.find(seen_ns, source)
     tracks = Tracks(step, track, source, sample, xy, look, track)
-    if not options.shares_samples:
-        tracks = taken(tracks, np.unique(sample, return_index=True)[1])
-    seen = Appearance.of(options.looks, tracks, model.step_s)
-    appearance = seen if seen and seen.calibration.tells_apart else None
-    answers = Answers.of(options.answers, steps, times_ns)
+    return tracks if options.shares_samples else taken(tracks, np.unique(sample, return_index=True)[1])
 
-    def hypotheses_in(tracks: Tracks, is_final: bool = False) -> Hypotheses:
-        return hypotheses_of(model, tracks, options.link_s / movers.unit_m, appearance, answers, is_final)
 
-    if options.link_s > 0 and len(tracks.step):
-        tracks = _linked(hypotheses_in, tracks, options.link_confidence)
-    if options.resolve_swaps and len(tracks.step) and not movers.on_ground:
-        tracks = _without_swaps(model, tracks, appearance)
-    if len(tracks.step) and answers.is_certain.any():
-        tracks = answers.obeyed(tracks, hypotheses_in(tracks), options.link_confidence)
+def _identified(log: Log, tracks: Tracks) -> Tracks:
+    """Tracks as they are decided to be, ordered by track and step."""
+    options = log.options
+    for _ in range(_SWEEPS if options.link_s > 0 else 0):
+        tracks = tracks._replace(track=hypotheses_of(log, tracks).scored().best(options.link_confidence))
+    if options.resolve_swaps and not log.movers.on_ground:
+        tracks = _without_swaps(log, tracks)
+    if log.answers.is_certain.any():
+        tracks = log.answers.obeyed(tracks, hypotheses_of(log, tracks), options.link_confidence)
     tracks = fix_tracks(tracks, options.fixed_ids)
-    tracks = taken(tracks, tracks.order)
-    rows = TrackRows.of(tracks.step, tracks.track, tracks.sample)
-    is_decided = DECISIONS in options.writes.values()
-    moved_m: Floats | None = None
-    ids, of = np.unique(tracks.track, return_inverse=True)
+    return taken(tracks, tracks.order)
+
+
+def hypotheses_of(log: Log, tracks: Tracks, is_final: bool = False) -> Hypotheses:
+    """The hypotheses about identities in tracks, with what the log shows of their looks, and what was answered."""
+    hypotheses = Hypotheses.of(log.model, tracks, log.max_gap_s, log.answers.joined(tracks))
+    looks = np.zeros(len(hypotheses.before))
+    if log.appearance is not None:
+        sides = log.appearance.between(tracks._replace(track=hypotheses.tracklets.of))
+        looks = sides.of_tracks(hypotheses.before, hypotheses.after)
+    looks = log.answers.weighed(hypotheses, tracks, looks, is_final)
+    return hypotheses._replace(evidence=hypotheses.evidence + looks)
+
+
+def _without_swaps(log: Log, tracks: Tracks) -> Tracks:
+    """Undo swaps of tracks that met."""
+    examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
+    for _ in range(_ROUNDS):
+        ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+        which = None if examined is None else np.isin(ids, examined)
+        seen = None if log.appearance is None else log.appearance.between(tracks)
+        owner, changed = resolve_swaps(log.model, trajectories, row, tracks.source, which, seen)
+        tracks = tracks._replace(track=ids[owner[row]])
+        if not changed:
+            break
+        own = group_index(np.diff(trajectories.first))
+        examined = ids[np.unique(own[owner != own])]
+    return tracks
+
+
+def _people(log: Log, tracks: Tracks, rows: TrackRows, paths: Trajectories) -> tuple[Floats, Bools]:
+    """The log odds (K,) that tracks are people, or what else moves, infinite for certain; and which are kept, (K,)."""
+    options, movers, steps, ids = log.options, log.movers, log.run.steps, np.unique(tracks.track)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
-    is_fixed |= np.isin(ids, answers.persons(tracks, yes=True))
-    is_clutter = np.isin(ids, answers.persons(tracks, yes=False)) & ~is_fixed
-    of_row = np.searchsorted(ids, rows.track)
-    least_s = options.shortest_s((steps[-1] - steps[0]) * model.step_s if len(steps) else 0.0)
-    least_s *= _CONFIRMED_SHARE if movers.on_ground else 1.0
-    is_short = _are_short(of_row, rows.is_sample, len(ids), round(least_s * options.rate_hz) + 1)
-    odds = np.full(len(ids), np.inf)
-    if len(ids) and (options.smooth or options.track_confidence > 0 or is_decided):
-        _, _, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-        smoothed = smooth(model, trajectories)
-        if options.smooth:  # rows and trajectories are both ordered by track, then by step
-            moved_m = movers.unit_m * smooth_in_log(model, trajectories, options.noise_m is not None, movers.unit_m)
-        log = steps[0], steps[-1]
-        odds = _log_odds(model, trajectories, smoothed, rows, samples, movers, log, is_short)
+    is_fixed |= np.isin(ids, log.answers.persons(tracks, yes=True))
+    is_clutter = np.isin(ids, log.answers.persons(tracks, yes=False)) & ~is_fixed
+    of_row = group_index(np.diff(paths.first))
+    is_short = _are_short(of_row, rows.is_sample, len(ids), round(log.least_s * options.rate_hz) + 1)
+    smoothed = smooth(log.model, paths)
+    if movers.on_ground:
+        odds = scored_log_odds(
+            smoothed.mean[:, :2] * movers.unit_m,
+            paths.first,
+            rows.between(column(log.run.samples, "score")),
+            column(log.run.samples, "observed")[rows.before] & rows.is_sample,
+            movers.usual_score,
+            log.model.step_s,
+        )
+    else:
+        in_log = log_odds_in_log(log.model, paths, smoothed, (steps[0], steps[-1]))[:, None]
+        odds = np.where(is_short, SHORT.log_odds(in_log), PERSON.log_odds(in_log))
     odds = np.where(is_short, np.minimum(odds, _SHORT), odds)
     odds = np.where(is_clutter, -CERTAIN, odds)
-    keeps = is_fixed | ((probability(odds) >= options.track_confidence) & ~is_short & ~is_clutter)
-    has_frame = np.isin(rows.step, np.array(steps, np.int64))  # inside gaps of the log there are none
-    left = np.flatnonzero(keeps[of_row] & has_frame)
-    decisions: Iterator[Rows] = repeat(DECISIONS.empty(), len(steps))
-    worlds: Iterator[Rows] = repeat(WORLDS.empty(), len(steps))
-    if is_decided and len(ids):
-        hypotheses = hypotheses_in(tracks, is_final=True)
-        decided = Decided(tracks, np.where(is_fixed, np.inf, odds), keeps, hypotheses)
-        if options.drawn_worlds:
-            drawn = _worlds(options, decided, round(least_s * options.rate_hz), samples)
-            worlds = world_rows(drawn, hypotheses, model.step_s, steps)
-        decisions = decision_rows(decided, model, samples, steps)
-    shown_m = None if moved_m is None else moved_m[left]
-    by_step = rows_by_step(taken(rows, left), samples, shown_m, options.ground_planes, steps, times_ns)
-    looks: Iterator[Rows] = repeat(APPEARANCE.empty(), len(steps))
-    if (stored := options.stored_looks) is not None:
-        looks = _looks(stored, taken(tracks, keeps[of] & (tracks.look >= 0)), times_ns)
-    return Offline(by_step, decisions, looks, worlds, seen and seen.calibration)
+    is_likely = (probability(odds) >= options.track_confidence) & ~is_short & ~is_clutter
+    return np.where(is_fixed, np.inf, odds), is_fixed | is_likely
 
 
 def _are_short(of_row: Ints, is_sample: Bools, count: int, least: int) -> Bools:
@@ -244,94 +308,14 @@ def _are_short(of_row: Ints, is_sample: Bools, count: int, least: int) -> Bools:
     return np.asarray(np.where(seen < _SPARSE * length, longest, length) < least)
 
 
-def _looks(stored: Descriptors, kept: Tracks, times_ns: Ints) -> Iterator[Rows]:
-    """The rows of Appearance of the tracks that were kept, at each of ``times_ns``."""
-    track_of = np.full(len(stored.t_ns), -1)
-    track_of[kept.look] = kept.track
-    return appearance_rows(stored, track_of, times_ns)
-
-
-def _log_odds(
-    model: MotionModel,
-    trajectories: Trajectories,
-    smoothed: State,
-    rows: TrackRows,
-    samples: FrameColumns,
-    movers: Movers,
-    log: tuple[int, int],
-    is_short: Bools,
-) -> Floats:
-    """The log odds (K,) that tracks are people, or what else moves; ``log`` are its first and last steps."""
-    if not movers.on_ground:
-        odds = log_odds_in_log(model, trajectories, smoothed, log)[:, None]
-        return np.where(is_short, SHORT.log_odds(odds), PERSON.log_odds(odds))
-    return scored_log_odds(
-        smoothed.mean[:, :2] * movers.unit_m,
-        trajectories.first,
-        rows.between(column(samples, "score")),
-        column(samples, "observed")[rows.before] & rows.is_sample,
-        movers.usual_score,
-        model.step_s,
-    )
-
-
-def _worlds(options: RetrackOptions, decided: Decided, least_steps: int, samples: FrameColumns) -> Worlds:
-    """The worlds of what was decided."""
-    tracks, log_odds, kept, hypotheses = decided
-    tracklets = hypotheses.tracklets
-    of_class = int(column(samples, "class_id")[0])
-    worlds = draw_worlds(
-        options.drawn_worlds,
-        hypotheses,
-        tracks.track[tracklets.first],
-        log_odds,
-        kept,
-        options.link_confidence,
-        least_steps,
-        of_class,
-    )
+def _worlds(log: Log, decided: Decided) -> Worlds:
+    """The worlds of what was decided; those of each class have a seed of their own."""
+    options, tracks, first = log.options, decided.tracks, decided.hypotheses.tracklets.first
+    of_class = int(column(log.run.samples, "class_id")[0])
+    least_steps = round(log.least_s * options.rate_hz)
+    worlds = draw_worlds(options.drawn_worlds, decided, options.link_confidence, least_steps, of_class)
     if options.fixed_ids:
         for track in worlds.track:
-            track[:] = fix_tracks(tracks._replace(track=track[tracklets.of]), options.fixed_ids).track[tracklets.first]
+            whole = tracks._replace(track=track[decided.hypotheses.tracklets.of])
+            track[:] = fix_tracks(whole, options.fixed_ids).track[first]
     return worlds
-
-
-def _without_swaps(model: MotionModel, tracks: Tracks, appearance: Appearance | None) -> Tracks:
-    """Undo swaps of tracks that met."""
-    examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
-    for _ in range(_ROUNDS):
-        ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-        which = None if examined is None else np.isin(ids, examined)
-        seen = None if appearance is None else appearance.between(tracks)
-        owner, changed = resolve_swaps(model, trajectories, row, tracks.source, which, seen)
-        tracks = tracks._replace(track=ids[owner[row]])
-        if not changed:
-            break
-        own = group_index(np.diff(trajectories.first))
-        examined = ids[np.unique(own[owner != own])]
-    return tracks
-
-
-def _linked(hypotheses_in: Callable[[Tracks], Hypotheses], tracks: Tracks, min_confidence: float) -> Tracks:
-    """Decide about identities."""
-    for _ in range(_SWEEPS):
-        tracks = tracks._replace(track=hypotheses_in(tracks).scored().best(min_confidence))
-    return tracks
-
-
-def hypotheses_of(
-    model: MotionModel,
-    tracks: Tracks,
-    max_gap_s: float,
-    appearance: Appearance | None,
-    answers: Answers,
-    is_final: bool = False,
-) -> Hypotheses:
-    """The hypotheses about identities in tracks, with what the log shows of their looks, and what was answered."""
-    hypotheses = Hypotheses.of(model, tracks, max_gap_s, answers.joined(tracks))
-    looks = np.zeros(len(hypotheses.before))
-    if appearance is not None:
-        sides = appearance.between(tracks._replace(track=hypotheses.tracklets.of))
-        looks = sides.of_tracks(hypotheses.before, hypotheses.after)
-    looks = answers.weighed(hypotheses, tracks, looks, is_final)
-    return hypotheses._replace(evidence=hypotheses.evidence + looks)

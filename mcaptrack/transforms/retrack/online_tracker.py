@@ -14,12 +14,13 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
+from mcaptrack.geometry.hull import GrowingHull
 from mcaptrack.geometry.neighbours import Pairing, near_pairs
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, StateRows, update
@@ -336,12 +337,8 @@ class OnlineTracker:
     def __post_init__(self) -> None:
         self.noise_m = self.model.noise_m
 
-    def step(self, xy_m: Floats, source: Ints, passed: int, most_noise_m: float = np.inf) -> Step:
-        """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,).
-
-        The noise of positions is estimated as no larger than ``most_noise_m``.
-        """
-        self._limit_noise(most_noise_m)
+    def step(self, xy_m: Floats, source: Ints, passed: int) -> Step:
+        """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,)."""
         self.tracks[MISSED] += passed
         is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
         is_over = is_over < self.tracks[MISSED]
@@ -351,13 +348,9 @@ class OnlineTracker:
         if self.tracks.shape[1]:
             self.model.predict(self.state, passed * self.model.step_s, self.state)
         track, row = self._assigned(xy_m, source)
-        observed = xy_m[:, row]
-        occluded, occluder = self._merged_detections(track, observed)
-        if len(occluded):
-            self._update_occluded(occluded, observed[:, occluder], passed)
         if len(track):
-            self._update(track, observed, source[row], occluder)
-            self._limit_noise(most_noise_m)
+            occluder = self._merge(track, xy_m[:, row], passed)
+            self._update(track, xy_m[:, row], source[row], occluder)
         row_of = np.full(self.tracks.shape[1], -1)
         row_of[track] = row
         if len(row) < len(source):
@@ -369,61 +362,43 @@ class OnlineTracker:
         self.known_sources.update(source.tolist())
         return Step(self.tracks.copy(), row_of, self.state.mean.copy(), self.state.cov.copy())
 
-    def _merged_detections(self, track: Ints, observed: Floats) -> tuple[Ints, Ints]:
-        """Find pairs of tracks merged into one detection (occlusion), and which track has that detection.
+    def _merge(self, track: Ints, observed: Floats, passed: int) -> Ints:
+        """Update lost tracks that are merged into one detection with another track (occlusion).
 
         A lost track becomes occluded by another one if the observation of the latter lies between both, and the middle
-        makes it likelier than its own track does. ``observed`` (2, P) are the observations of the tracks ``track``
-        (P,). Returns the occluded tracks, and for each the index into ``track`` of the one that occludes it.
+        makes it likelier than its own track does. It says little about the position of each, and its input id nothing
+        about either track once they separate. ``observed`` (2, P) are the observations of the tracks ``track`` (P,).
+        Returns the indices into ``track`` of those that occlude others.
         """
-        tracks, (p, _, _) = self.tracks, self.state.cov
+        tracks, limits, (p, _, _) = self.tracks, self.association, self.state.cov
         is_confirmed = tracks[HITS] >= self.confirm_hits
-        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < self.association.merge_timeout_s)
+        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < limits.merge_timeout_s)
         is_lost[track] = False
-        lost = is_lost.nonzero()[0]
-        if len(lost) == 0:
-            return _NOTHING
-        confirmed = is_confirmed[track].nonzero()[0]
-        if len(confirmed) == 0:
-            return _NOTHING
+        lost, confirmed = is_lost.nonzero()[0], is_confirmed[track].nonzero()[0]
+        if not len(lost) or not len(confirmed):
+            return confirmed[:0]
         seen, expected = observed[:, confirmed], self.state.mean[:2, lost]
-        if len(lost) * len(confirmed) > LARGE_TABLE:
-            from scipy.spatial import cKDTree
-
-            distance, nearest = cKDTree(seen.T).query(expected.T)
-            is_merged = distance < self.association.merge_distance_m
-        else:
-            squared = _squared(expected[:, :, None] - seen[:, None])
-            nearest = squared.argmin(axis=1)
-            is_merged = squared.min(axis=1) < self.association.merge_distance_m**2
-        if not is_merged.any():
-            return _NOTHING
-        lost, expected, nearest = lost[is_merged], expected[:, is_merged], nearest[is_merged]
-        seen, owner = seen[:, nearest], track[confirmed[nearest]]
-        own = self.state.mean[:2, owner]
+        distance_m, nearest = _nearest(expected, seen)
+        is_near = distance_m < limits.merge_distance_m
+        lost, expected, host = lost[is_near], expected[:, is_near], confirmed[nearest[is_near]]
+        seen, owner = observed[:, host], track[host]
+        own, noise = self.state.mean[:2, owner], self.noise_m**2
         to_own, to_middle = _squared(seen - own), _squared(seen - (own + expected) / 2)
-        noise = self.noise_m**2
         alone, together = p[owner] + noise, (p[owner] + p[lost]) / 4 + noise  # the middle of two: a quarter of both
         evidence = to_own / alone - to_middle / together + 2 * np.log(alone / together)
         was_merged = (tracks[MERGED, lost] > 0) | (tracks[SOURCE, lost] == -1)  # they may take turns at having it
-        is_merged = (to_middle < to_own) & (was_merged | (evidence > self.association.merge_evidence))
-        return lost[is_merged], confirmed[nearest[is_merged]]
-
-    def _update_occluded(self, occluded: Ints, xy_m: Floats, passed: int) -> None:
-        """Update occluded tracks with the merged detection, which says little about the position of each.
-
-        Its input id says nothing about either track once they separate.
-        """
-        state = self.state.take(occluded)
-        update(state, xy_m, np.full(len(occluded), self.association.merge_distance_m / 2))
-        self.state.mean[:, occluded], self.state.cov[:, occluded] = state
-        self.tracks[MISSED, occluded] = np.maximum(self.tracks[MISSED, occluded] - passed, 1)
-        self.tracks[MERGED, occluded] += passed
+        is_merged = (to_middle < to_own) & (was_merged | (evidence > limits.merge_evidence))
+        lost, host = lost[is_merged], host[is_merged]
+        state = self.state.take(lost)
+        update(state, observed[:, host], limits.merge_distance_m / 2)
+        self.state.mean[:, lost], self.state.cov[:, lost] = state
+        tracks[MISSED, lost] = np.maximum(tracks[MISSED, lost] - passed, 1)
+        tracks[MERGED, lost] += passed
+        return host
 
     def _update(self, track: Ints, xy_m: Floats, source: Ints, occluder: Ints) -> None:
         """Update tracks (P,) with their observations (2, P); those of ``occluder`` are merged with others."""
-        state = self.state.take(track)
-        noise_m = np.full(len(track), self.noise_m)
+        state, noise_m = self.state.take(track), np.full(len(track), self.noise_m)
         noise_m[occluder] = self.association.merge_distance_m / 2
         if self.estimate_noise:
             self._adapt_noise(state, xy_m, (self.tracks[HITS, track] >= self.confirm_hits) & (noise_m == self.noise_m))
@@ -444,10 +419,6 @@ class OnlineTracker:
         rate = max(_MIN_RATE, 5 / (self.judged + 50))  # fast at first
         log_noise = np.log(self.noise_m) + rate * float((outside - _OUTSIDE).sum())
         self.noise_m = min(max(float(np.exp(log_noise)), NOISE_M[0]), NOISE_M[1])
-
-    def _limit_noise(self, most_noise_m: float) -> None:
-        if self.estimate_noise:
-            self.noise_m = min(self.noise_m, most_noise_m)
 
     def _assigned(self, xy_m: Floats, source: Ints) -> tuple[Ints, Ints]:
         """Tracks and observations that belong together, (P,) each."""
@@ -493,6 +464,17 @@ def _is_crowded(xy_m: Floats, crowd_m: float) -> Bools:
     return np.asarray(near.sum(axis=0) > 1)
 
 
+def _nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
+    """The distance of each point (2, N) to the nearest one of others (2, M), and which it is, (N,)."""
+    if points.shape[1] * others.shape[1] > LARGE_TABLE:
+        from scipy.spatial import cKDTree
+
+        distance, nearest = cKDTree(others.T).query(points.T)
+        return distance, nearest
+    squared = _squared(points[:, :, None] - others[:, None])
+    return np.sqrt(squared.min(axis=1)), squared.argmin(axis=1)
+
+
 def _squared(off: Floats) -> Floats:
     """The squared lengths of differences (2, ...)."""
     off *= off
@@ -511,7 +493,7 @@ def _squared(off: Floats) -> Floats:
 # A track that is lost is written for a while, because most come back. Those that don't have left, or were false.
 # Which is likelier is learned in the same way, for each number of steps without an observation, for tracks that
 # have not lasted yet, and for those that would be outside of the area in which tracks were seen so far: most of
-# these have left it.
+# these have left it. It also depends on where the track was lost (``PlacesOfLosses``).
 #
 # Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have
 # lasted; A levels of steps without an observation.
@@ -533,68 +515,72 @@ _LASTS, _RETURNS, _WEIGHT = 0.6, 0.8, 2.0
 _LEVELS: Final = 200
 
 
-# Convex hulls that grow. Letters: N points, V vertices.
+# Where lost tracks come back and where they don't, as far as the log has shown.
+#
+# People go out at some places, and are missed for a moment at others. Whether a lost track comes back is told by
+# what became of those that were lost nearby, compared with the whole log. (Where a track began tells less of
+# whether it will last: people who are soon occluded look like false detections.)
+#
+# Letters: F steps; R tracks alive at these steps, end to end.
 
 
-#: Points so little outside are taken for inside, in units of length.
-_SLACK: Final = 1e-6
+Place: TypeAlias = tuple[float, float]
+
+#: Places are as near as this to be one.
+_NEAR_M: Final = 2.0
+#: Each place counts as if so many tracks like all others had been there before.
+_USUAL: Final = 8.0
+#: So many of the last tracks count.
+_LAST: Final = 2000
 
 
-@dataclass
-class GrowingHull:
-    """The convex hull of all points so far.
+class PlaceOdds:
+    """The odds that something turns out well at places, compared with everywhere."""
 
-    Attributes
-    ----------
-    vertices : (V, 2) of float
-        Its vertices, anticlockwise; fewer than three if no area was seen yet, which has no inside.
+    def __init__(self) -> None:
+        self._xy_m = np.empty((2, _LAST))
+        self._is_good = np.zeros(_LAST, bool)
+        self._count = 0
 
-    Examples
-    --------
-    >>> hull = GrowingHull()
-    >>> hull.add(np.array([[0.0, 4.0, 4.0, 0.0, 2.0], [0.0, 0.0, 4.0, 4.0, 2.0]]))
-    >>> hull.vertices.tolist()
-    [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
-    >>> hull.holds(np.array([[1.0, 5.0], [1.0, 1.0]])).tolist()
-    [True, False]
-    """
+    def add(self, place: Place, is_good: bool) -> None:
+        """Count what became of something that was at a place."""
+        at = self._count % _LAST
+        self._xy_m[:, at], self._is_good[at] = place, is_good
+        self._count += 1
 
-    vertices: Floats = field(default_factory=lambda: np.empty((0, 2)))
-    _normals: Floats = field(init=False, default_factory=lambda: np.empty((0, 2)))
-    _limits: Floats = field(init=False, default_factory=lambda: np.empty((0, 1)))
-
-    def holds(self, xy: Floats) -> Bools:
-        """Which points (2, N) are inside, (N,); those that are NaN are not."""
-        if not len(self._normals):
-            return np.zeros(xy.shape[1], bool)
-        return np.asarray((self._normals @ xy <= self._limits).all(axis=0))
-
-    def add(self, xy: Floats) -> None:
-        """Add points (2, N); those that are NaN are left out."""
-        new = xy[:, np.isfinite(xy).all(axis=0) & ~self.holds(xy)]
-        if not new.shape[1]:
-            return
-        points = sorted({(x, y) for x, y in [*self.vertices.tolist(), *new.T.tolist()]})
-        ring = [*_chain(points), *_chain(points[::-1])]
-        self.vertices = np.array(ring)
-        if len(ring) > 2:
-            edges = np.roll(self.vertices, -1, axis=0) - self.vertices
-            outwards = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-            self._normals = outwards / np.hypot(*outwards.T)[:, None]
-            self._limits = (self._normals * self.vertices).sum(axis=1)[:, None] + _SLACK
+    def ratio(self, place: Place) -> float:
+        """The odds that something at a place turns out well, as a ratio to those everywhere."""
+        count = min(self._count, _LAST)
+        is_good = self._is_good[:count]
+        share = (int(is_good.sum()) + 1) / (count + 2)
+        (x, y), (x_m, y_m) = place, self._xy_m[:, :count]
+        near = is_good[(x_m - x) ** 2 + (y_m - y) ** 2 <= _NEAR_M**2]
+        good = int(near.sum())
+        return (good / share + _USUAL) / ((len(near) - good) / (1 - share) + _USUAL)
 
 
-def _chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """One side of the hull of sorted points, without the last one (A. M. Andrew, 1979)."""
-    out: list[tuple[float, float]] = []
-    for x, y in points:
-        while len(out) > 1:
-            (ax, ay), (bx, by) = out[-2:]
-            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
-                break
-            out.pop()
-        out.append((x, y))
-    return out[:-1] if len(out) > 1 else out
+class PlacesOfLosses:
+    """Where tracks were lost, and what became of them: called with each step of a log."""
+
+    def __init__(self) -> None:
+        self._odds = PlaceOdds()
+        self._lost: dict[int, tuple[Place, float]] = {}  # where each lost track was lost, and the ratio there
+
+    def __call__(self, passed: int, ids: list[int], is_observed: Bools, xy_m: Floats) -> list[float]:
+        """The odds that lost tracks (K,) come back, as ratios to those of the whole log; 1 for others.
+
+        ``passed`` is by how many steps time advanced, and ``xy_m`` (2, K) where tracks are.
+        """
+        alive = dict(zip(ids, is_observed.tolist(), strict=True))
+        for name in [name for name in self._lost if alive.get(name, True)]:
+            place, _ = self._lost.pop(name)
+            if name in alive or passed == 1:  # a gap of the log ends tracks without telling anything of them
+                self._odds.add(place, name in alive)
+        for k in np.flatnonzero(~is_observed).tolist():
+            if ids[k] not in self._lost:
+                place = float(xy_m[0, k]), float(xy_m[1, k])
+                self._lost[ids[k]] = place, self._odds.ratio(place)
+        return [self._lost[name][1] if name in self._lost else 1.0 for name in ids]
 
 
 class ShownTracks:
@@ -619,6 +605,7 @@ class ShownTracks:
         self._lasting = _lasting(confirm_hits)
         self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
         self._seen = GrowingHull()
+        self._places = PlacesOfLosses()
         # By level of observations: tracks that reached the next one or terminated, and those that terminated. By inside
         # and outside and level of steps without an observation: tracks that went on from there, and that came back.
         self._counts = np.zeros((2, self._levels + 1))
@@ -630,34 +617,39 @@ class ShownTracks:
 
     def __call__(self, alive: Alive) -> Bools:
         """Which of the tracks alive at some steps are written, (R,). Nothing is known that was not known then."""
-        _, passed, tick, is_observed, tracks, state = alive
+        _, passed, tick, is_observed, tracks, _ = alive
         is_confirmed, may_coast = tracks[HITS] >= self._confirm_hits, tracks[MISSED] <= self._coast
         if not self._adapts:
             is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
             return np.asarray(np.where(is_observed, is_confirmed, may_coast & is_old))
-        outside = ~self._inside(len(passed), tick, is_observed & is_confirmed, state.mean[:, :2].T)
+        inside, ratio = self._where(alive, is_observed & is_confirmed)
+        outside = ~inside
         level, next_level = (self._level(tracks[HITS] + more) for more in (0, 1))
         age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
         lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
         lasting, where = level >= self._levels, outside.astype(np.intp)
         early = lasts[tick, level] >= 0.5
-        comes_back = returns[tick, where, age] * lasts[tick, next_level] >= 0.5
+        comes_back = _at_odds(returns[tick, where, age], ratio) * lasts[tick, next_level] >= 0.5
         stays = may_coast & ((lasting & ~outside) | comes_back)
         return np.asarray(np.where(is_observed, early | is_confirmed, stays))
 
     def _level(self, hits: Ints) -> Ints:
         return -(-np.minimum(hits, self._lasting) * self._levels // self._lasting)
 
-    def _inside(self, count: int, tick: Ints, is_sure: Bools, xy_m: Floats) -> Bools:
-        """Which tracks (R,) are in the area in which others, or they themselves, were seen before."""
-        bounds = np.searchsorted(tick, np.arange(count + 1)).tolist()
-        inside = np.zeros(len(tick), bool)
-        for low, high in pairwise(bounds):
+    def _where(self, alive: Alive, is_sure: Bools) -> tuple[Bools, Floats]:
+        """Which tracks (R,) are in the area in which others, or they themselves, were seen before; and how much better
+        or worse than everywhere the odds are that lost ones come back, where they were lost, (R,).
+        """
+        xy_m, ids = alive.state.mean[:, :2].T, alive.tracks[IDS].tolist()
+        bounds = np.searchsorted(alive.tick, np.arange(len(alive.steps) + 1)).tolist()
+        inside, ratio = np.zeros(len(ids), bool), np.ones(len(ids))
+        for passed, (low, high) in zip(alive.passed.tolist(), pairwise(bounds), strict=True):
             here = xy_m[:, low:high]
             inside[low:high] = self._seen.holds(here)
             if (is_sure[low:high] & ~inside[low:high]).any():
                 self._seen.add(here[:, is_sure[low:high]])
-        return inside
+            ratio[low:high] = self._places(passed, ids[low:high], alive.is_observed[low:high], here)
+        return inside, ratio
 
     def _learn(self, passed: Ints, tick: Ints, now: Ints) -> tuple[Floats, Floats]:
         """Learn from what became of tracks, of which ``now`` (4, R) is known at each step.
@@ -690,6 +682,11 @@ class ShownTracks:
         survives[:, -1] = 1.0
         stays_lost: Floats = 1 - (returns[1] + self._prior_returns) / (returns[0] + _WEIGHT)
         return _from_here_on(survives), 1 - _from_here_on(stays_lost)
+
+
+def _at_odds(probability: Floats, ratio: Floats) -> Floats:
+    """Probabilities (R,) with odds multiplied by ``ratio`` (R,)."""
+    return np.asarray(probability * ratio / (1 - probability + probability * ratio))
 
 
 def _counted(place: Ints, count: int, shape: tuple[int, ...]) -> Floats:
