@@ -49,6 +49,8 @@ from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers, motion_m
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
 
 DEFAULT = PROFILES["default"]
+#: The classes of gaps, as in ``hypotheses.GAPS_S``.
+GAP_NAMES: Final = ("next step", "up to 1.7 s", "up to 5 s", "longer")
 Found = TypeVar("Found")
 #: Who is who at encounters changes neither links nor how likely a track is, and takes longest.
 FITTED = replace(DEFAULT, resolve_swaps=False)
@@ -310,11 +312,11 @@ def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any
 
 def fit_choices(parts: Sequence[Chosen]) -> dict[str, Any]:
     """The weights of what ends and beginnings choose."""
-    fitted = multinomial(parts, len(hypotheses.GAP_NAMES))
-    links = dict(zip(hypotheses.GAP_NAMES, fitted.links, strict=True))
-    ends, usual = hypotheses.END_TERMS, (*hypotheses.GAP_NAMES, "none")
+    fitted = multinomial(parts, len(GAP_NAMES))
+    links = dict(zip(GAP_NAMES, fitted.links, strict=True))
+    ends, usual = hypotheses.CHOICES.end_terms, (*GAP_NAMES, "none")
     return {
-        "links": {name: named(hypotheses.LINK_TERMS, weights) for name, weights in links.items()},
+        "links": {name: named(hypotheses.CHOICES.terms, weights) for name, weights in links.items()},
         "leaves": named(ends, fitted.leaves),
         "comes": named(ends, fitted.comes),
         "usual_leaves": named(usual, fitted.usual_leaves),
@@ -430,7 +432,7 @@ def main() -> None:
     linking._BY_GAP = np.array(links["usual by gap"])
     more = [*scenes, *runs(MORE, given.steps)]
     choices = fit_choices(list(told(choices_of, more, "choices")))
-    hypotheses.CHOICES = Choices.from_entry(choices, hypotheses.GAP_NAMES, hypotheses.LINK_TERMS, hypotheses.END_TERMS)
+    hypotheses.CHOICES = Choices.from_entry(choices)
     others = list(runs(JUDGED, JUDGED_STEPS))
     people = fit_people(list(told(people_of, more, "people")))
     install(false_tracks, "_PEOPLE", people)

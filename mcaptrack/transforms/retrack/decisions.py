@@ -29,11 +29,11 @@ from mcaptrack.transforms.retrack.motion_model import MotionModel, Tracks
 from mcaptrack.transforms.retrack.weights import Logistic, probability
 
 #: Whether a join is right, from its log odds as its end and as its beginning see them.
-JOINS: Final = Logistic.of("joins", ("end", "beginning"))
+JOINS: Final = Logistic.of("joins")
 #: The log odds that a track is a person, from those of the test of false tracks: that one weighs rows, not tracks.
-PERSON: Final = Logistic.of("decided", ("log odds",))
+PERSON: Final = Logistic.of("decided")
 #: The same of tracks that are too short: there is less to see of these, so they are more doubtful.
-SHORT: Final = Logistic.of("decided short", ("log odds",))
+SHORT: Final = Logistic.of("decided short")
 #: An alternative is at least so likely as log odds.
 _MAY_BE: Final = -4.0
 #: Samples of another input id that last less, between two parts with one, are no join. Seconds.

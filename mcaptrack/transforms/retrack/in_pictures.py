@@ -30,7 +30,7 @@ from mcaptrack.schema.framing import JoinedFrames, filtered_rows, joined_parts, 
 from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence
 from mcaptrack.transforms.retrack.motion_model import Tracks
-from mcaptrack.transforms.retrack.weights import Logistic, probability
+from mcaptrack.transforms.retrack.weights import Logistic, columns, probability
 
 #: Tracks are cut at gaps of more seconds than that, and more than a missing frame.
 CUT_S: Final = 0.2
@@ -60,25 +60,10 @@ _AT_ONCE: Final = 4096
 #: away as the usual box.
 _PERSON_M: Final = 1.7
 
-#: What tells right links from wrong ones.
-FEATURES: Final = (
-    "log miss",
-    "log growth",
-    "change of width",
-    "log gap",
-    "gap",
-    "same track",
-    "hidden after",
-    "hidden",
-    "least hidden",
-    "log rarity",
-    "short before",
-    "short after",
-)
-#: What tells them among others: their log odds by themselves, and how likely one of the others is that would take the
-#: place before or after the gap, as a logarithm.
-AMONG_OTHERS: Final = ("alone", "others after", "others before")
-_PAIRS, _LINKS = Logistic.of("pairs in pictures", FEATURES), Logistic.of("links in pictures", AMONG_OTHERS)
+#: What tells right links from wrong ones; and what tells them among others: their log odds by themselves, and how
+#: likely one of the others is that would take the place before or after the gap, as a logarithm.
+_PAIRS, _LINKS = Logistic.of("pairs in pictures"), Logistic.of("links in pictures")
+FEATURES, AMONG_OTHERS = _PAIRS.names, _LINKS.names
 
 
 class Linked(NamedTuple):
@@ -367,21 +352,21 @@ def find_candidates(pieces: BoxPieces, max_gap_s: float, across_classes: bool = 
         _hidden(pieces, begun.frame, begun.boxes, every, every),
         _hidden(pieces, np.maximum(begun.frame - 1, 0), begun.boxes, every, every),
     )
-    features = (
-        np.log1p(edge[near]),
-        np.log1p(growth[near]),
-        wider[near],
-        np.log(gap_s),
-        gap_s,
-        (pieces.source[i] == pieces.source[j]) & (j == i + 1),
-        hidden_after[j],
-        hidden.mean(axis=1),
-        hidden.min(axis=1, initial=1.0),
-        rarity,
-        1 / np.sqrt(_ERRORS_PER_S * lost.known_s[i] + 0.1),
-        1 / np.sqrt(_ERRORS_PER_S * begun.known_s[j] + 0.1),
-    )
-    return i, j, np.column_stack(features).astype(np.float64)
+    values = {
+        "log miss": np.log1p(edge[near]),
+        "log growth": np.log1p(growth[near]),
+        "change of width": wider[near],
+        "log gap": np.log(gap_s),
+        "gap": gap_s,
+        "same track": (pieces.source[i] == pieces.source[j]) & (j == i + 1),
+        "hidden after": hidden_after[j],
+        "hidden": hidden.mean(axis=1),
+        "least hidden": hidden.min(axis=1, initial=1.0),
+        "log rarity": rarity,
+        "short before": 1 / np.sqrt(_ERRORS_PER_S * lost.known_s[i] + 0.1),
+        "short after": 1 / np.sqrt(_ERRORS_PER_S * begun.known_s[j] + 0.1),
+    }
+    return i, j, columns(FEATURES, values)
 
 
 def _births(pieces: BoxPieces) -> float:

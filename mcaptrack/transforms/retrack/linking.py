@@ -17,15 +17,14 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.ragged import batches, find_rows, group_index, ragged_range
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State
-from mcaptrack.transforms.retrack.weights import Logistic, probability
+from mcaptrack.transforms.retrack.weights import Logistic, columns, probability
 
 #: A track that continues another begins no farther from its end than this, and so much more for each second between.
 _REACH_M, _MAX_SPEED_M_PER_S = 1.0, 2.5
-#: The features of a link, see ``features``.
-FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 #: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of ``_PRIOR`` of the
 #: best links is right. Links with log odds below ``MIN_LOG_ODDS`` are not considered.
-_LINKS: Final = Logistic.of("links", FEATURES)
+_LINKS: Final = Logistic.of("links")
+FEATURES: Final = _LINKS.names
 _PRIOR, MIN_LOG_ODDS = (float(_LINKS.numbers[name]) for name in ("usual", "least"))
 #: Gaps are of classes with these bounds in seconds; the mean probability of the best links of each, where as many are
 #: right as usual; and with how many links more this is taken to be so in a log.
@@ -206,18 +205,16 @@ def features(model: MotionModel, gaps: Gaps) -> Floats:
 def features_of(fit: Fit, gap_s: Floats) -> Floats:
     """The same of gaps (E,) with this fit and so many seconds."""
     speed = log_speed(fit.speed)
-    return np.stack(
-        [
-            log_distance(fit.miss),
-            np.log1p(fit.misfit**2 / fit.spread_m2 / 2),
-            gap_s,
-            log_distance(np.minimum(fit.misfit, fit.stay)) * np.log(gap_s + 0.4),
-            log_speed(fit.turn),
-            log_distance(fit.stay) * speed,
-            log_distance(fit.misfit) * speed,
-        ],
-        axis=1,
-    )
+    values = {
+        "miss": log_distance(fit.miss),
+        "misfit": np.log1p(fit.misfit**2 / fit.spread_m2 / 2),
+        "gap": gap_s,
+        "misfit or stay": log_distance(np.minimum(fit.misfit, fit.stay)) * np.log(gap_s + 0.4),
+        "turn": log_speed(fit.turn),
+        "distance and speed": log_distance(fit.stay) * speed,
+        "misfit and speed": log_distance(fit.misfit) * speed,
+    }
+    return columns(FEATURES, values)
 
 
 def log_distance(distance_m: Floats) -> Floats:
