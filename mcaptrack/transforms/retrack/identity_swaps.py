@@ -11,6 +11,7 @@ Letters: C encounters, T steps of them, N rows of trajectories.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.transforms.retrack.appearance import Sides
-from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, StateRows, Trajectories, update
 
 #: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter. With the
 #: largest, of people who walk to and fro, motion says little.
@@ -200,60 +201,49 @@ def find_swaps(
     """
     swapped = np.zeros(len(relative_m)) if evidence is None else evidence
     drifts = len(DRIFTS_M_PER_S)  # all at once: a step of few encounters takes as long as one of many
-    power = np.repeat(np.square(DRIFTS_M_PER_S), len(relative_m))
+    drift = np.repeat(DRIFTS_M_PER_S, len(relative_m))[:, None]
     paths, gain, likelihood = _viterbi(
-        model, np.tile(relative_m, (drifts, 1, 1)), np.tile(swap_cost, (drifts, 1)), np.tile(swapped, drifts), power
+        replace(model, drift_m_per_s=drift, drift_ratio=0.0, noise_m=np.sqrt(2) * model.noise_m),
+        np.tile(relative_m, (drifts, 1, 1)),
+        np.tile(swap_cost, (drifts, 1)),
+        np.tile(swapped, drifts),
     )
     best = np.argmax(likelihood.reshape(drifts, -1), axis=0) * len(relative_m) + np.arange(len(relative_m))
     return paths[best], gain[best]
 
 
 def _viterbi(
-    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats, power: Floats
+    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats
 ) -> tuple[Bools, Floats, Floats]:
-    """Swaps (C, T), their gain (C,) and log likelihood (C,) for drifts of the relative velocity, squared (C,)."""
+    """Swaps (C, T), their gain (C,) and log likelihood (C,) with the noise and drift of relative positions."""
     count, steps = relative_m.shape[:2]
-    r, step_s, power = 2 * model.noise_m**2, model.step_s, power[:, None]
-    mean = np.zeros((count, 3, 4))  # hypotheses: as labelled, swapped, and never swapped at all
-    cov = np.tile([r, 0.0, 2 * model.speed_m_per_s**2], (count, 3, 1))
+    # hypotheses: as labelled, swapped, and never swapped at all
+    state = StateRows(np.zeros((4, count, 3)), np.zeros((3, count, 3)))
+    state.cov[0], state.cov[2] = model.noise_m**2, 2 * model.speed_m_per_s**2
     total = np.tile([0.0, -np.inf, 0.0], (count, 1))
     came_swapped = np.zeros((steps, count, 2), bool)  # whether the best predecessor has the other labels
-    started = np.zeros(count, bool)
+    started, row = np.zeros(count, bool), np.arange(count)[:, None]
     sign = np.array([1.0, -1.0, 1.0])
     for step in range(steps):
         observed = np.isfinite(relative_m[:, step, 0])
-        z = np.where(observed[:, None], relative_m[:, step], 0.0)
-        p, c, v = cov[..., 0], cov[..., 1], cov[..., 2]
+        new, go = observed & ~started, (observed & started)[:, None]
+        z = np.where(observed, relative_m[:, step].T, 0.0)[..., None]
         if step:
-            p = p + step_s * (2 * c + step_s * (v + step_s * power / 3))
-            c = c + step_s * (v + step_s * power / 2)
-            v = v + step_s * power
-            mean[..., :2] += step_s * mean[..., 2:]
-        new = observed & ~started
-        mean[new, :, :2] = z[new, None] * sign[None, :, None]
-        mean[new, :, 2:] = 0.0
-        s = p + r
-        go = observed & started
+            model.predict(state, model.step_s, state)
+        state.mean[:2, new], state.mean[2:, new] = (z * sign)[:, new], 0.0
         # from each hypothesis (0, 1, 2) to each labelling (+1, -1)
-        off = z[:, None, None] * np.array([1.0, -1.0])[None, None, :, None] - mean[:, :, None, :2]
+        off = z[..., None] * sign[:2] - state.mean[:2, ..., None]
+        s = state.cov[0] + model.noise_m**2
         # Student's distribution in the plane
-        like = -(_FREEDOM / 2 + 1) * np.log1p((off**2).sum(-1) / s[..., None] / _FREEDOM) - np.log(s)[..., None]
-        like = np.where(go[:, None, None], like, 0.0)
+        like = -(_FREEDOM / 2 + 1) * np.log1p((off**2).sum(0) / s[..., None] / _FREEDOM) - np.log(s)[..., None]
+        like = np.where(go[..., None], like, 0.0)
         stay = total[:, :2] + np.stack([like[:, 0, 0], like[:, 1, 1]], axis=1)
         change = total[:, 1::-1] + np.stack([like[:, 1, 0], like[:, 0, 1]], axis=1) - swap_cost[:, step, None]
-        jumped = (change > stay) & go[:, None]
-        came_swapped[step] = jumped
+        came_swapped[step] = jumped = (change > stay) & go
         total = np.concatenate([np.where(jumped, change, stay), (total[:, 2] + like[:, 2, 0])[:, None]], axis=1)
         source = np.concatenate([np.where(jumped, [1, 0], [0, 1]), np.full((count, 1), 2)], axis=1)
-        row = np.arange(count)[:, None]
-        mean = mean[row, source]
-        p, c, v = p[row, source], c[row, source], v[row, source]
-        s = s[row, source]
-        gain, gain_rate = np.where(go[:, None], p / s, 0.0), np.where(go[:, None], c / s, 0.0)
-        off = z[:, None] * sign[None, :, None] - mean[..., :2]
-        mean[..., :2] += gain[..., None] * off
-        mean[..., 2:] += gain_rate[..., None] * off
-        cov = np.stack([p * (1 - gain), c * (1 - gain), v - gain_rate * c], axis=-1)
+        state = StateRows(state.mean[:, row, source], state.cov[:, row, source])
+        update(state, z * sign, np.where(go, model.noise_m, np.inf))
         started |= observed
     total[:, 1] += is_swapped
     path = np.zeros((count, steps), bool)

@@ -23,7 +23,7 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
 from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, filtered_rows, joined_parts, mapped_rows
@@ -54,8 +54,8 @@ _MOST: Final = 30.0
 _TIMES: Final = 6
 #: A box hides those behind it: its lower edge is at most so many of their heights above theirs.
 _BEHIND: Final = 0.05
-#: Pairs at once, for what is hidden.
-_AT_ONCE: Final = 4096
+#: Pairs of boxes at once, for what is hidden.
+_AT_ONCE: Final = 2**17
 #: The height of a person, for how far people may have walked between two places in the picture: as if all were as far
 #: away as the usual box.
 _PERSON_M: Final = 1.7
@@ -338,15 +338,7 @@ def find_candidates(pieces: BoxPieces, max_gap_s: float, across_classes: bool = 
     near = np.flatnonzero((miss < _MOST_MISSED) & (growth < _MOST_MISSED))
     i, j, gap_s = i[near], j[near], gap_s[near]
     rarity = -np.log(2 * np.pi * spread[near]) - np.log(tall[near]) / 2 - np.log(_births(pieces))
-    hidden = np.concatenate(
-        [
-            np.empty((0, _TIMES)),
-            *(
-                _hidden_between(pieces, lost, begun, i[low : low + _AT_ONCE], j[low : low + _AT_ONCE])
-                for low in range(0, len(i), _AT_ONCE)
-            ),
-        ]
-    )
+    hidden = _hidden_between(pieces, lost, begun, i, j)
     every = np.arange(len(pieces.source))
     hidden_after = np.maximum(
         _hidden(pieces, begun.frame, begun.boxes, every, every),
@@ -396,12 +388,13 @@ def _hidden(pieces: BoxPieces, frame: Ints, boxes: Floats, own: Ints, other: Int
     """The share of boxes (E, 4) at frames (E,) that one box of a third piece hides, which is nearer to the camera."""
     order = np.argsort(pieces.frame, kind="stable")
     low, high = (np.searchsorted(pieces.frame[order], frame, side) for side in ("left", "right"))
-    which, row = group_index(high - low), order[ragged_range(low, high - low)]
-    hiding, hidden, piece = pieces.boxes[row], boxes[which], pieces.piece[row]
-    corner = np.minimum(hiding[:, :2] + hiding[:, 2:], hidden[:, :2] + hidden[:, 2:])
-    overlap = np.clip(corner - np.maximum(hiding[:, :2], hidden[:, :2]), 0, None).prod(axis=1)
-    is_nearer = hiding[:, 1] + hiding[:, 3] > hidden[:, 1] + (1 - _BEHIND) * hidden[:, 3]
-    counts = is_nearer & (piece != own[which]) & (piece != other[which])
-    share = np.zeros(len(frame))
-    np.maximum.at(share, which, np.where(counts, overlap / hidden[:, 2:].prod(axis=1), 0.0))
+    share, piece_of = np.zeros(len(frame)), pieces.piece
+    for part in batches(high - low, _AT_ONCE):
+        which, row = part.start + group_index((high - low)[part]), order[ragged_range(low[part], (high - low)[part])]
+        hiding, hidden, piece = pieces.boxes[row], boxes[which], piece_of[row]
+        corner = np.minimum(hiding[:, :2] + hiding[:, 2:], hidden[:, :2] + hidden[:, 2:])
+        overlap = np.clip(corner - np.maximum(hiding[:, :2], hidden[:, :2]), 0, None).prod(axis=1)
+        is_nearer = hiding[:, 1] + hiding[:, 3] > hidden[:, 1] + (1 - _BEHIND) * hidden[:, 3]
+        counts = is_nearer & (piece != own[which]) & (piece != other[which])
+        np.maximum.at(share, which, np.where(counts, overlap / hidden[:, 2:].prod(axis=1), 0.0))
     return share

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, repeat
 from types import MappingProxyType
-from typing import ClassVar, Final, TypeAlias, TypeVar
+from typing import Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Ints
+from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
@@ -18,7 +18,7 @@ from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, Frame, Rows
 from mcaptrack.schema.by_class import join_classes, split_classes
 from mcaptrack.schema.frame_columns import FrameColumns, collect
-from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.framing import filtered_rows
 from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
@@ -45,7 +45,8 @@ from mcaptrack.transforms.retrack.passes import (
 )
 from mcaptrack.transforms.to_video_rate import steady_s, to_metres
 
-Options = TypeVar("Options", bound=RetrackOptions)
+#: Makes the online pass of a method.
+NewPass = Callable[[Any, Movers, FrameColumns], OnlinePass]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +68,11 @@ class Retrack(LikelihoodOptions):
     {1}
     """
 
+    new_pass: ClassVar[NewPass] = LikelihoodPass
+
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         seen: list[AppearanceCalibration] = []
-        yield from _retrack(self, LikelihoodPass, frames, seen)
+        yield from _retrack(self, frames, seen)
         object.__setattr__(self, "_seen", seen)
 
     def model_card(self) -> ModelCard:
@@ -94,32 +97,29 @@ class RetrackByConsistency(ConsistencyOptions):
 
     #: Rows of people outside of the picture stay, as in the paper (see ``pipeline.visible``).
     keeps_unseen: ClassVar[bool] = True
+    new_pass: ClassVar[NewPass] = ConsistencyPass
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        return _retrack(self, ConsistencyPass, frames)
+        return _retrack(self, frames, [])
 
 
 Retracking: TypeAlias = Retrack | RetrackByConsistency
 
 
 def _retrack(
-    options: Options,
-    new_pass: Callable[[Options, Movers, FrameColumns], OnlinePass],
-    frames: Iterable[Frame],
-    seen: list[AppearanceCalibration] | None = None,
+    options: Retracking, frames: Iterable[Frame], seen: list[AppearanceCalibration]
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame the offline tracks, the online tracks and their predictions, and further outputs that the options
     write; each class by itself. How appearance tells tracks apart is added to ``seen``, for each class.
     """
     warn_if_weak(options.predictor)
-    calibrations = [] if seen is None else seen
     if options.leaves_unchanged:
-        yield from _keep_ids(options, frames, calibrations)
+        yield from _keep_ids(options, frames, seen)
         return
     frames = _placed(collect(TRACKS, frames))
     classes = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
-    outputs = [_retracked(options, new_pass, part, score, calibrations) for part in classes]
+    outputs = [_retracked(options, part, score, seen) for part in classes]
     if len(classes) > 1:
         yield from join_classes([list(map(collect, options.writes.values(), part)) for part in outputs])
         return
@@ -129,15 +129,12 @@ def _retrack(
 
 def _placed(frames: FrameColumns) -> FrameColumns:
     """The frames without the rows that have no position in metres; how many these are is said."""
-    counts = [(~_is_placed(part.rows)).sum() for _, _, part in joined_parts(TRACKS, frames)]
-    if not any(counts):
+    placed = filtered_rows(TRACKS, frames, lambda part: np.isfinite(part.rows["x_m"]) & np.isfinite(part.rows["y_m"]))
+    lost = int(frames.ends[-1] - placed.ends[-1])
+    if not lost:
         return frames
-    warn(f"{sum(counts):,} rows of tracks have no position in metres, and are left out", "left-out")
-    return collect(TRACKS, (frame._replace(rows=frame.rows[_is_placed(frame.rows)]) for frame in frames))
-
-
-def _is_placed(rows: Rows) -> Bools:
-    return np.asarray(np.isfinite(rows["x_m"]) & np.isfinite(rows["y_m"]))
+    warn(f"{lost:,} rows of tracks have no position in metres, and are left out", "left-out")
+    return placed
 
 
 def _keep_ids(
@@ -181,18 +178,14 @@ def _sampled(tracks: FrameColumns, at_ns: Ints, gap_s: float, planes: Planes) ->
 
 
 def _retracked(
-    options: Options,
-    new_pass: Callable[[Options, Movers, FrameColumns], OnlinePass],
-    frames: FrameColumns,
-    score: float,
-    seen: list[AppearanceCalibration],
+    options: Retracking, frames: FrameColumns, score: float, seen: list[AppearanceCalibration]
 ) -> list[Iterable[Frame]]:
     """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    online = (KeptIds if movers.on_ground else new_pass)(options, movers, frames)
+    online = (KeptIds if movers.on_ground else options.new_pass)(options, movers, frames)
     run = online
     if options.follows_speed and not movers.on_ground and (paced := at_pace_of_log(movers, frames)) != movers:
-        movers, run = paced, new_pass(options, paced, frames)
+        movers, run = paced, options.new_pass(options, paced, frames)
     model = motion_model(options, run.noise_m, movers)
     rows, calibration = offline_tracks(options, model, run, movers)
     seen.extend([] if calibration is None else [calibration])
