@@ -96,7 +96,7 @@ def resolve_swaps(
     i, j, low, high, meet, part_ways = encounters
     evidence = np.zeros(len(i)) if seen is None else seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
-    swaps: dict[int, _Swaps] = {}
+    swaps: dict[int, list[tuple[int, int, int]]] = {}  # of each encounter that is changed: steps, and both tracks
     gain = np.zeros(len(i))
     for part in _batches(high - low + 1):
         steps = low[part, None] + np.arange(int((high - low)[part].max()) + 1)
@@ -109,33 +109,21 @@ def resolve_swaps(
         paths, gain[part] = find_swaps(model, relative, cost, evidence[part])
         for at, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
             if gain[at] >= _MIN_GAIN:
-                swaps[at] = _Swaps(int(i[at]), int(j[at]), int(low[at]), path[: length + 1].copy())
+                changes = low[at] + np.flatnonzero(np.diff(path[: length + 1], prepend=False))
+                swaps[at] = [(step, int(i[at]), int(j[at])) for step in changes.tolist()]
     which = np.array(sorted(swaps), np.int64)
     chosen = which[compatible(np.stack([i, j], axis=1)[which], low[which], high[which], gain[which])]
-    return _exchanged(trajectories, track, [swaps[at] for at in chosen.tolist()]), len(chosen)
+    in_order = sorted(swap for at in chosen.tolist() for swap in swaps[at])
+    return _exchanged(trajectories, track, in_order), len(chosen)
 
 
-class _Swaps(NamedTuple):
-    """The swaps of an encounter of the tracks ``a`` and ``b``: whether they are swapped at steps from ``low`` on."""
+def _exchanged(trajectories: Trajectories, track: Ints, swaps: list[tuple[int, int, int]]) -> Ints:
+    """The track that each row (N,) belongs to after swaps: steps, rising, and the two tracks that are swapped there.
 
-    a: int
-    b: int
-    low: int
-    is_swapped: Bools
-
-
-def _exchanged(trajectories: Trajectories, track: Ints, encounters: list[_Swaps]) -> Ints:
-    """The track that each row (N,) belongs to after the swaps of encounters, of which no two change a track at once.
-
-    Two tracks that are swapped go on as each other, or as whoever these are by then.
+    These go on as each other, or as whichever tracks they are by then.
     """
     owner = track.copy()
     now: dict[int, int] = {}
-    swaps = sorted(
-        (met.low + int(at), met.a, met.b)
-        for met in encounters
-        for at in np.flatnonzero(np.diff(met.is_swapped, prepend=False))
-    )
     for step, a, b in swaps:
         now[a], now[b] = now.get(b, b), now.get(a, a)
         for number in (a, b):

@@ -32,9 +32,10 @@ _OUTSIDE: Final = 0.1
 _MIN_RATE: Final = 0.01
 #: The squared radius of that circle, for a variance of 1.
 _CIRCLE: Final = -2 * np.log(_OUTSIDE)
-#: The rows of the whole numbers of tracks: id, input id of the last observation (-1: of a merged detection), number of
-#: observations, steps since the last one, and steps for which the track is merged into the detection of another one.
-IDS, SOURCE, HITS, MISSED, MERGED = range(5)
+#: The rows of the whole numbers of tracks: id, input id of the last observation (-1: of a merged detection), its number
+#: in the log, how many there were, steps since the last one, and steps for which the track is merged into the detection
+#: of another one.
+IDS, SOURCE, SAMPLE, HITS, MISSED, MERGED = range(6)
 
 
 # Online links: which new track continues a lost one, decided from when the new one begins until it has lasted.
@@ -126,11 +127,11 @@ class OnlineLinks:
 
         ``is_written`` (R,) says which are written in any case. Nothing is known at a step that was not known then.
         """
-        steps, _, tick, is_observed, tracks, state = seen
+        steps, _, tick, tracks, state = seen
         if self._max_gap_steps <= 0:
             return np.asarray(tracks[IDS]), is_written
         alive, which = self._known(seen)
-        count = len(tick)
+        count, is_observed = len(tick), seen.is_observed
         is_named = self._are_named(alive.ids)
         first = np.full(len(alive.ids), count)  # the row from which on a track is written that was not written before
         written = np.flatnonzero(is_written & ~is_named[which])
@@ -286,12 +287,11 @@ class Association:
 class Step(NamedTuple):
     """The tracks alive after a step.
 
-    ``tracks`` (5, K) are their whole numbers (``IDS`` to ``MERGED``), ``row`` (K,) is the observation that each has, or
-    -1, and ``mean`` (4, K) and ``cov`` (3, K) are their states, as in ``StateRows``.
+    ``tracks`` (6, K) are their whole numbers (``IDS`` to ``MERGED``), ``mean`` (4, K) and ``cov`` (3, K) are their
+    states, as in ``StateRows``.
     """
 
     tracks: Ints
-    row: Ints
     mean: Floats
     cov: Floats
 
@@ -300,16 +300,19 @@ class Alive(NamedTuple):
     """The tracks alive at each of F steps, R in all, laid end to end.
 
     ``steps`` (F,) are the numbers of the steps, ``passed`` (F,) is by how many time advanced to each, and ``tick`` (R,)
-    the index of the step of each track, rising. ``tracks`` (5, R) are as in ``Step``; ``is_observed`` (R,) says which
-    have an observation then, and ``state`` (R,) are their states.
+    the index of the step of each track, rising. ``tracks`` (6, R) are as in ``Step``, ``state`` (R,) are their states.
     """
 
     steps: Ints
     passed: Ints
     tick: Ints
-    is_observed: Bools
     tracks: Ints
     state: State
+
+    @property
+    def is_observed(self) -> Bools:
+        """Which tracks have an observation at that step, (R,)."""
+        return np.asarray(self.tracks[MISSED] == 0)
 
 
 @dataclass
@@ -327,7 +330,7 @@ class OnlineTracker:
     confirm_hits: int
     max_age_tentative: int
     estimate_noise: bool = True
-    tracks: Ints = field(default_factory=lambda: np.empty((5, 0), np.int64))
+    tracks: Ints = field(default_factory=lambda: np.empty((6, 0), np.int64))
     state: StateRows = field(default_factory=lambda: StateRows(np.empty((4, 0)), np.empty((3, 0))))
     next_id: int = 1
     judged: int = 0
@@ -337,8 +340,11 @@ class OnlineTracker:
     def __post_init__(self) -> None:
         self.noise_m = self.model.noise_m
 
-    def step(self, xy_m: Floats, source: Ints, passed: int) -> Step:
-        """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,)."""
+    def step(self, xy_m: Floats, source: Ints, sample: Ints, passed: int) -> Step:
+        """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,).
+
+        ``sample`` (N,) are the numbers of the observations in the log.
+        """
         self.tracks[MISSED] += passed
         is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
         is_over = is_over < self.tracks[MISSED]
@@ -351,16 +357,14 @@ class OnlineTracker:
         if len(track):
             occluder = self._merge(track, xy_m[:, row], passed)
             self._update(track, xy_m[:, row], source[row], occluder)
-        row_of = np.full(self.tracks.shape[1], -1)
-        row_of[track] = row
+            self.tracks[SAMPLE, track] = sample[row]
         if len(row) < len(source):
             is_free = np.ones(len(source), bool)
             is_free[row] = False
             free = is_free.nonzero()[0]
-            row_of = np.concatenate([row_of, free])
-            self._start(xy_m[:, free], source[free])
+            self._start(xy_m[:, free], source[free], sample[free])
         self.known_sources.update(source.tolist())
-        return Step(self.tracks.copy(), row_of, self.state.mean.copy(), self.state.cov.copy())
+        return Step(self.tracks.copy(), self.state.mean.copy(), self.state.cov.copy())
 
     def _merge(self, track: Ints, observed: Floats, passed: int) -> Ints:
         """Update lost tracks that are merged into one detection with another track (occlusion).
@@ -442,12 +446,12 @@ class OnlineTracker:
             return assign_by_gain(gain)
         return assign_pairs_by_gain(pairs.chosen(gain > 0), gain[gain > 0], pairs.shape)[0]
 
-    def _start(self, xy_m: Floats, source: Ints) -> None:
+    def _start(self, xy_m: Floats, source: Ints, sample: Ints) -> None:
         """Birth: start a track for each observation (2, N) that was not matched."""
         count = len(source)
-        born = np.zeros((5, count), np.int64)
+        born = np.zeros((6, count), np.int64)
         born[IDS] = range(self.next_id, self.next_id + count)
-        born[SOURCE], born[HITS] = source, 1
+        born[SOURCE], born[SAMPLE], born[HITS] = source, sample, 1
         self.next_id += count
         self.tracks = np.concatenate([self.tracks, born], axis=1)
         new = self.model.initial(xy_m, self.noise_m)
@@ -617,7 +621,7 @@ class ShownTracks:
 
     def __call__(self, alive: Alive) -> Bools:
         """Which of the tracks alive at some steps are written, (R,). Nothing is known that was not known then."""
-        _, passed, tick, is_observed, tracks, _ = alive
+        (_, passed, tick, tracks, _), is_observed = alive, alive.is_observed
         is_confirmed, may_coast = tracks[HITS] >= self._confirm_hits, tracks[MISSED] <= self._coast
         if not self._adapts:
             is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
@@ -641,14 +645,14 @@ class ShownTracks:
         or worse than everywhere the odds are that lost ones come back, where they were lost, (R,).
         """
         xy_m, ids = alive.state.mean[:, :2].T, alive.tracks[IDS].tolist()
-        bounds = np.searchsorted(alive.tick, np.arange(len(alive.steps) + 1)).tolist()
+        bounds, is_observed = np.searchsorted(alive.tick, np.arange(len(alive.steps) + 1)).tolist(), alive.is_observed
         inside, ratio = np.zeros(len(ids), bool), np.ones(len(ids))
         for passed, (low, high) in zip(alive.passed.tolist(), pairwise(bounds), strict=True):
             here = xy_m[:, low:high]
             inside[low:high] = self._seen.holds(here)
             if (is_sure[low:high] & ~inside[low:high]).any():
                 self._seen.add(here[:, is_sure[low:high]])
-            ratio[low:high] = self._places(passed, ids[low:high], alive.is_observed[low:high], here)
+            ratio[low:high] = self._places(passed, ids[low:high], is_observed[low:high], here)
         return inside, ratio
 
     def _learn(self, passed: Ints, tick: Ints, now: Ints) -> tuple[Floats, Floats]:

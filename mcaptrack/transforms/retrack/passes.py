@@ -36,6 +36,7 @@ from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M, WALK_M_PE
 from mcaptrack.transforms.retrack.online_tracker import (
     HITS,
     IDS,
+    SAMPLE,
     Alive,
     Association,
     OnlineLinks,
@@ -203,7 +204,7 @@ class LikelihoodPass(OnlinePass):
     """Online tracking over one log.
 
     Frames are read some at a time, and rows of online tracks are made of as many, because one frame has few of them.
-    What later steps need is kept: the last sample of each track, and its past positions.
+    What later steps need is kept: the past positions of each track.
     """
 
     def __init__(self, options: LikelihoodOptions, movers: Movers, frames: FrameColumns) -> None:
@@ -227,8 +228,6 @@ class LikelihoodPass(OnlinePass):
         )
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
         self._links = OnlineLinks(self._tracker.model, options.link_s, options.link_confidence, confirm_hits)
-        # what is known of earlier frames: tracks and their last samples
-        self._ids, self._last_rows = np.empty(0, np.int64), TRACKS.empty()
         self._online = FrameCollector(TRACKS)
         self._coasting: list[tuple[Ints, Floats, Ints]] = []  # places of rows in _online, positions in m, times
         self._forecasts = OnlineForecasts(
@@ -259,48 +258,34 @@ class LikelihoodPass(OnlinePass):
 
     def _track(self, part: JoinedFrames, numbers: Ints, here: slice) -> None:
         """Track through some frames, and write these steps."""
-        steps, passed, samples = self.steps[here], self.passed[here], part.rows
+        steps, passed, first = self.steps[here], self.passed[here], self.samples.ends[here.start]
         # observations of each step, ordered by their input ids
-        tick, source = part.frame, samples["track_id"]
-        observed = np.lexsort((source, tick))
+        row = np.lexsort((part.rows["track_id"], part.frame))
         if not self._options.interpolated:
-            observed = observed[samples["observed"][observed]]
-        tick, source = tick[observed], source[observed]
-        xy_m = np.stack([samples["x_m"][observed], samples["y_m"][observed]]) / self._unit_m
-        ends = np.searchsorted(tick, np.arange(len(steps) + 1))
+            row = row[part.rows["observed"][row]]
+        source = part.rows["track_id"][row]
+        xy_m = np.stack([part.rows["x_m"][row], part.rows["y_m"][row]]) / self._unit_m
+        bounds = pairwise(np.searchsorted(part.frame[row], np.arange(len(steps) + 1)).tolist())
         results = [
-            self._tracker.step(xy_m[:, low:high], source[low:high], steps_passed)
-            for (low, high), steps_passed in zip(pairwise(ends.tolist()), passed.tolist(), strict=True)
+            self._tracker.step(xy_m[:, low:high], source[low:high], first + row[low:high], by)
+            for (low, high), by in zip(bounds, passed.tolist(), strict=True)
         ]
-        tracks, row, mean, cov = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
-        tick = group_index([len(result.row) for result in results])
-        has = row >= 0
-        row[has] = observed[ends[tick[has]] + row[has]]
-        self.assignments.add(steps[tick[has]], tracks[IDS, has], samples["track_id"][row[has]])
-        alive = Alive(steps, passed, tick, row >= 0, tracks, State(mean.T, cov.T))
-        self._write(alive, part, numbers, row)
+        tracks, mean, cov = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
+        tick = group_index([result.tracks.shape[1] for result in results])
+        self._write(Alive(steps, passed, tick, tracks, State(mean.T, cov.T)), part, numbers, first)
 
-    def _write(self, alive: Alive, part: JoinedFrames, numbers: Ints, row: Ints) -> None:
-        """Make the rows of online tracks, and their predictions, of some steps; ``row`` (R,) is the sample of each
-        track alive, or -1.
-        """
+    def _write(self, alive: Alive, part: JoinedFrames, numbers: Ints, first: int) -> None:
+        """Make the rows of online tracks, and their predictions, of steps of which ``first`` is the first sample."""
         steps, tick, ids, place = alive.steps, alive.tick, alive.tracks[IDS], alive.state.mean[:, :2]
-        samples = TRACKS.joined([self._last_rows, part.rows])
-        before = len(self._last_rows)
-        sample = np.where(row >= 0, before + row, -1)
-        # the last sample of each track up to each step: before the first of these steps, that of ``_last_rows``
-        earlier = np.concatenate([np.arange(before), sample])
-        order = np.lexsort((np.concatenate([np.full(before, -1), tick]), np.concatenate([self._ids, ids])))
-        last = np.maximum.accumulate(np.where(earlier[order] >= 0, np.arange(len(order)), -1))
-        last_sample = np.empty_like(earlier)
-        last_sample[order] = earlier[order][last]
-        last_sample = last_sample[before:]
+        is_observed, seen_m = alive.is_observed, np.full((len(ids), 2), np.nan)
+        seen = part.rows[alive.tracks[SAMPLE, is_observed] - first]
+        seen_m[is_observed] = np.stack([seen["x_m"], seen["y_m"]], axis=-1)
+        self.assignments.add(steps[tick[is_observed]], ids[is_observed], seen["track_id"])
         names, is_shown = self._links(alive, self._shown(alive) & np.isfinite(place[:, 0]))
         shown = np.flatnonzero(is_shown)
         shown = shown[np.lexsort((names[shown], tick[shown]))]
 
-        rows = samples[last_sample[shown]].copy()
-        coasts = row[shown] < 0
+        rows, coasts = self.samples.take(alive.tracks[SAMPLE, shown]), ~is_observed[shown]
         rows["source_id"] = np.where(coasts, -1, rows["track_id"])
         rows["track_id"] = names[shown]
         rows["observed"] &= ~coasts
@@ -309,8 +294,6 @@ class LikelihoodPass(OnlinePass):
         self._coasting.append((self._written + np.flatnonzero(coasts), xy_m[coasts], part.t_ns[tick[shown[coasts]]]))
         self._written += len(rows)
         ticks = np.arange(len(steps) + 1)
-        seen_m = np.full((len(ids), 2), np.nan)
-        seen_m[row >= 0] = np.stack([part.rows[name][row[row >= 0]] for name in ("x_m", "y_m")], axis=-1)
         past = self._recent.push_all(alive.passed, np.searchsorted(tick, ticks), ids, seen_m)[0][shown]
         past[:, -1] = xy_m
         self._online.extend(part.t_ns, numbers, np.searchsorted(tick[shown], ticks), rows)
@@ -318,8 +301,6 @@ class LikelihoodPass(OnlinePass):
         known = np.isfinite(past[..., 0])
         waiting = taken(Unpredicted(names[shown], past, known, coasts, steps[tick[shown]]), confirmed)
         self._forecasts.add(part.t_ns, numbers, np.searchsorted(tick[shown[confirmed]], ticks), waiting)
-        is_last = tick == len(steps) - 1
-        self._ids, self._last_rows = ids[is_last], samples[last_sample[is_last]]
 
 
 def motion_model(options: RetrackOptions, noise_m: float, movers: Movers = PEOPLE) -> MotionModel:
