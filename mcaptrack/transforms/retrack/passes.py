@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.arrays import Bools, Ints, taken
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, steps_passed
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.ragged import find_rows, group_index
@@ -115,9 +115,7 @@ class OnlinePass:
         raise NotImplementedError
 
 
-# Re-tracking of each class by itself: links, swaps and gaps never join tracks of different classes.
-#
-# Letters: C classes, F frames.
+# The unit and the kind of the tracks of one class: each class is re-tracked by itself.
 
 
 class Movers(NamedTuple):
@@ -229,32 +227,16 @@ class LikelihoodPass(OnlinePass):
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
         self._links = OnlineLinks(self._tracker.model, options.link_s, options.link_confidence, confirm_hits)
         self._online = FrameCollector(TRACKS)
-        self._coasting: list[tuple[Ints, Floats, Ints]] = []  # places of rows in _online, positions in m, times
         self._forecasts = OnlineForecasts(
             options.predictor, options.horizon_s, rate, options.follows_log, movers.unit_m
         )
         self._recent = Histories(self._forecasts.past)  # of tracks, in m
-        self._written = 0
         for low, high in spans_of(frames.ends, _SAMPLES):
             self._track(join_frames(TRACKS, frames, low, high), frames.numbers[low:high], slice(low, high))
         self.noise_m = self._tracker.noise_m
 
     def outputs(self) -> tuple[FrameColumns, FrameColumns]:
-        online, predictions = self._online.done(), self._forecasts.done()
-        # All at once, because the last digits of a product of matrices depend on their size.
-        nothing = np.empty(0, np.int64), np.empty((0, 2)), np.empty(0, np.int64)
-        places, xy_m, t_ns = (np.concatenate(parts) for parts in zip(nothing, *self._coasting, strict=True))
-        coasting = move_rows(online.take(places), xy_m, self._options.ground_planes, t_ns)
-        done = 0
-
-        def moved(part: JoinedFrames) -> Rows:
-            nonlocal done
-            here = slice(*np.searchsorted(places, [done, done + len(part.rows)]))
-            part.rows[places[here] - done] = coasting[here]
-            done += len(part.rows)
-            return part.rows
-
-        return (mapped_rows(TRACKS, online, moved) if len(places) else online), predictions
+        return self._online.done(), self._forecasts.done()
 
     def _track(self, part: JoinedFrames, numbers: Ints, here: slice) -> None:
         """Track through some frames, and write these steps."""
@@ -291,8 +273,7 @@ class LikelihoodPass(OnlinePass):
         rows["observed"] &= ~coasts
         xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
         xy_m[coasts] = place[shown[coasts]] * self._unit_m
-        self._coasting.append((self._written + np.flatnonzero(coasts), xy_m[coasts], part.t_ns[tick[shown[coasts]]]))
-        self._written += len(rows)
+        rows = move_rows(rows, xy_m, self._options.ground_planes, part.t_ns[tick[shown]])
         ticks = np.arange(len(steps) + 1)
         past = self._recent.push_all(alive.passed, np.searchsorted(tick, ticks), ids, seen_m)[0][shown]
         past[:, -1] = xy_m
