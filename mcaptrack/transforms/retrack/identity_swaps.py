@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.transforms.retrack.appearance import Sides
@@ -45,7 +45,7 @@ _MIN_GAIN: Final = 1.0
 # Which encounters are changed at once: of those that need the same track at the same time, the one that gains most.
 #
 # Whether two tracks were swapped is judged as if all other tracks were right. So of two encounters that overlap in
-# time and have a track in common only one is changed, and the other is judged again afterwards.
+# time and have a track in common only one is changed.
 
 
 def compatible(pair: Ints, low: Ints, high: Ints, gain: Floats) -> Ints:
@@ -72,18 +72,13 @@ class Encounters(NamedTuple):
 
 
 def resolve_swaps(
-    model: MotionModel,
-    trajectories: Trajectories,
-    row: Ints,
-    source: Ints,
-    examined: Bools | None = None,
-    seen: Sides | None = None,
+    model: MotionModel, trajectories: Trajectories, row: Ints, source: Ints, seen: Sides | None = None
 ) -> tuple[Ints, int]:
     """The track that each row of the trajectories belongs to (N,), and the number of encounters that were changed.
 
-    ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter is left for the next
-    call if a better one changes one of its tracks at the same time. Only encounters of ``examined`` tracks (K,) are
-    looked at, by default all. ``seen`` compares what the tracks look like before and after an encounter.
+    ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter stays as it is if a
+    better one changes one of its tracks at the same time. ``seen`` compares what the tracks look like before and after
+    an encounter.
     """
     track = group_index(np.diff(trajectories.first))
     input_id = np.full(len(track), -1)
@@ -91,8 +86,6 @@ def resolve_swaps(
     encounters = find_encounters(trajectories)
     if len(encounters.i) == 0:
         return track, 0
-    if examined is not None:
-        encounters = taken(encounters, examined[encounters.i] | examined[encounters.j])
     i, j, low, high, meet, part_ways = encounters
     evidence = np.zeros(len(i)) if seen is None else seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]

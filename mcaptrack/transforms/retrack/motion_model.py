@@ -42,7 +42,7 @@ class MotionModel:
 
     noise_m: float
     speed_m_per_s: float
-    drift_m_per_s: float
+    drift_m_per_s: Floats | float
     drift_ratio: float
     step_s: float
 

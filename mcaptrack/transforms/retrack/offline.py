@@ -58,8 +58,6 @@ _SPARSE: Final = 0.25
 _SHORT: Final = -0.05
 #: Identities are decided so often, each time with the motion of the tracks that were decided before.
 _SWEEPS: Final = 2
-#: The number of times that encounters are examined again after identities were swapped.
-_ROUNDS: Final = 5
 
 
 # Rows of offline tracks: described by a few numbers each while tracks are decided about, then made part by part.
@@ -254,18 +252,10 @@ def hypotheses_of(log: Log, tracks: Tracks, is_final: bool = False) -> Hypothese
 
 def _without_swaps(log: Log, tracks: Tracks) -> Tracks:
     """Undo swaps of tracks that met."""
-    examined: Ints | None = None  # tracks that were changed: the encounters of all others stay as they are
-    for _ in range(_ROUNDS):
-        ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-        which = None if examined is None else np.isin(ids, examined)
-        seen = None if log.appearance is None else log.appearance.between(tracks)
-        owner, changed = resolve_swaps(log.model, trajectories, row, tracks.source, which, seen)
-        tracks = tracks._replace(track=ids[owner[row]])
-        if not changed:
-            break
-        own = group_index(np.diff(trajectories.first))
-        examined = ids[np.unique(own[owner != own])]
-    return tracks
+    ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
+    seen = None if log.appearance is None else log.appearance.between(tracks)
+    owner, _ = resolve_swaps(log.model, trajectories, row, tracks.source, seen)
+    return tracks._replace(track=ids[owner[row]])
 
 
 def _people(log: Log, tracks: Tracks, rows: TrackRows, paths: Trajectories) -> tuple[Floats, Bools]:

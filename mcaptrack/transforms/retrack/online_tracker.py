@@ -62,11 +62,12 @@ _BATCH: Final = 200_000
 
 
 class _Known(NamedTuple):
-    """Tracks (K,): ids, the steps at which they began, were last observed and are over, the number of observations, the
-    state at the first one, and at the last one.
+    """Tracks (K,): ids, those under which they are written, or -1, the steps at which they began, were last observed
+    and are over, the number of observations, the state at the first one, and at the last one.
     """
 
     ids: Ints
+    names: Ints
     began: Ints
     last: Ints
     over: Ints
@@ -77,7 +78,7 @@ class _Known(NamedTuple):
 
 _NONE: Final = np.empty(0, np.int64)
 _NO_STATE: Final = State(np.empty((0, 4)), np.empty((0, 3)))
-_NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, _NO_STATE, _NO_STATE)
+_NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, _NONE, _NO_STATE, _NO_STATE)
 
 
 class _Links(NamedTuple):
@@ -113,11 +114,7 @@ class OnlineLinks:
         self._confirm_hits, self._settled_hits = confirm_hits, _lasting(confirm_hits)
         self._sure = float(np.log(min_confidence / (1 - min_confidence)))
         self._least = self._sure + float(np.log(linking.ENOUGH))
-        self._names: dict[int, int] = {}  # the ids under which tracks are written, of those that were
-        self._alive, self._lost = (
-            _NO_TRACKS,
-            _NO_TRACKS,
-        )  # lost ones are over, were written, and are continued by no other
+        self._alive, self._lost = _NO_TRACKS, _NO_TRACKS  # lost ones were written, and are continued by no other
         self._links: deque[tuple[float, float]] = deque(maxlen=_LINKS)  # log odds and seconds
         self._link_count, self._estimated = 0, 0
         self._shifts = linking.prior_shifts(np.empty(0), np.empty(0))
@@ -132,49 +129,46 @@ class OnlineLinks:
             return np.asarray(tracks[IDS]), is_written
         alive, which = self._known(seen)
         count, is_observed = len(tick), seen.is_observed
-        is_named = self._are_named(alive.ids)
+        is_named, is_own = alive.names >= 0, (alive.names < 0) | (alive.names == alive.ids)
         first = np.full(len(alive.ids), count)  # the row from which on a track is written that was not written before
         written = np.flatnonzero(is_written & ~is_named[which])
         np.minimum.at(first, which[written], written)
         is_early = (np.arange(count) <= first[which]) & ~is_named[which]
         is_judged = is_early | (tracks[HITS] <= self._settled_hits)
-        is_own = np.array([self._names.get(track, track) == track for track in alive.ids.tolist()], bool)
         rows = np.flatnonzero(((is_written & is_early) | is_observed) & is_judged & is_own[which])
         of = which[rows]
         new = taken(alive, of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=taken(state, rows))
-        over = np.flatnonzero(alive.over < _NEVER)
-        lost = joined([self._lost, taken(alive, over)])
+        known, before = joined([self._lost, alive]), len(self._lost.ids)
+        is_over = known.over < _NEVER
+        lost_at = np.flatnonzero(is_over)
+        lost_at = lost_at[np.argsort(known.ids[lost_at])]  # links of equal odds are chosen by ids
+        lost, names = taken(known, lost_at), known.names.copy()
         # a lost track was written before it was over; or else it has to continue another one
-        was_written = np.append(np.ones(len(self._lost.ids), bool), first[over] < count)
-        order = np.argsort(lost.ids)  # however many steps are read at once, links of equal odds are chosen by ids
-        lost, was_written = taken(lost, order), was_written[order]
+        was_written = np.append(np.ones(before, bool), first < count)[lost_at]
         is_first = rows == first[of]
         is_settled = new.hits >= self._settled_hits
         links = self._candidates(lost, new, is_first)
         since = np.full(len(alive.ids), count)  # those that continue another one are written whenever they are observed
         since[~is_own] = 0
-        used = np.zeros(len(lost.ids), bool)
+        used = np.zeros(len(lost_at), bool)
         for at_once in np.split(np.arange(len(links.new)), np.flatnonzero(np.diff(tick[rows[links.new]])) + 1):
             may_be = ~used[links.lost[at_once]] & (since[of[links.new[at_once]]] == count)
-            may_be &= was_written[links.lost[at_once]] | self._are_named(lost.ids[links.lost[at_once]])
+            may_be &= was_written[links.lost[at_once]] | (names[lost_at[links.lost[at_once]]] >= 0)
             edges = taken(links, at_once[may_be])
             chosen = self._decide(edges, is_first[edges.new], is_settled[edges.new])
-            for ended, other in zip(edges.lost[chosen].tolist(), edges.new[chosen].tolist(), strict=True):
-                self._names[int(new.ids[other])] = self._names.get(int(lost.ids[ended]), int(lost.ids[ended]))
-                used[ended], since[of[other]] = True, rows[other]
-        for track in alive.ids[first < count].tolist():
-            self._names.setdefault(track, track)
+            ended, other = edges.lost[chosen], edges.new[chosen]
+            own = names[lost_at[ended]]
+            names[before + of[other]] = np.where(own >= 0, own, lost.ids[ended])
+            used[ended], since[of[other]] = True, rows[other]
+        is_new = np.append(np.zeros(before, bool), first < count) & (names < 0)
+        names[is_new] = known.ids[is_new]
+        known = known._replace(names=names)
         reached = lost.last >= steps[-1] - self._max_gap_steps
-        self._lost = taken(lost, reached & ~used & self._are_named(lost.ids))
-        self._alive = taken(alive, alive.over == _NEVER)
-        names = np.array([self._names.get(track, track) for track in alive.ids.tolist()], np.int64)
-        kept = {*self._alive.ids.tolist(), *self._lost.ids.tolist()}
-        self._names = {track: name for track, name in self._names.items() if track in kept}
+        self._lost = taken(known, lost_at[reached & ~used & (names[lost_at] >= 0)])
+        self._alive = taken(known, ~is_over)
+        shown = np.where(names < 0, known.ids, names)[before:]
         continues = np.arange(count) >= since[which]
-        return np.where(continues, names[which], tracks[IDS]), is_written | (is_observed & continues)
-
-    def _are_named(self, ids: Ints) -> Bools:
-        return np.array([track in self._names for track in ids.tolist()], bool)
+        return np.where(continues, shown[which], tracks[IDS]), is_written | (is_observed & continues)
 
     def _candidates(self, lost: _Known, new: _Known, is_written: Bools) -> _Links:
         """The links with a chance from lost tracks (L,) to new ones (N,), ordered by these, at the steps ``new.last``.
@@ -237,6 +231,7 @@ class OnlineLinks:
         ends[which[count:]] = seen.tick
         known = _Known(
             ids,
+            np.append(before.names, np.full(len(hits), -1))[first],
             np.concatenate([before.began, at])[first],
             np.concatenate([before.last, at])[last],
             np.append(seen.steps, _NEVER)[ends + 1],
