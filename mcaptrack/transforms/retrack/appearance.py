@@ -9,7 +9,6 @@ Letters: C assignments, S descriptors, D bytes of one, E pairs of tracks.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.colour_histograms import BINS, mean_shares
 from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_starts
 from mcaptrack.schema import APPEARANCE, BodyPart, Rows
+from mcaptrack.schema.framing import rows_at
 from mcaptrack.transforms.retrack.motion_model import Tracks
 
 #: The log likelihood ratio that the end of one track and the beginning of another are one person, for pairs of tracks
@@ -416,6 +416,4 @@ def appearance_rows(descriptors: Descriptors, track: Ints, times_ns: Ints) -> It
         rows[name] = share
     at = np.repeat(last, len(BodyPart))
     order = np.argsort(at, kind="stable")
-    ends = np.append(0, np.searchsorted(at[order], times_ns, "right")).tolist()
-    rows = APPEARANCE.check(rows.take(order))
-    yield from (rows[low:high] for low, high in pairwise(ends))
+    return rows_at(APPEARANCE, rows.take(order), at[order], times_ns)

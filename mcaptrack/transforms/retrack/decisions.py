@@ -22,7 +22,7 @@ from mcaptrack.geometry.ragged import find_rows, run_ends, run_starts
 from mcaptrack.notices import warn
 from mcaptrack.schema import DECISIONS, WORLDS, DecisionKind, Frame, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
-from mcaptrack.schema.framing import join_frames, nearest_times
+from mcaptrack.schema.framing import join_frames, nearest_times, rows_at
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, best_next, following, named
 from mcaptrack.transforms.retrack.linking import chains
 from mcaptrack.transforms.retrack.motion_model import MotionModel, Tracks
@@ -63,9 +63,7 @@ def decision_rows(decided: Decided, model: MotionModel, samples: FrameColumns, s
     rows["x_px"], rows["y_px"] = places["x_px"] + places["w_px"] / 2, places["y_px"] + places["h_px"] / 2
     step = decided.tracks.step[at]
     order = np.lexsort((rows["source_id"], rows["track_id"], rows["kind"], step))
-    ends = np.append(0, np.searchsorted(step[order], steps, "right")).tolist()
-    rows = DECISIONS.check(rows.take(order))
-    yield from (rows[low:high] for low, high in pairwise(ends))
+    return rows_at(DECISIONS, rows.take(order), step[order], steps)
 
 
 class Joins(NamedTuple):

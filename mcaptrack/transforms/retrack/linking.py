@@ -105,14 +105,11 @@ def pairs_in_reach(ends: TrackEnds, max_gap_s: float) -> Iterator[tuple[Ints, In
         yield i[near], j[near], taken(gaps, near)
 
 
-def reach_m(gap_s: Floats) -> Floats:
-    """The distance that people walk within gaps (E,), at most."""
-    return np.asarray(_REACH_M + _MAX_SPEED_M_PER_S * gap_s)
-
-
 def are_in_reach(gaps: Gaps) -> Bools:
     """Whether people may get from the one side to the other within the gaps (E,)."""
-    return np.asarray(_length(gaps.before.mean[:, :2] - gaps.after.mean[:, :2]) <= reach_m(gaps.seconds))
+    return np.asarray(
+        _length(gaps.before.mean[:, :2] - gaps.after.mean[:, :2]) <= _REACH_M + _MAX_SPEED_M_PER_S * gaps.seconds
+    )
 
 
 def prior_shift(log_odds: Floats) -> float:

@@ -154,7 +154,9 @@ class _Steps(NamedTuple):
     @classmethod
     def of(cls, first: Ints) -> _Steps:
         """The steps of tracks that begin at these rows, (K + 1,)."""
-        order, alive = _by_length(first)
+        length = np.diff(first)
+        order = np.argsort(-length, kind="stable")
+        alive = np.searchsorted(-length[order], -np.arange(int(length.max(initial=0))), "left")
         step, place = group_index(alive), ragged_range(0, alive)
         forward = first[:-1][order][place] + step
         return cls(forward, first[1:][order][place] - 1 - step, [0, *np.cumsum(alive).tolist()])
@@ -326,15 +328,6 @@ def _smooth_back(model: MotionModel, states: StateRows, bounds: Sequence[int]) -
         cov[0] += g00**2 * dp + 2 * g00 * g01 * dc + g01**2 * dv
         cov[1] += g00 * g10 * dp + (g00 * g11 + g01 * g10) * dc + g01 * g11 * dv
         cov[2] += g10**2 * dp + 2 * g10 * g11 * dc + g11**2 * dv
-
-
-def _by_length(first: Ints) -> tuple[Ints, Ints]:
-    """Tracks from the longest to the shortest, and for each k how many of them have a row k."""
-    length = np.diff(first)
-    order = np.argsort(-length, kind="stable")
-    longest = int(length.max(initial=0))
-    alive = np.searchsorted(-length[order], -np.arange(longest), "left")
-    return order, alive
 
 
 def _filter(model: MotionModel, xy_m: Floats, noise_m: Floats, bounds: Sequence[int]) -> StateRows:
