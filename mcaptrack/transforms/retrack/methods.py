@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, repeat
 from types import MappingProxyType
@@ -36,7 +36,6 @@ from mcaptrack.transforms.retrack.options import (
 from mcaptrack.transforms.retrack.passes import (
     KeptIds,
     LikelihoodPass,
-    Movers,
     OnlinePass,
     at_pace_of_log,
     motion_model,
@@ -44,9 +43,6 @@ from mcaptrack.transforms.retrack.passes import (
     usual_score,
 )
 from mcaptrack.transforms.to_video_rate import steady_s, to_metres
-
-#: Makes the online pass of a method.
-NewPass = Callable[[Any, Movers, FrameColumns], OnlinePass]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +64,8 @@ class Retrack(LikelihoodOptions):
     {1}
     """
 
-    new_pass: ClassVar[NewPass] = LikelihoodPass
+    #: The class of its online pass.
+    new_pass: ClassVar[type[Any]] = LikelihoodPass
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         seen: list[AppearanceCalibration] = []
@@ -97,7 +94,7 @@ class RetrackByConsistency(ConsistencyOptions):
 
     #: Rows of people outside of the picture stay, as in the paper (see ``pipeline.visible``).
     keeps_unseen: ClassVar[bool] = True
-    new_pass: ClassVar[NewPass] = ConsistencyPass
+    new_pass: ClassVar[type[Any]] = ConsistencyPass
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         return _retrack(self, frames, [])
@@ -182,7 +179,7 @@ def _retracked(
 ) -> list[Iterable[Frame]]:
     """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    online = (KeptIds if movers.on_ground else options.new_pass)(options, movers, frames)
+    online: OnlinePass = (KeptIds if movers.on_ground else options.new_pass)(options, movers, frames)
     run = online
     if options.follows_speed and not movers.on_ground and (paced := at_pace_of_log(movers, frames)) != movers:
         movers, run = paced, options.new_pass(options, paced, frames)

@@ -148,7 +148,7 @@ def _rows(which: TrackRows, samples: FrameColumns) -> Rows:
     return rows
 
 
-class Log(NamedTuple):
+class WholeLog(NamedTuple):
     """A log that is decided about: the options, how what moves in it moves, and what was done online.
 
     ``model`` is in the unit of ``movers``. ``appearance`` and ``answers`` also tell which tracks are one person.
@@ -186,7 +186,7 @@ def offline_tracks(
     seen = Appearance.of(options.looks, tracks, model.step_s)
     calibration = seen and seen.calibration
     appearance = seen if calibration and calibration.tells_apart else None
-    log = Log(options, model, movers, run, appearance, Answers.of(options.answers, steps, times_ns))
+    log = WholeLog(options, model, movers, run, appearance, Answers.of(options.answers, steps, times_ns))
     empty = {"": TRACKS, "decisions": DECISIONS, APPEARANCE_OUTPUT: APPEARANCE, WORLDS_OUTPUT: WORLDS}
     out: dict[str, Iterator[Rows]] = {name: repeat(schema.empty(), len(steps)) for name, schema in empty.items()}
     if not len(tracks.step):
@@ -226,7 +226,7 @@ def _as_assigned(options: RetrackOptions, run: OnlinePass, movers: Movers) -> Tr
     return tracks if options.shares_samples else taken(tracks, np.unique(sample, return_index=True)[1])
 
 
-def _identified(log: Log, tracks: Tracks) -> Tracks:
+def _identified(log: WholeLog, tracks: Tracks) -> Tracks:
     """Tracks as they are decided to be, ordered by track and step."""
     options = log.options
     for _ in range(_SWEEPS if options.link_s > 0 else 0):
@@ -239,7 +239,7 @@ def _identified(log: Log, tracks: Tracks) -> Tracks:
     return taken(tracks, tracks.order)
 
 
-def hypotheses_of(log: Log, tracks: Tracks, is_final: bool = False) -> Hypotheses:
+def hypotheses_of(log: WholeLog, tracks: Tracks, is_final: bool = False) -> Hypotheses:
     """The hypotheses about identities in tracks, with what the log shows of their looks, and what was answered."""
     hypotheses = Hypotheses.of(log.model, tracks, log.max_gap_s, log.answers.joined(tracks))
     looks = np.zeros(len(hypotheses.before))
@@ -250,7 +250,7 @@ def hypotheses_of(log: Log, tracks: Tracks, is_final: bool = False) -> Hypothese
     return hypotheses._replace(evidence=hypotheses.evidence + looks)
 
 
-def _without_swaps(log: Log, tracks: Tracks) -> Tracks:
+def _without_swaps(log: WholeLog, tracks: Tracks) -> Tracks:
     """Undo swaps of tracks that met."""
     ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     seen = None if log.appearance is None else log.appearance.between(tracks)
@@ -258,7 +258,7 @@ def _without_swaps(log: Log, tracks: Tracks) -> Tracks:
     return tracks._replace(track=ids[owner[row]])
 
 
-def _people(log: Log, tracks: Tracks, rows: TrackRows, paths: Trajectories) -> tuple[Floats, Bools]:
+def _people(log: WholeLog, tracks: Tracks, rows: TrackRows, paths: Trajectories) -> tuple[Floats, Bools]:
     """The log odds (K,) that tracks are people, or what else moves, infinite for certain; and which are kept, (K,)."""
     options, movers, steps, ids = log.options, log.movers, log.run.steps, np.unique(tracks.track)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
@@ -298,7 +298,7 @@ def _are_short(of_row: Ints, is_sample: Bools, count: int, least: int) -> Bools:
     return np.asarray(np.where(seen < _SPARSE * length, longest, length) < least)
 
 
-def _worlds(log: Log, decided: Decided) -> Worlds:
+def _worlds(log: WholeLog, decided: Decided) -> Worlds:
     """The worlds of what was decided; those of each class have a seed of their own."""
     options, tracks, first = log.options, decided.tracks, decided.hypotheses.tracklets.first
     of_class = int(column(log.run.samples, "class_id")[0])

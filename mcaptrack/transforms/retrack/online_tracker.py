@@ -375,7 +375,7 @@ class OnlineTracker:
         is_lost[track] = False
         lost, confirmed = is_lost.nonzero()[0], is_confirmed[track].nonzero()[0]
         if not len(lost) or not len(confirmed):
-            return confirmed[:0]
+            return np.empty(0, np.int64)
         seen, expected = observed[:, confirmed], self.state.mean[:2, lost]
         distance_m, nearest = _nearest(expected, seen)
         is_near = distance_m < limits.merge_distance_m
@@ -393,7 +393,7 @@ class OnlineTracker:
         self.state.mean[:, lost], self.state.cov[:, lost] = state
         tracks[MISSED, lost] = np.maximum(tracks[MISSED, lost] - passed, 1)
         tracks[MERGED, lost] += passed
-        return host
+        return np.asarray(host)
 
     def _update(self, track: Ints, xy_m: Floats, source: Ints, occluder: Ints) -> None:
         """Update tracks (P,) with their observations (2, P); those of ``occluder`` are merged with others."""
