@@ -25,7 +25,7 @@ from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import Retrack, RetrackByConsistency, Sample
 from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors
-from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.motion_model import Tracks
 from tests.clothes import BLUE, RED, UNTIL_S, two_who_turn_back
 from tests.commands import call, done
 

@@ -13,10 +13,10 @@ import pytest
 import mcaptrack
 from mcaptrack import foxglove, log, tables
 from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline.steps import settle_classes
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import COCO, ClassMap, class_names
 from mcaptrack.transforms import PROFILES, ByteTrack, OcSort, Sort
-from mcaptrack.transforms.retrack.offline import settle_classes
 from tests.worlds import assert_same_rows, noisy_tracks, ns, table_to_frames
 
 TRACKERS = {"sort": Sort(), "metres apart": Sort(cost="pixels"), "bytetrack": ByteTrack(), "ocsort": OcSort()}

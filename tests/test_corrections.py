@@ -15,7 +15,7 @@ from mcaptrack.evaluation.corrections import Changes, compare
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.sources.corrections import fixed_ids, with_corrections, without_filled
 from mcaptrack.transforms import Retrack
-from mcaptrack.transforms.retrack.offline import fix_tracks
+from mcaptrack.transforms.retrack.decisions import fix_tracks
 from tests.test_offline_reference import tracks_of as assigned
 
 STEP_NS = 400_000_000

@@ -22,8 +22,8 @@ from mcaptrack.schema.frame_columns import FrameColumns, collect
 from mcaptrack.sources.ingest.labels.timeline import boxes_extent
 from mcaptrack.tables import build, rows
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack import identity_swaps, likelihood
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms.retrack import identity_swaps, passes
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers
 from tests.awaiting import until
 from tests.memory import held
 
@@ -55,9 +55,7 @@ def small_blocks(monkeypatch):
     monkeypatch.setattr(rows, "GROUP_ROWS", 256)
     monkeypatch.setattr(rows, "_BUFFER_BYTES", 2**10)
     monkeypatch.setattr(build, "PIECE_ROWS", 256)
-    monkeypatch.setattr(likelihood, "_BATCH", 128)
-    monkeypatch.setattr(likelihood, "_STEPS", 16)
-    monkeypatch.setattr(likelihood, "_SAMPLES", 256)
+    monkeypatch.setattr(passes, "_SAMPLES", 128)
     monkeypatch.setattr(identity_swaps, "_CELLS", 64)
 
 
@@ -66,10 +64,7 @@ def test_online_retracking_holds_numbers_of_each_sample_and_no_rows():
     """A row of tracks has 153 bytes, the predictions of a sample 840; what is held were rows once, ten times as much."""
 
     def online(frames: int) -> LikelihoodPass:
-        run = LikelihoodPass(Retrack(predictor="cv"))
-        for frame in walks(frames):
-            run.step(frame)
-        return run
+        return LikelihoodPass(Retrack(predictor="cv"), Movers(), collect(TRACKS, walks(frames)))
 
     online(10)  # what is imported, and made once
     short, long = (held(lambda frames=frames: online(frames))[0] for frames in (48, 144))

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from itertools import combinations, islice, permutations
+from itertools import combinations, permutations
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mcaptrack.geometry import assignment
 from mcaptrack.geometry.assignment import assign_by_gain, assign_pairs_by_gain
-from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import linking, motion_model
-from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses
 from mcaptrack.transforms.retrack.identity_swaps import compatible, find_swaps, resolve_swaps
-from mcaptrack.transforms.retrack.likelihood import InputNoise, LikelihoodPass
-from mcaptrack.transforms.retrack.motion_model import MotionModel, filtered, smooth, smooth_in_log, to_trajectories
-from mcaptrack.transforms.retrack.online_tracker import Association, OnlineTracker
+from mcaptrack.transforms.retrack.motion_model import (
+    MotionModel,
+    Tracks,
+    filtered,
+    smooth,
+    smooth_in_log,
+    to_trajectories,
+)
 from tests.memory import held
 from tests.references.hypotheses import Claim, Scene, gains_of, swept
 from tests.references.offline import DRIFTS, Motion, course_of, exchanged, smoothed_in_log, usual_by_gap
-from tests.references.online import Bends
-from tests.tiers import thorough
-from tools.corruptions import STEP_S, corrupt
-from tools.crowds import drawn
-from tools.reproduce import on_clock
 
 SEEDS = st.integers(0, 2**32 - 1)
 Paths = dict[int, dict[int, tuple[float, float]]]
@@ -141,9 +140,9 @@ def test_links_are_the_same_without_a_table_of_all_pairs_and_in_batches_of_any_s
     step, name, *xy = map(np.array, zip(*placed, strict=True))
     tracks = tracks_of(step, name, name, np.stack(xy, axis=-1))
     whole = Hypotheses.of(model, tracks, 20.0).scored().best(0.1)
-    for constant, value in (("_TABLE_CELLS", 1), ("_BATCH", int(rng.integers(1, 9)))):
+    for module, constant, value in ((assignment, "LARGE_TABLE", 1), (linking, "_BATCH", int(rng.integers(1, 9)))):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(linking, constant, value)
+            patch.setattr(module, constant, value)
             assert Hypotheses.of(model, tracks, 20.0).scored().best(0.1).tolist() == whole.tolist()
 
 
@@ -165,8 +164,8 @@ def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alon
     rows = np.repeat(np.arange(count), 3)
     pairs = rows, np.minimum(rows + np.tile([0, 1, 2], count), count - 1)
     gain = np.random.default_rng(0).uniform(0.1, 5, len(rows))
-    linking._assigned(pairs, gain, (count, count))
-    _, most = held(lambda: linking._assigned(pairs, gain, (count, count)))
+    linking.best_links(*pairs, gain, count)
+    _, most = held(lambda: linking.best_links(*pairs, gain, count))
     assert most < 2_000_000
 
 
@@ -282,72 +281,3 @@ def test_an_encounter_is_changed_unless_a_better_one_needs_its_track(met):
     assert allowed(met, found)
     for other in set(range(len(met))) - set(found):
         assert any(are_rivals(met[other], met[k]) and met[k][3] >= met[other][3] for k in found)
-
-
-# How much noise the tracks of the input allow for
-
-
-def observed(seed: int, steps: int, people: int, noise_m: float, missed: float = 0.1):
-    """Steps, those before each, and which of them, input ids and places of observations: people who walk and turn."""
-    rng = np.random.default_rng(seed)
-    step = np.cumsum(rng.choice([1, 1, 1, 4], steps)) - 1
-    speed = rng.normal(0, 0.4, (people, step[-1] + 1, 2)).cumsum(axis=1) * rng.choice([0.0, 0.3], (people, 1, 1))
-    at = speed.cumsum(axis=1) * STEP_S + rng.normal(0, noise_m, speed.shape)
-    place, source = np.nonzero(rng.random((steps, people)) > missed)
-    return step, np.diff(step, prepend=step[0] - 1), place, source, at[source, step[place]]
-
-
-@given(seed=st.integers(0, 2**32 - 1), noise_m=st.sampled_from([0.0, 0.1, 0.4, 1.0]), cut=st.integers(1, 59))
-@settings(max_examples=20)
-def test_the_limit_is_that_of_the_reference_however_many_steps_come_at_once(seed, noise_m, cut):
-    step, passed, place, source, xy = observed(seed, 60, 4, noise_m)
-    bends, wanted = Bends(STEP_S), []
-    for at, now in enumerate(step.tolist()):
-        here = zip(source[place == at].tolist(), xy[place == at].tolist(), strict=True)
-        wanted.append(bends.limit(now, [{"track_id": one, "x_m": x, "y_m": y} for one, (x, y) in here]))
-    noise, found = InputNoise(STEP_S), []
-    for low, high in ((0, cut), (cut, 60)):
-        part = (place >= low) & (place < high)
-        found += noise.most_m(passed[low:high], step[low:high], place[part] - low, source[part], xy[part])
-    assert found == pytest.approx(wanted)
-
-
-@thorough
-def test_people_merged_into_one_detection_are_not_taken_for_noise():
-    """In this synthetic crowd positions are off by 0.17 m; the estimate went to its highest value, 0.8 m."""
-    (truth, how) = next(islice(drawn(1, 150), 4, None))
-    assert how.noise_m == pytest.approx(0.173, abs=0.001)
-    rows = corrupt(truth, how, np.random.default_rng([1, 4, 2]))
-    clock = np.arange(int(truth[:, 0].min()), int(truth[:, 0].max()) + 1)
-    run = LikelihoodPass(PROFILES["default"])
-    for (frame,) in Sample(start_ns=round(clock[0] * STEP_S * 1e9))(on_clock(rows, clock)):
-        run.step(frame)
-    run.finish()
-    assert run.noise_m < 0.5
-
-
-def test_ids_of_any_size_give_the_same_limit():
-    """256 steps: with these ids, products of both wrap around."""
-    place, source = np.divmod(np.arange(256 * 20), 20)
-    at = 5.0 * source[:, None] + np.random.default_rng(3).normal(0, 0.4, (256 * 20, 2))
-    one, steps = np.ones(256, int), np.arange(256)
-    found = [InputNoise(STEP_S).most_m(one, steps, place, source * size, at) for size in (1, 2**56)]
-    assert found[0][-1] == pytest.approx(0.6, rel=0.1)
-    assert found[0] == found[1]
-
-
-def test_the_estimate_keeps_the_limit_at_once():
-    """Forty people jump about by metres: all of them are outside of their circles at the same step."""
-    tracker = OnlineTracker(
-        model=MotionModel(0.2, 1.5, 0.12, 0.08, STEP_S),
-        association=Association(same_id=12.0, same_id_crowded=4.0, merge_distance_m=0.0, merge_timeout_s=0.0),
-        max_age=5,
-        confirm_hits=2,
-        max_age_tentative=2,
-    )
-    home = 20.0 * np.stack(np.divmod(np.arange(40), 8)).astype(float)
-    for step in range(8):
-        tracker.step(home + (step % 2) * 0.9, np.arange(40), 1, most_noise_m=0.3)
-        assert tracker.noise_m <= 0.3
-    tracker.step(home, np.arange(40), 1)
-    assert tracker.noise_m > 0.3

@@ -11,16 +11,15 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.hull import GrowingHull
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Rows, framing
+from mcaptrack.schema.by_class import join_classes, split_classes
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Retrack
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, join_classes, movers_of, split_classes, usual_score
 from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_odds_in_log, stand_throughout
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
-from mcaptrack.transforms.retrack.methods import KeptIds
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
-from mcaptrack.transforms.retrack.online_tracker import GrowingHull
+from mcaptrack.transforms.retrack.passes import PEOPLE, KeptIds, LikelihoodPass, Movers, movers_of, usual_score
 from tests.commands import call
 from tests.logs import provenance_of
 from tests.references.false_tracks import log_odds_in_log as in_log
@@ -112,10 +111,8 @@ class TestFailuresOfThePaper:
 @pytest.mark.parametrize(("spread_m", "found_m"), [(0.0, 0.03), (4.0, 0.8)])
 def test_the_estimated_noise_has_limits(spread_m, found_m):
     rng = np.random.default_rng(2)
-    run = LikelihoodPass(DEFAULT)
-    for frame in walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250):
-        run.step(frame)
-    run.finish()
+    frames = walk(lambda n: {k: tuple([0.0, 900.0 * k] + rng.normal(0, spread_m, 2)) for k in range(9)}, 250)
+    run = LikelihoodPass(DEFAULT, PEOPLE, collect(TRACKS, frames))
     assert run.noise_m == pytest.approx(found_m)
 
 
@@ -301,15 +298,14 @@ def test_tracks_in_metres_keep_what_they_are_under_numbers_of_their_own(part_row
     frames = [Frame(ns(n / 2.5) + 3, n, rows_of(ids, [1] * len(ids))) for n, ids in zip(steps, seen, strict=True)]
     kept = KeptIds(Retrack(predictor="cv", noise_m=0.5), Movers(unit_m=2.0), collect(TRACKS, frames))
     assert kept.noise_m == 0.25
-    assert kept.steps == steps
+    assert kept.steps.tolist() == steps
     out = [(online.rows["source_id"].tolist(), online.rows["track_id"].tolist()) for online in kept.outputs()[0]]
     assert out == [([4, 9], [1, 2]), ([4, 9], [1, 2]), ([7], [3]), ([7, 9], [3, 2])]
     step, track, source, row = kept.assignments.of(kept.samples, kept.steps)
     assert step.tolist() == [0, 0, 1, 1, 3, 4, 4]
-    assert track.tolist() == [1, 2, 1, 2, 3, 3, 2]
-    assert source.tolist() == [4, 9, 4, 9, 7, 7, 9]
+    assert track.tolist() == [2, 1, 1, 2, 3, 2, 3]
+    assert source.tolist() == [one for ids in seen for one in ids]
     assert row.tolist() == [*range(7)]
-    assert kept.samples.column("track_id").tolist() == source.tolist()
 
 
 # Which online tracks are written: what the log said so far of how long tracks last, and where they were seen

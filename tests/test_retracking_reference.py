@@ -14,7 +14,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.predictors import make
 from mcaptrack.schema import Frame, Rows
 from mcaptrack.transforms import PROFILES, Predict, Retrack, RetrackByConsistency
-from mcaptrack.transforms.retrack import Retracking, likelihood
+from mcaptrack.transforms.retrack import Retracking, passes
 from tests.references.algorithm1 import Algorithm1
 from tests.references.online import OnlineTracker
 from tests.references.retracking import Undecided, constant_velocity
@@ -143,7 +143,7 @@ def test_the_likelihood_method_equals_the_reference(seed, chosen):
     make_frames = crossing_tracks if rng.random() < 0.3 else noisy_tracks
     frames = make_frames(rng, rate_hz=transform.rate_hz)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(likelihood, "_STEPS", int(rng.choice([1, 3, 256])))  # so many are written at once
+        patch.setattr(passes, "_SAMPLES", int(rng.choice([1, 9, 2**12])))  # so many are written at once
         compare(transform, frames, reference)
 
 
@@ -256,7 +256,7 @@ def test_online_links_equal_the_reference(seed, link_s, confidence):
     frames = noisy_tracks(rng, ticks=70, hidden=0.05) if scene == 0 else passers(rng, 4, 85, flickers=scene == 1)
     reference = OnlineTracker(transform, *black_box("cv", 5, 0.4))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(likelihood, "_STEPS", int(rng.choice([1, 7, 256])))
+        patch.setattr(passes, "_SAMPLES", int(rng.choice([1, 40, 2**12])))
         compare(transform, frames, reference)
 
 
@@ -268,7 +268,7 @@ def test_links_with_equal_odds_do_not_depend_on_how_many_steps_are_read_at_once(
             frame.rows[name] = 0.0
     wanted = [ids(frame) for frame in online(frames)]
     assert wanted != [ids(frame) for frame in online(frames, link_s=0.0)]
-    monkeypatch.setattr(likelihood, "_STEPS", 7)
+    monkeypatch.setattr(passes, "_SAMPLES", 7)
     assert [ids(frame) for frame in online(frames)] == wanted
 
 

@@ -18,7 +18,7 @@ from mcaptrack.predictors.weights import SHIPPED, Weights, load
 from mcaptrack.schema import Frame
 from mcaptrack.testing import LawError, check_predictor
 from mcaptrack.transforms import PROFILES, Predict
-from mcaptrack.transforms.retrack import likelihood
+from mcaptrack.transforms.retrack import passes
 from tests.worlds import ns, tracks_at
 
 STEPS = 12
@@ -110,7 +110,7 @@ class TestWhatPredictorsAreGiven:
     def test_retracking_gives_all_tracks_of_a_step_at_once(self, monkeypatch, profile):
         rng = np.random.default_rng(1)
         frames = [frame(n, {k: (0.4 * n, 2 * k + rng.normal(0, 0.05)) for k in range(5)}) for n in range(12)]
-        monkeypatch.setattr(likelihood, "_BATCH", 4)
+        monkeypatch.setattr(passes, "_SAMPLES", 4)
         list(replace(PROFILES[profile], predictor="tests.test_social:Watching")(frames))
         calls = [(xy_m, people) for xy_m, people in SEEN if len(xy_m)]
         for xy_m, people in calls:

@@ -12,9 +12,9 @@ from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame, framing
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.transforms.retrack.assignments import LogSamples
-from mcaptrack.transforms.retrack.offline import TrackRows, move_rows, rows_by_step
-from mcaptrack.transforms.to_video_rate import linked_tracks, mended_ends, to_video_rate
+from mcaptrack.transforms.retrack.offline import TrackRows, rows_by_step
+from mcaptrack.transforms.retrack.passes import column
+from mcaptrack.transforms.to_video_rate import linked_tracks, mended_ends, move_rows, to_video_rate
 from tests.worlds import ns
 
 
@@ -332,7 +332,7 @@ class Scene:
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         self.steps = np.cumsum(rng.integers(1, 3, 12)).tolist()
-        self.samples, self.rows, places = LogSamples(), [], []
+        frames, places = [], []
         self.assigned: dict[int, dict[int, int]] = {}  # the sample at each step of each track
         for step in self.steps:
             ids = rng.permutation(6)[: rng.integers(2, 7)]
@@ -343,12 +343,12 @@ class Scene:
                 width_m=[2.0] * count, height_m=[1.5] * count, vy_m_per_s=[0.0] * count,
                 **{name: rng.uniform(1, 90, count) for name in LINEAR},
             )  # fmt: skip
-            self.samples.add(Frame(ns(step / 2.5), step, rows))
+            frames.append(Frame(ns(step / 2.5), step, rows))
             for one in rng.permutation(count)[: rng.integers(0, 4)]:
                 track = int(rng.integers(1, 5))
                 self.assigned.setdefault(track, {}).setdefault(step, len(places) + int(one))
             places += [*rows]
-        self.rows = places
+        self.samples, self.rows = collect(TRACKS, frames), places
         pairs = [
             (track, step, row) for track, own in sorted(self.assigned.items()) for step, row in sorted(own.items())
         ]
@@ -398,7 +398,7 @@ def test_rows_between_samples_are_interpolated(seed: int, part_rows: int, monkey
         for row, one in zip(rows, wanted.get(step, []), strict=True):
             for name, value in one.items():
                 assert row[name] == pytest.approx(value, rel=1e-6, abs=1e-6), name
-    between = scene.track_rows.between(scene.samples.column("x_m"))
+    between = scene.track_rows.between(column(scene.samples, "x_m"))
     order = np.lexsort((scene.track_rows.track, scene.track_rows.step))
     np.testing.assert_allclose(between[order], [one["x_m"] for step in sorted(wanted) for one in wanted[step]])
     some = taken(scene.track_rows, slice(2, 6))
@@ -413,7 +413,7 @@ def test_boxes_of_rows_between_samples_move_with_their_positions_where_there_is_
     """By a metre along x and two along y, which are 10 and 20 px, and from the third second on 20 and 40 px."""
     scene = Scene(9)
     rows, wanted = scene.track_rows, scene.slowly()
-    at = np.stack([rows.between(scene.samples.column(name)) for name in ("x_m", "y_m")], axis=-1)
+    at = np.stack([rows.between(column(scene.samples, name)) for name in ("x_m", "y_m")], axis=-1)
     for step, some in enumerate(scene.by_step(at + [1.0, 2.0], planes)):
         for row, one in zip(some, wanted.get(step, []), strict=True):
             stays = not planes or row["source_id"] >= 0

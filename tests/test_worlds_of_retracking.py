@@ -19,7 +19,7 @@ from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, WORLDS, Frame
 from mcaptrack.transforms import Retrack
-from mcaptrack.transforms.retrack import offline, worlds
+from mcaptrack.transforms.retrack import decisions, offline
 from tests.commands import done
 from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks, write_channels
 
@@ -87,8 +87,8 @@ def test_each_sample_has_one_track_in_each_world_and_no_track_is_at_two_places_a
 def test_without_noise_a_world_is_what_was_decided(seed):
     frames = scene(seed)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worlds, "NOISE", 0.0)
-        patch.setattr(worlds, "PERSON_NOISE", 0.0)
+        patch.setattr(decisions, "NOISE", 0.0)
+        patch.setattr(decisions, "PERSON_NOISE", 0.0)
         made = outputs_of(frames, worlds=1)
     decided = {
         (frame.t_ns, int(row["source_id"])): int(row["track_id"])
@@ -110,9 +110,10 @@ def test_links_hold_in_as_many_worlds_as_are_likely():
     frames = scene(7)
     args = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(offline, "draw_worlds", lambda *given: args.append(given) or worlds.draw_worlds(*given))
+        patch.setattr(offline, "draw_worlds", lambda *given: args.append(given) or decisions.draw_worlds(*given))
         outputs_of(frames, worlds=1)
-    (_, hypotheses, *_), *_ = args
+    (_, decided, *_), *_ = args
+    hypotheses = decided.hypotheses
     tracklets = hypotheses.tracklets
     pair = hypotheses._replace(
         tracklets=tracklets._replace(
@@ -124,16 +125,16 @@ def test_links_hold_in_as_many_worlds_as_are_likely():
     count = 4000
     random = np.random.default_rng(5)
     for gain in (0.5, 1.0, 2.0):
-        drawn = np.stack(list(worlds.draw_links(count, pair, np.array([gain]))))
+        drawn = np.stack(list(decisions.draw_links(count, pair, np.array([gain]))))
         share = (drawn[:, 0] == drawn[:, 1]).mean()
-        noise = worlds.NOISE * (random.gumbel(size=(4, 200_000)) * [[1], [1], [-1], [-1]]).sum(axis=0) / 2
+        noise = decisions.NOISE * (random.gumbel(size=(4, 200_000)) * [[1], [1], [-1], [-1]]).sum(axis=0) / 2
         assert share == pytest.approx((gain + noise > 0).mean(), abs=0.03)
 
 
 def test_people_are_kept_in_as_many_worlds_as_is_likely():
     for probability in (0.2, 0.5, 0.8, 0.95):
         odds = np.log(probability / (1 - probability))
-        kept = np.array([worlds.draw_people(world, np.array([odds]))[0] > 0 for world in range(4000)])
+        kept = np.array([decisions.draw_people(world, np.array([odds]))[0] > 0 for world in range(4000)])
         assert kept.mean() == pytest.approx(probability, abs=0.03)
 
 

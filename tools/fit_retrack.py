@@ -38,17 +38,19 @@ from mcaptrack.evaluation.metrics import combine, score, summary
 from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.assignment import assign, solve
 from mcaptrack.geometry.ragged import find_rows
-from mcaptrack.schema import Frame
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
-from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.transforms.retrack.decisions import draw_worlds, find_joins
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.motion_model import Trajectories, filtered, to_trajectories
+from mcaptrack.transforms.retrack.motion_model import Tracks, Trajectories, filtered, to_trajectories
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers, motion_model
 from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
-from mcaptrack.transforms.retrack.worlds import draw_worlds
 
 DEFAULT = PROFILES["default"]
+#: The classes of gaps, as in ``hypotheses.GAPS_S``.
+GAP_NAMES: Final = ("next step", "up to 1.7 s", "up to 5 s", "longer")
 Found = TypeVar("Found")
 #: Who is who at encounters changes neither links nor how likely a track is, and takes longest.
 FITTED = replace(DEFAULT, resolve_swaps=False)
@@ -92,13 +94,8 @@ def prepare(truth: np.ndarray, made: np.ndarray) -> Run:
     clock = np.arange(int(truth[:, 0].min()), int(truth[:, 0].max()) + 1)
     true = on_clock(truth, clock)
     samples = [frame for (frame,) in Sample(start_ns=true[0].t_ns)(on_clock(made[:, :4], clock))]
-    run = LikelihoodPass(DEFAULT)
-    for frame in samples:
-        run.step(frame)
-    run.finish()
-    times = np.array([frame.t_ns for frame in samples])
-    model = motion_model(DEFAULT, run.noise_m)
-    return Run(true, samples, (DEFAULT, model, run.assignments, run.samples, run.steps, times), made)
+    run = LikelihoodPass(DEFAULT, Movers(), collect(TRACKS, samples))
+    return Run(true, samples, (DEFAULT, motion_model(DEFAULT, run.noise_m), run), made)
 
 
 class _Reached(Exception):
@@ -127,7 +124,7 @@ def owners(run: Run, step: np.ndarray, xy_m: np.ndarray, length: np.ndarray) -> 
     """The true id at each of the positions (N, 2), or -1; ``length`` is that of the track of each."""
     owner = np.full(len(step), -1)
     order = np.argsort(step, kind="stable")
-    where = dict(zip(run.args[4], run.true, strict=True))
+    where = dict(zip(run.args[2].steps.tolist(), run.true, strict=True))
     for here in np.split(order, np.flatnonzero(np.diff(step[order])) + 1):
         people = where[int(step[here[0]])].rows
         off = np.hypot(*(xy_m[here, None, k] - people[name] for k, name in enumerate(("x_m", "y_m"))))
@@ -182,7 +179,8 @@ class Pairs:
 
 def pairs_of(run: Run) -> Pairs:
     """The candidate links of a scene."""
-    model, tracks, *_ = reached("hypotheses_of", FITTED, *run.args[1:])
+    log, tracks = reached("hypotheses_of", FITTED, *run.args[1:])
+    model = log.model
     _, _, paths = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     first, last = paths.first[:-1], paths.first[1:] - 1
     forward, backward = filtered(model, paths)
@@ -232,8 +230,8 @@ class Judged(NamedTuple):
 
 def choices_of(run: Run) -> Chosen:
     """What the ends and beginnings of tracklets should choose in a scene."""
-    model, tracks, max_gap_s, *_ = reached("hypotheses_of", *run.args)
-    tracklets, before, after, _, gap, terms, leaves, comes, _ = Hypotheses.of(model, tracks, max_gap_s)
+    log, tracks = reached("hypotheses_of", *run.args)
+    tracklets, before, after, _, gap, terms, leaves, comes, _ = Hypotheses.of(log.model, tracks, log.max_gap_s)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
     same = np.flatnonzero((ends[before] >= 0) & (ends[before] == begins[after]))
     right = []
@@ -269,7 +267,7 @@ def decisions_of(run: Run) -> tuple[Judged, Judged, Judged]:
     decided, model, *_ = reached("decision_rows", *run.args)
     tracks, people = decided.tracks, run.people(decided.tracks)
     begins, ends = sides_of(tracks, decided.hypotheses.tracklets, people)
-    link = offline.find_joins(decided, model.step_s).link
+    link = find_joins(decided, model.step_s).link
     sides = np.stack([ends[decided.hypotheses.before[link]], begins[decided.hypotheses.after[link]]])
     counts = (sides >= 0).any(axis=0)
     joins = Judged(decided.hypotheses.scored().log_odds()[link][counts], (sides[0] == sides[1])[counts])
@@ -283,13 +281,12 @@ def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
     """In how many of 50 worlds each join of a scene holds, and which joins are right; and the number of people, the
     number that was decided, and those that 5 %, 50 % and 95 % of the worlds don't exceed.
     """
-    _, decided, least_steps, _ = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
+    log, decided = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
+    least_steps = round(log.least_s * DEFAULT.rate_hz)
     tracks, choices, tracklets = decided.tracks, decided.hypotheses, decided.hypotheses.tracklets
-    some_worlds = draw_worlds(
-        50, choices, tracks.track[tracklets.first], decided.log_odds, decided.kept, DEFAULT.link_confidence, least_steps
-    )
+    some_worlds = draw_worlds(50, decided, DEFAULT.link_confidence, least_steps)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
-    link = offline.find_joins(decided, run.args[1].step_s).link
+    link = find_joins(decided, run.args[1].step_s).link
     before, after = choices.before[link], choices.after[link]
     counts = (ends[before] >= 0) | (begins[after] >= 0)
     share = (some_worlds.track[:, before] == some_worlds.track[:, after]).mean(axis=0)
@@ -315,11 +312,11 @@ def fit_judged(names: tuple[str, ...], parts: Iterable[Judged]) -> dict[str, Any
 
 def fit_choices(parts: Sequence[Chosen]) -> dict[str, Any]:
     """The weights of what ends and beginnings choose."""
-    fitted = multinomial(parts, len(hypotheses.GAP_NAMES))
-    links = dict(zip(hypotheses.GAP_NAMES, fitted.links, strict=True))
-    ends, usual = hypotheses.END_TERMS, (*hypotheses.GAP_NAMES, "none")
+    fitted = multinomial(parts, len(GAP_NAMES))
+    links = dict(zip(GAP_NAMES, fitted.links, strict=True))
+    ends, usual = hypotheses.CHOICES.end_terms, (*GAP_NAMES, "none")
     return {
-        "links": {name: named(hypotheses.LINK_TERMS, weights) for name, weights in links.items()},
+        "links": {name: named(hypotheses.CHOICES.terms, weights) for name, weights in links.items()},
         "leaves": named(ends, fitted.leaves),
         "comes": named(ends, fitted.comes),
         "usual_leaves": named(usual, fitted.usual_leaves),
@@ -392,7 +389,7 @@ def held(seeds: list[int], steps: int) -> None:
     for run in runs(seeds, steps):
         outcomes.append(decisions_of(run))
         in_worlds.append(worlds_of(run))
-        rows = offline.offline_tracks(*run.args).tracks
+        rows = offline.offline_tracks(*run.args)[0][""]
         found = [frame._replace(rows=new) for frame, new in zip(run.samples, rows, strict=True)]
         for side, frames in zip(parts, (run.samples, found), strict=True):
             side.append(score(make_matchup(run.true, frames, "metres", GATE_M), "motmetrics"))
@@ -435,7 +432,7 @@ def main() -> None:
     linking._BY_GAP = np.array(links["usual by gap"])
     more = [*scenes, *runs(MORE, given.steps)]
     choices = fit_choices(list(told(choices_of, more, "choices")))
-    hypotheses.CHOICES = Choices.from_entry(choices, hypotheses.GAP_NAMES, hypotheses.LINK_TERMS, hypotheses.END_TERMS)
+    hypotheses.CHOICES = Choices.from_entry(choices)
     others = list(runs(JUDGED, JUDGED_STEPS))
     people = fit_people(list(told(people_of, more, "people")))
     install(false_tracks, "_PEOPLE", people)

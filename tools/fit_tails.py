@@ -17,6 +17,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -34,10 +35,12 @@ from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, Predictor, make, predict_among
 from mcaptrack.predictors.tail_calibration import TABLES, counts_of
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import JoinedFrames, join_frames
 from mcaptrack.sources.walks import walks
 from mcaptrack.transforms import PROFILES, Sample
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms import forecasts as made_by
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers
 
 STEPS, PAST = 12, 8
 #: People of a scene of walks, steps of each of their walks, and scenes and walks of a person in one draw.
@@ -113,10 +116,9 @@ def _keys(joined: JoinedFrames, start_ns: int) -> tuple[np.ndarray, np.ndarray]:
 def distances(true: Positions, samples: list[Frame]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """For each predictor squared distances (N, T), and groups (N,), from samples and after re-tracking."""
     start = samples[0].t_ns
-    run = LikelihoodPass(PROFILES["default"])
-    kept = run._forecasts._predictor = _Kept(run._forecasts._predictor)
-    for frame in samples:
-        run.step(frame)
+    with patch.object(made_by, "make", lambda *given: _Kept(make(*given))):
+        run = LikelihoodPass(PROFILES["default"], Movers(), collect(TRACKS, samples))
+    kept = run._forecasts._predictor
     online, forecasts = map(list, run.outputs())
     joined, predicted = join_frames(TRACKS, online), join_frames(PREDICTIONS, forecasts)
     tracked, is_first = _keys(joined, start), predicted.rows["step"] == 1

@@ -13,7 +13,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.mixtures import Tails
 from mcaptrack.predictors.tail_calibration import CENTRES, LEAST_WIDE, MOST_WIDE
-from mcaptrack.transforms.retrack.weights import Choices, probability
+from mcaptrack.transforms.retrack.weights import probability
 
 #: How strongly weights are drawn to 0, and how strongly those that groups have of their own (shares of right links).
 RIDGE, OWN_RIDGE = 1e-5, 1e-4
@@ -69,7 +69,17 @@ class Chosen(NamedTuple):
         return Chosen(*sides, *self[2:6], *right)
 
 
-def multinomial(scenes: Sequence[Chosen], classes: int, ridge: float = 1.0) -> Choices:
+class Fitted(NamedTuple):
+    """The weights of a multinomial logit, as in ``Choices``."""
+
+    links: Floats
+    leaves: Floats
+    comes: Floats
+    usual_leaves: Floats
+    usual_comes: Floats
+
+
+def multinomial(scenes: Sequence[Chosen], classes: int, ridge: float = 1.0) -> Fitted:
     """The weights under which what was chosen is likeliest (L-BFGS), and how often each class of links was."""
     from scipy.optimize import minimize
 
@@ -113,7 +123,7 @@ def multinomial(scenes: Sequence[Chosen], classes: int, ridge: float = 1.0) -> C
     for target in right:
         classes_of = np.where(target >= 0, gap[target], classes)[target >= -1]
         usual.append(np.bincount(classes_of, minlength=classes + 1) / len(classes_of))
-    return Choices(of_links.reshape(shape) / spread, leaves / scales[0], comes / scales[1], *usual)
+    return Fitted(of_links.reshape(shape) / spread, leaves / scales[0], comes / scales[1], *usual)
 
 
 def shift(log_odds: np.ndarray, right: np.ndarray, weight: np.ndarray) -> float:

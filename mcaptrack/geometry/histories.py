@@ -6,6 +6,7 @@ Letters: K tracks remembered, N tracks at one time, B batch, L past positions (t
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -141,3 +142,58 @@ def rebuild_positions(last_m: Floats, displacements: Floats) -> Floats:
     """Positions (K, L, 2) that end at ``last_m`` (K, 2), from the ``displacements`` (K, L - 1, 2) before it."""
     back = np.cumsum(displacements[:, ::-1], axis=1)[:, ::-1]
     return np.concatenate([last_m[:, None] - back, last_m[:, None]], axis=1)
+
+
+class SmoothedHistory(NamedTuple):
+    """The smoothed histories of K tracks, of constant size whatever their age.
+
+    ``last_m`` (K, 2) is the last observed position. ``level`` and ``trend`` (K, 2) are those of Holt's smoothing,
+    ``displacements`` (K, L - 1, 2) the last smoothed displacements, of which the last ``known`` (K,) exist.
+    """
+
+    last_m: Floats
+    level: Floats
+    trend: Floats
+    displacements: Floats
+    known: Ints
+
+    @classmethod
+    def of_observations(cls, holt: Holt, past_m: Floats, valid: Bools) -> SmoothedHistory:
+        """The smoothed histories of N observations: their pasts (N, L, 2) are ``valid`` (N, L) in a run up to now."""
+        count, length = valid.shape
+        history = cls(
+            past_m[:, -1],
+            np.zeros((count, 2)),
+            np.zeros((count, 2)),
+            np.zeros((count, length - 1, 2)),
+            np.zeros(count, int),
+        )
+        for step in range(1, length):
+            usable = valid[:, step] & valid[:, step - 1]
+            history = history._smoothed(holt, usable, past_m[:, step] - past_m[:, step - 1])
+        return history
+
+    def extended(self, holt: Holt, xy_m: Floats, steps: Ints) -> SmoothedHistory:
+        """With observations at ``xy_m`` (K, 2), ``steps`` (K,) after the last ones; gaps are interpolated linearly."""
+        displacement, history = (xy_m - self.last_m) / steps[:, None], self
+        for done in range(int(steps.max(initial=0))):
+            history = history._smoothed(holt, steps > done, displacement)
+        return history._replace(last_m=xy_m)
+
+    def _smoothed(self, holt: Holt, which: Bools, displacement: Floats) -> SmoothedHistory:
+        """Eq. 3 of the paper: smooth one more displacement (K, 2) of some tracks (K,)."""
+        started = (self.known > 0)[:, None]
+        first, flat = holt.start(displacement)
+        level, trend = holt.step(self.level, self.trend, displacement)
+        level = np.where(which[:, None], np.where(started, level, first), self.level)
+        trend = np.where(which[:, None], np.where(started, trend, flat), self.trend)
+        shifted = np.concatenate([self.displacements[:, 1:], level[:, None]], axis=1)
+        displacements = np.where(which[:, None, None], shifted, self.displacements)
+        known = np.where(which, np.minimum(self.known + 1, displacements.shape[1]), self.known)
+        return SmoothedHistory(self.last_m, level, trend, displacements, known)
+
+    def positions(self) -> tuple[Floats, Bools]:
+        """Past positions (K, L, 2), rebuilt from the smoothed displacements, and which of them are known (K, L)."""
+        length = self.displacements.shape[1] + 1
+        valid = np.arange(length) >= length - 1 - self.known[:, None]
+        return rebuild_positions(self.last_m, self.displacements), valid

@@ -29,10 +29,11 @@ from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_fo
 from mcaptrack.pipeline.scores import DOUBTFUL, score_map, score_range, without_doubtful
 from mcaptrack.pipeline.staleness import digest_of, takes_corrections
 from mcaptrack.pipeline.write import RunState
-from mcaptrack.schema import DECISIONS, TRACKS, VIDEO, Frame, Schema
+from mcaptrack.schema import DECISIONS, TRACKS, VIDEO, Frame, Rows, Schema
 from mcaptrack.schema.camera_motion import to_pictures, to_scene
+from mcaptrack.schema.classes import majority
 from mcaptrack.schema.frame_columns import collect
-from mcaptrack.schema.framing import frame_times, join_frames, row_ends
+from mcaptrack.schema.framing import JoinedFrames, frame_times, join_frames, joined_parts, mapped_rows, row_ends
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.cameras import camera_at
 from mcaptrack.sources.corrections import ANSWERS, corrections_of, fixed_ids, with_corrections, without_filled
@@ -40,7 +41,6 @@ from mcaptrack.sources.pictures import picture_size
 from mcaptrack.transforms import FULL, STAGES, Sample, Stage
 from mcaptrack.transforms.motion_limits import ClassNames, unknown_limits
 from mcaptrack.transforms.protocol import traits_of
-from mcaptrack.transforms.retrack.offline import settle_classes
 from mcaptrack.transforms.stages import StepAfter, StepBefore
 from mcaptrack.transforms.to_video_rate import linked_tracks, to_video_rate
 
@@ -398,6 +398,33 @@ CONTEXT: Final[Mapping[str, Callable[[Work], SideInput | None]]] = MappingProxyT
 
 
 # Steps after a transform.
+
+
+def settle_classes(frames: Sequence[Frame]) -> Sequence[Frame]:
+    """Give each track one class, that of most of its rows; of several, the one that it had first.
+
+    Warns of the tracks that have rows of several classes. Frames are unchanged if there are none.
+    """
+    columns = [joined.rows[["track_id", "class_id"]].copy() for _, _, joined in joined_parts(TRACKS, frames)]
+    if not columns:
+        return frames
+    rows = np.concatenate(columns)
+    ids, track = np.unique(rows["track_id"], return_inverse=True)
+    class_id = majority(track, rows["class_id"], len(ids))
+    changed = np.unique(track[rows["class_id"] != class_id[track]])
+    if not len(changed):
+        return frames
+
+    def settled(joined: JoinedFrames) -> Rows:
+        joined.rows["class_id"] = class_id[np.searchsorted(ids, joined.rows["track_id"])]
+        return joined.rows
+
+    warn(
+        f"{len(changed)} of {len(ids)} tracks have detections of several classes; each has the class of most of its "
+        "detections",
+        "classes",
+    )
+    return mapped_rows(TRACKS, frames, settled)
 
 
 def _with_one_class(work: Work) -> None:

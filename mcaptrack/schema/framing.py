@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -160,6 +161,13 @@ def thinned(frames: Sequence[Frame], rows: int) -> Sequence[Frame]:
     """Every second, third ... frame, as few as needed to have at most about so many rows; all if these are few."""
     every = -(-int(row_ends(frames)[-1]) // rows)
     return frames if every <= 1 else frames[::every]
+
+
+def rows_at(schema: Schema, rows: Rows, at: Ints, times: Ints) -> Iterator[Rows]:
+    """The rows (N,) of a schema at each of ``times``, rising; those at ``at`` (N,), rising, which are some of these."""
+    ends = np.append(0, np.searchsorted(at, times, "right")).tolist()
+    rows = schema.check(rows)
+    return (rows[low:high] for low, high in pairwise(ends))
 
 
 def split_rows(t_ns: Iterable[int], index: Iterable[int], rows: Rows, ends: ArrayLike) -> list[Frame]:

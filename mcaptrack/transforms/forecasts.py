@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -13,7 +14,7 @@ from mcaptrack.geometry.clocks import steps_passed
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, normal_tails
 from mcaptrack.geometry.ragged import run_starts
-from mcaptrack.predictors import Forecast, PeopleSeen, make, predict_among, uses_people
+from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, predict_together, uses_people
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.position_noise import PAST
 from mcaptrack.predictors.tail_calibration import TailCalibration
@@ -251,3 +252,68 @@ def _with_rest(
     cov = p * rest[:, :, None, None] * np.eye(2) + q * forecast.cov
     cov += p * q * off[..., :, None] * off[..., None, :]
     return Forecast(now[:, None] + q[..., 0] * off, cov)
+
+
+# Predictions of online tracks, made for many tracks at once and calibrated step by step.
+#
+# Letters: R rows of online tracks, L past positions.
+
+
+#: The number of tracks in a product of matrices: of larger ones threads would only wait for each other.
+_BLOCK: Final = 32
+
+
+class Unpredicted(NamedTuple):
+    """Tracks without predictions yet: ids, past positions (R, L, 2), which are known, whether tracks coast, steps."""
+
+    ids: Ints
+    past: Floats
+    known: Bools
+    coasts: Bools
+    step: Ints
+
+
+class OnlineForecasts:
+    """Predictions of the tracks of some frames at a time."""
+
+    def __init__(self, predictor: str, horizon_s: float, rate_hz: float, adapt: bool, unit_m: float) -> None:
+        self._name, self._unit_m = predictor, unit_m
+        self._predictor: Predictor = make(predictor, max(1, round(horizon_s * rate_hz)), 1 / rate_hz)
+        self._calibration = TailCalibration.of(predictor, self._predictor, adapt)
+        self._out = FrameCollector(PREDICTIONS)
+
+    @property
+    def past(self) -> int:
+        """The number of past positions that predictions are made from."""
+        return self._predictor.past
+
+    def add(self, t_ns: Ints, numbers: Ints, ends: Ints, tracks: Unpredicted) -> None:
+        """Predict the tracks of frames, ``ends[f]`` to ``ends[f + 1]`` of frame f."""
+        mean, cov = self._forecast(tracks.past / self._unit_m, tracks.known, tracks.step)
+        forecast, tails = Forecast(mean * self._unit_m, cov * self._unit_m**2), None
+        if self._calibration is not None:  # by the predictions of the steps before
+            forecast, tails = self._calibration(tracks.step, tracks.ids, forecast, tracks.past, tracks.coasts)
+        rows = forecast_to_rows(tracks.ids, forecast, self._predictor.step_s, tails)
+        self._out.extend(t_ns, numbers, ends * self._predictor.steps, rows)
+
+    def done(self) -> FrameColumns:
+        """The predictions; nothing can be added any more."""
+        if self._calibration is not None:
+            self._calibration.warn(self._name)
+        return self._out.done()
+
+    def _forecast(self, past: Floats, is_known: Bools, steps: Ints) -> Forecast:
+        """The forecasts of tracks, step by step if the predictor looks at others.
+
+        The last digits of a product of matrices depend on their size: all blocks have the same, the last one by
+        repeating its last track, so that forecasts don't depend on later tracks.
+        """
+        count = len(steps)
+        if uses_people(self._predictor):
+            bounds = pairwise([*np.flatnonzero(run_starts(steps)), count])
+            parts = [predict_together(self._predictor, past[low:high], is_known[low:high]) for low, high in bounds]
+        else:
+            blocks = np.minimum(np.arange(count + -count % _BLOCK), count - 1).reshape(-1, _BLOCK)
+            parts = [self._predictor.predict(past[rows], is_known[rows]) for rows in blocks]
+        nothing = Forecast(np.empty((0, self._predictor.steps, 2)), np.empty((0, self._predictor.steps, 2, 2)))
+        return Forecast(*(np.concatenate(part)[:count] for part in zip(nothing, *parts, strict=True)))

@@ -404,3 +404,20 @@ def to_metres(rows: Rows, t_ns: Ints, planes: Planes) -> None:
         plane = plane_at(planes, int(t_ns[here[0]]))
         if plane is not None:
             rows["x_m"][here], rows["y_m"][here] = plane.boxes_to_metres(columns_to_boxes(rows[here])).T
+
+
+def move_rows(rows: Rows, xy_m: Floats, planes: Planes, t_ns: Ints) -> Rows:
+    """Move rows (R,) to other positions (R, 2), and their boxes with them if there is a ground plane at their times."""
+    out = rows.copy()
+    which = np.maximum(np.searchsorted([since_ns for since_ns, _ in planes], t_ns, side="right") - 1, 0)
+    for number in np.unique(which).tolist() if planes else ():
+        plane, here = planes[number][1], which == number
+        before, size_px = rows[here], columns_to_boxes(rows[here])[:, 2:]
+        from_m = np.stack([before["x_m"], before["y_m"]], axis=-1)
+        shift_px = plane.standing_boxes(xy_m[here], size_px) - plane.standing_boxes(from_m, size_px)
+        out["x_px"][here], out["y_px"][here] = (
+            before[name] + np.where(np.isfinite(shift_px).all(axis=1), shift_px[:, axis], 0.0)
+            for axis, name in enumerate(("x_px", "y_px"))
+        )
+    out["x_m"], out["y_m"] = xy_m.T
+    return out

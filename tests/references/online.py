@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from math import exp, floor, hypot, inf, log, log10, pi, sqrt
+from math import exp, hypot, log, pi
 
 import numpy as np
 
@@ -251,46 +251,6 @@ def log_density(off: np.ndarray, variance: float) -> float:
     return float(-(off**2).sum() / variance / 2 - log(2 * pi * variance))
 
 
-class Bends:
-    """How much tracks of the input bend: they can't have much more noise than that."""
-
-    def __init__(self, step_s: float) -> None:
-        self.step_s = step_s
-        self.places: dict[tuple[int, int], np.ndarray] = {}
-        self.found: list[tuple[int, int, int]] = []  # lag, step, and the sixteenth of a power of ten of the square
-
-    def limit(self, step: int, rows: list[Row]) -> float:
-        """The most that noise may be at a step with these observations."""
-        for row in rows:
-            name, here = row["track_id"], place(row)
-            self.places[name, step] = here
-            for lag in (1, 2, 3):
-                one, other = (self.places.get((name, step - back)) for back in (lag, 2 * lag))
-                if one is not None and other is not None:
-                    squared = max(((here - 2 * one + other) ** 2).sum(), 1e-8)
-                    self.found.append((lag, step, floor((log10(squared) + 8) * 16)))
-        variances = [self.variance(lag, step) for lag in (1, 2, 3)]
-        known = [one for one in variances if one is not None]
-        return max(1.5 * sqrt(max(known)), 0.3) if known else inf
-
-    def variance(self, lag: int, step: int) -> float | None:
-        """That of white noise with such bends: half of the squares are below the median, those of a minute ago count 1 / e."""
-        counts: dict[int, float] = {}
-        for of, then, level in self.found:
-            if of == lag:
-                counts[level] = counts.get(level, 0.0) + exp(-(step - then) * self.step_s / 60)
-        total = sum(counts.values())
-        if total < 30:
-            return None
-        below = 0.0
-        for level in sorted(counts):
-            if below + counts[level] >= total / 2:
-                power = (level + (total / 2 - below) / counts[level]) / 16 - 8
-                return 10**power / (12 * log(2))
-            below += counts[level]
-        raise AssertionError
-
-
 class OnlineTracker:
     CAP, GATE, CROWD_M, FRESH, FLOOR_M = 26.0, 40.0, 1.7, 4.0, 0.1
     WIDE, MERGED = 0.1, 4.0
@@ -314,16 +274,12 @@ class OnlineTracker:
         online, predictions = [], []
         places: dict[tuple[int, int], Point] = {}
         lives = Lives(self.confirm, self.max_age)
-        bends = Bends(1 / o.rate_hz)
         losses = Losses()
         motion = Motion(self.noise_m, max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
         returns = Returns(motion, o, self.confirm)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
             passed = step - steps[at - 1] if at else 1
             seen = sorted((r for r in rows if r["observed"] or o.interpolated), key=lambda row: row["track_id"])
-            if o.noise_m is None:
-                self.most_noise_m = bends.limit(step, seen)
-                self.noise_m = min(self.noise_m, self.most_noise_m)
             has = self.step(seen, passed)
             now = {
                 one.name: (one.hits, 0 if one.name in has else one.missed, lives.is_outside(one.here))
@@ -472,4 +428,4 @@ class OnlineTracker:
             self.judged += len(outside)
             rate = max(0.01, 5 / (self.judged + 50))
             change = rate * sum(out - self.WIDE for out in outside)
-            self.noise_m = min(max(exp(log(noise_m) + change), 0.03), 0.8, self.most_noise_m)
+            self.noise_m = min(max(exp(log(noise_m) + change), 0.03), 0.8)

@@ -139,16 +139,14 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         paths = {}
         for track, (_, step, row) in zip(swept(motion, held, o.link_s, o.link_confidence), places, strict=True):
             paths.setdefault(track, {})[step] = row
-    for _ in range(5 if o.resolve_swaps else 0):
+    if o.resolve_swaps:
         ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
-        owner, count = exchanged(motion, places_of(paths), ids)
+        owner, _ = exchanged(motion, places_of(paths), ids)
         changed: dict[int, dict[int, Row]] = {}
         for track, path in paths.items():
             for step, row in path.items():
                 changed.setdefault(owner[track][step], {})[step] = row
         paths = changed
-        if not count:
-            break
     tracks = {track: filled(path, track) for track, path in paths.items()}
     smoothed = smoothed_in_log(motion, places_of(paths), o.noise_m is not None) if paths else {}
     odds = {

@@ -17,16 +17,15 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent))
 from reproduce import scenes
 
-from mcaptrack.schema import Frame
+from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Predict, Retrack
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass
+from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers
 
 
 def online(samples: list[Frame]) -> None:
     """Online tracks and their predictions only."""
-    run = LikelihoodPass(Retrack())
-    for frame in samples:
-        run.step(frame)
+    run = LikelihoodPass(Retrack(), Movers(), collect(TRACKS, samples))
     for _ in zip(*run.outputs(), strict=True):
         pass
 

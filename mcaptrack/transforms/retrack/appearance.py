@@ -15,8 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.clocks import NS_PER_S
+from mcaptrack.geometry.colour_histograms import BINS, mean_shares
 from mcaptrack.geometry.ragged import find_rows, group_index, ragged_range, run_starts
-from mcaptrack.transforms.retrack.assignments import Tracks
+from mcaptrack.schema import APPEARANCE, BodyPart, Rows
+from mcaptrack.schema.framing import rows_at
+from mcaptrack.transforms.retrack.motion_model import Tracks
 
 #: The log likelihood ratio that the end of one track and the beginning of another are one person, for pairs of tracks
 #: (E,) that are numbered by ascending id.
@@ -128,16 +132,18 @@ def usual_distance(values: NDArray[np.uint8], mine: Ints, is_one: Bools, other: 
 
     A pole before a person changes one descriptor, and a mean with it; most pairs stay as they are.
     """
-    a, b = values[mine] / np.float32(255), values[other] / np.float32(255)
-    squared = np.square(a).sum(2)[:, :, None] + np.square(b).sum(2)[:, None] - 2 * (a @ b.swapaxes(1, 2))
-    squared = np.where(is_one[:, :, None] & is_other[:, None], squared, np.inf).reshape(
-        len(mine), mine.shape[1] * other.shape[1]
-    )
-    squared.sort(axis=1)
-    count = is_one.sum(axis=1) * is_other.sum(axis=1)
-    at = np.floor(_QUANTILE * np.maximum(count - 1, 0)).astype(np.int64)
-    distances = squared[np.arange(len(mine)), at]
-    return np.where(np.isfinite(distances), np.maximum(distances, 0), 0).astype(np.float64)
+    out = np.zeros(len(mine))
+    for low in range(0, len(mine), BATCH):
+        here = slice(low, low + BATCH)
+        a, b = values[mine[here]] / np.float32(255), values[other[here]] / np.float32(255)
+        squared = np.square(a).sum(2)[:, :, None] + np.square(b).sum(2)[:, None] - 2 * (a @ b.swapaxes(1, 2))
+        squared = np.where(is_one[here, :, None] & is_other[here, None], squared, np.inf).reshape(len(a), -1)
+        squared.sort(axis=1)
+        count = is_one[here].sum(axis=1) * is_other[here].sum(axis=1)
+        at = np.floor(_QUANTILE * np.maximum(count - 1, 0)).astype(np.int64)
+        distances = squared[np.arange(len(a)), at]
+        out[here] = np.where(np.isfinite(distances), np.maximum(distances, 0), 0)
+    return out
 
 
 class _Blocks(NamedTuple):
@@ -166,15 +172,8 @@ def calibrate(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> Appea
     if len(tracks.look) < 2:
         return None
     blocks, noise = _blocks(values, tracks, step_s)
-    which, has = blocks.which, blocks.has
-    parts = [
-        (part, usual_distance(values, which[part.before], has[part.before], which[part.after], has[part.after]))
-        for part in _pairs(blocks, step_s)
-    ]
-    if not parts:
-        return None
-    pairs = _Pairs(*(np.concatenate([getattr(part, name) for part, _ in parts]) for name in _Pairs._fields))
-    distance = np.concatenate([distances for _, distances in parts])
+    which, has, pairs = blocks.which, blocks.has, _pairs(blocks, step_s)
+    distance = usual_distance(values, which[pairs.before], has[pairs.before], which[pairs.after], has[pairs.after])
     lag = np.searchsorted(_LAGS_S, pairs.gap_s, "right") - 1
     is_same = blocks.track[pairs.before] == blocks.track[pairs.after]
     count = len(np.unique(blocks.track[pairs.before[is_same]]))
@@ -243,28 +242,21 @@ def _fewer(blocks: _Blocks, step_s: float) -> _Blocks:
     starts = run_starts(stretch[inside])
     number = np.arange(len(inside)) - np.flatnonzero(starts)[np.cumsum(starts) - 1]
     kept = np.sort(inside[number < _MAX_BLOCKS // _STRETCHES])
-    return _Blocks(*(values[kept] for values in blocks))
+    return taken(blocks, kept)
 
 
-def _pairs(blocks: _Blocks, step_s: float) -> Iterator[_Pairs]:
+def _pairs(blocks: _Blocks, step_s: float) -> _Pairs:
     """Pairs of successive blocks: of one track, or of two tracks that exist at the same time within reach."""
     order = np.argsort(blocks.first, kind="stable")
     begins = blocks.first[order]
     low = np.searchsorted(begins, blocks.last, "right")
     many = np.searchsorted(begins, blocks.last + round(_LONGEST_S / step_s), "right") - low
-    part = np.cumsum(many) // BATCH
-    for number in np.unique(part).tolist():
-        own = np.flatnonzero(part == number)
-        before = own[group_index(many[own])]
-        after = order[ragged_range(low[own], many[own])]
-        gap_s = np.asarray((blocks.first[after] - blocks.last[before]) * step_s, np.float64)
-        way = blocks.from_m[after] - blocks.to_m[before]
-        meet = np.minimum(blocks.ends[before], blocks.ends[after]) > np.maximum(
-            blocks.begins[before], blocks.begins[after]
-        )
-        meet &= np.hypot(way[:, 0], way[:, 1]) <= _REACH_M + _SPEED_M_PER_S * gap_s
-        kept = meet | (blocks.track[before] == blocks.track[after])
-        yield _Pairs(before[kept], after[kept], gap_s[kept])
+    before, after = group_index(many), order[ragged_range(low, many)]
+    gap_s = np.asarray((blocks.first[after] - blocks.last[before]) * step_s, np.float64)
+    way = blocks.from_m[after] - blocks.to_m[before]
+    meet = np.minimum(blocks.ends[before], blocks.ends[after]) > np.maximum(blocks.begins[before], blocks.begins[after])
+    meet &= np.hypot(way[:, 0], way[:, 1]) <= _REACH_M + _SPEED_M_PER_S * gap_s
+    return taken(_Pairs(before, after, gap_s), meet | (blocks.track[before] == blocks.track[after]))
 
 
 def _drift(beyond: Floats, lag: Ints, track: Ints, is_same: Bools, noise: float) -> Floats:
@@ -372,13 +364,6 @@ class Sides:
 
     def _compare(self, left: Ints, end: Ints, right: Ints, begin: Ints) -> Floats:
         """The log likelihood ratio (E,) that ``left`` up to ``end`` and ``right`` from ``begin`` on are one person."""
-        ratio = np.zeros(len(left))
-        for low in range(0, len(left), BATCH):
-            part = slice(low, low + BATCH)
-            ratio[part] = self._ratio(left[part], end[part], right[part], begin[part])
-        return ratio
-
-    def _ratio(self, left: Ints, end: Ints, right: Ints, begin: Ints) -> Floats:
         if len(self._seen) == 0:
             return np.zeros(len(left))
         low, high = self._known[self._starts[left]], self._known[end]
@@ -398,3 +383,37 @@ class Sides:
         step = self._seen[places]
         inside &= np.abs(step - step[:, :1]) * self._step_s <= WITHIN_S
         return self._which[places], inside, step[:, 0]
+
+
+# The appearance of tracks as rows: the mean histograms of the pictures in which they are seen clearly.
+#
+# Letters: S descriptors, T frames, K tracks.
+
+
+def appearance_rows(descriptors: Descriptors, track: Ints, times_ns: Ints) -> Iterator[Rows]:
+    """The rows of Appearance at each of ``times_ns`` (T,), ordered by track and part of the body.
+
+    ``track`` (S,) is the track that each descriptor is of, or -1. The rows of a track stand at the last of its
+    descriptors that count, which is at one of the times; a track without any has none.
+    """
+    used = np.flatnonzero(descriptors.is_clear & (track >= 0))
+    ids, group = np.unique(track[used], return_inverse=True)
+    t_ns = descriptors.t_ns[used]
+    first, last = np.full(len(ids), np.iinfo(np.int64).max), np.zeros(len(ids), np.int64)
+    np.minimum.at(first, group, t_ns)
+    np.maximum.at(last, group, t_ns)
+    rows = APPEARANCE.empty(len(ids) * len(BodyPart))
+    of_parts = {
+        "track_id": ids,
+        "pictures": np.bincount(group, minlength=len(ids)),
+        "duration_s": (last - first) / NS_PER_S,
+    }
+    for name, values in of_parts.items():
+        rows[name] = np.repeat(values, len(BodyPart))
+    rows["body_part"] = np.tile(list(BodyPart), len(ids))
+    shares = mean_shares(descriptors.values[used], group, len(ids)).reshape(len(rows), len(BINS))
+    for name, share in zip(BINS, shares.T, strict=True):
+        rows[name] = share
+    at = np.repeat(last, len(BodyPart))
+    order = np.argsort(at, kind="stable")
+    return rows_at(APPEARANCE, rows.take(order), at[order], times_ns)

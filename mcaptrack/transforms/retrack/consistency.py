@@ -9,89 +9,25 @@ Letters: K tracks, N observations, L past positions, T predicted steps.
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints, joined, taken
 from mcaptrack.geometry.assignment import assign
-from mcaptrack.geometry.histories import Histories, Holt, rebuild_positions
+from mcaptrack.geometry.histories import Histories, Holt, SmoothedHistory
+from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import Forecast, Predictor, make, predict_together
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.predictions import forecast_to_rows
-from mcaptrack.transforms.retrack.assignments import PEOPLE, Movers, OnlinePass
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
-from mcaptrack.transforms.retrack.options import (
-    ConsistencyOptions,
-    metric_distances,
-    position_distances,
-    prediction_distances,
-)
+from mcaptrack.transforms.retrack.options import ConsistencyOptions
+from mcaptrack.transforms.retrack.passes import Movers, OnlinePass
 
 #: Cost of a pair with priority: lower than any sum of other costs.
 _PRIORITY_COST: Final = -100.0
-
-
-# The active tracks of Algorithm 1 as arrays, one element per track, and their smoothed histories.
-#
-# Letters: K tracks, N observations, L past positions that the predictor looks at.
-
-
-class SmoothedHistory(NamedTuple):
-    """The smoothed histories of K tracks, of constant size whatever their age.
-
-    ``last_m`` (K, 2) is the last observed position. ``level`` and ``trend`` (K, 2) are those of Holt's smoothing,
-    ``displacements`` (K, L - 1, 2) the last smoothed displacements, of which the last ``known`` (K,) exist.
-    """
-
-    last_m: Floats
-    level: Floats
-    trend: Floats
-    displacements: Floats
-    known: Ints
-
-    @classmethod
-    def of_observations(cls, holt: Holt, past_m: Floats, valid: Bools) -> SmoothedHistory:
-        """The smoothed histories of N observations: their pasts (N, L, 2) are ``valid`` (N, L) in a run up to now."""
-        count, length = valid.shape
-        history = cls(
-            past_m[:, -1],
-            np.zeros((count, 2)),
-            np.zeros((count, 2)),
-            np.zeros((count, length - 1, 2)),
-            np.zeros(count, int),
-        )
-        for step in range(1, length):
-            usable = valid[:, step] & valid[:, step - 1]
-            history = history._smoothed(holt, usable, past_m[:, step] - past_m[:, step - 1])
-        return history
-
-    def extended(self, holt: Holt, xy_m: Floats, steps: Ints) -> SmoothedHistory:
-        """With observations at ``xy_m`` (K, 2), ``steps`` (K,) after the last ones; gaps are interpolated linearly."""
-        displacement, history = (xy_m - self.last_m) / steps[:, None], self
-        for done in range(int(steps.max(initial=0))):
-            history = history._smoothed(holt, steps > done, displacement)
-        return history._replace(last_m=xy_m)
-
-    def _smoothed(self, holt: Holt, which: Bools, displacement: Floats) -> SmoothedHistory:
-        """Eq. 3 of the paper: smooth one more displacement (K, 2) of some tracks (K,)."""
-        started = (self.known > 0)[:, None]
-        first, flat = holt.start(displacement)
-        level, trend = holt.step(self.level, self.trend, displacement)
-        level = np.where(which[:, None], np.where(started, level, first), self.level)
-        trend = np.where(which[:, None], np.where(started, trend, flat), self.trend)
-        shifted = np.concatenate([self.displacements[:, 1:], level[:, None]], axis=1)
-        displacements = np.where(which[:, None, None], shifted, self.displacements)
-        known = np.where(which, np.minimum(self.known + 1, displacements.shape[1]), self.known)
-        return SmoothedHistory(self.last_m, level, trend, displacements, known)
-
-    def positions(self) -> tuple[Floats, Bools]:
-        """Past positions (K, L, 2), rebuilt from the smoothed displacements, and which of them are known (K, L)."""
-        length = self.displacements.shape[1] + 1
-        valid = np.arange(length) >= length - 1 - self.known[:, None]
-        return rebuild_positions(self.last_m, self.displacements), valid
 
 
 class ActiveTracks(NamedTuple):
@@ -120,7 +56,7 @@ class ActiveTracks(NamedTuple):
 class ConsistencyPass(OnlinePass):
     """Algorithm 1 over one log."""
 
-    def __init__(self, options: ConsistencyOptions, movers: Movers = PEOPLE) -> None:
+    def __init__(self, options: ConsistencyOptions, _: Movers, frames: FrameColumns) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
         if horizon == 1 and options.distance != "now":
             raise McaptrackError(
@@ -128,7 +64,7 @@ class ConsistencyPass(OnlinePass):
                 f'"{options.distance}" compares predictions of one time made at different steps, which takes '
                 f'{2 / options.rate_hz:g} s at least; the distance "now" needs one step'
             )
-        super().__init__(options.rate_hz, options.bridged_s)
+        super().__init__(frames, options.rate_hz, options.bridged_s)
         self._options = options
         self._predictor: Predictor = make(options.predictor, horizon, 1 / options.rate_hz)
         self._holt = Holt(options.alpha, options.beta)
@@ -138,13 +74,11 @@ class ConsistencyPass(OnlinePass):
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
         self._online = FrameCollector(TRACKS), FrameCollector(PREDICTIONS)
         self._next_id = 1
+        for frame, step, passed in zip(frames, self.steps.tolist(), self.passed.tolist(), strict=True):
+            self._step(frame, step, passed)
 
-    def step(self, frame: Frame) -> None:
+    def _step(self, frame: Frame, step: int, passed: int) -> None:
         """One step: associate, update, age, start and terminate tracks."""
-        passed = self.advance(frame.t_ns)
-        step = self.steps[-1]
-        self.samples.add(frame)
-
         sources = frame.rows["track_id"]
         past, valid = self._histories.push(sources, np.stack([frame.rows["x_m"], frame.rows["y_m"]], axis=-1), passed)
         usable = valid[:, -self._options.min_history :].all(axis=1)
@@ -235,3 +169,75 @@ class ConsistencyPass(OnlinePass):
         prediction = taken(self._tracks.prediction, at)
         predictions = forecast_to_rows(rows["track_id"], prediction, self._predictor.step_s)
         return Frame(frame.t_ns, frame.index, rows), Frame(frame.t_ns, frame.index, predictions)
+
+
+# Distances between tracks and observations, by comparing their predictions (Eq. 1 and 2 of the paper).
+#
+# Letters: K tracks, N observations, T predicted steps.
+
+
+def mahalanobis(off: Floats, cov: Floats) -> Floats:
+    """Eq. 1: the lengths of ``off`` (..., 2) in standard deviations of ``cov`` (..., 2, 2)."""
+    return np.asarray(np.sqrt(np.maximum(mahalanobis_squared(off, cov), 0.0)))
+
+
+def paper_covariance(first: Ints, steps: int, sigma_m: float) -> Floats:
+    """The paper's covariance, (u - t) sigma^2 per axis, for ``steps`` steps u from t + ``first``; (K, steps, 2, 2)."""
+    ahead = first[:, None] + np.arange(steps)
+    return ahead[:, :, None, None] * (sigma_m**2 * np.eye(2))
+
+
+def prediction_distances(
+    tracks: Forecast, age: Ints, observations: Forecast, kind: Literal["mean", "max", "first"], sigma_m: float | None
+) -> Floats:
+    """Distances (K, N) between predictions of tracks, made ``age`` (K,) steps ago, and of observations, made now.
+
+    Eq. 2 averages over the steps that both predict ("mean"); the authors' program takes the largest ("max"); "first"
+    takes the first of them alone. ``sigma_m`` uses the paper's covariance, None that of the predictions. Infinite where
+    no steps overlap.
+    """
+    horizon = observations.mean.shape[1]
+    steps = 1 if kind == "first" else max(horizon - int(age.min(initial=horizon)), 0)
+    at = age[:, None] + np.arange(steps)  # step of the track's prediction that belongs to each overlapping step
+    overlaps = at < horizon
+    at = np.minimum(at, horizon - 1)
+    row = np.arange(len(age))[:, None]
+    if sigma_m is None:
+        track_cov, observation_cov = tracks.cov[row, at], observations.cov[:, :steps]
+    else:
+        track_cov = paper_covariance(age + 1, steps, sigma_m)
+        observation_cov = paper_covariance(np.ones(len(observations.mean), np.int64), steps, sigma_m)
+    off = tracks.mean[row, at][:, None] - observations.mean[None, :, :steps]
+    distance = mahalanobis(off, track_cov[:, None] + observation_cov[None])
+    counted = np.broadcast_to(overlaps[:, None], distance.shape)
+    if kind == "mean":
+        total = np.where(counted, distance, 0.0).sum(axis=-1)
+        count = counted.sum(axis=-1)
+        return np.where(count > 0, total / np.maximum(count, 1), np.inf)
+    return np.where(counted.any(axis=-1), np.where(counted, distance, -np.inf).max(axis=-1, initial=-np.inf), np.inf)
+
+
+def expected_positions(tracks: Forecast, age: Ints) -> Floats:
+    """The expected positions (K, 2) of tracks ``age`` (K,) steps after their prediction; NaN beyond its horizon."""
+    horizon = tracks.mean.shape[1]
+    now = tracks.mean[np.arange(len(age)), np.minimum(age, horizon) - 1]
+    return np.where((age <= horizon)[:, None], now, np.nan)
+
+
+def metric_distances(tracks: Forecast, age: Ints, xy_m: Floats) -> Floats:
+    """Distances (K, N) in metres between where tracks are expected now and positions (N, 2)."""
+    off = expected_positions(tracks, age)[:, None] - xy_m[None]
+    return np.asarray(np.hypot(off[..., 0], off[..., 1]))
+
+
+def position_distances(tracks: Forecast, age: Ints, xy_m: Floats, noise_m: float, sigma_m: float | None) -> Floats:
+    """Mahalanobis distances (K, N) between where tracks are expected now and measured positions.
+
+    Positions (N, 2) are measured with ``noise_m`` on each axis. Infinite for tracks beyond the horizon of their
+    prediction.
+    """
+    now = np.minimum(age, tracks.mean.shape[1]) - 1
+    cov = tracks.cov[np.arange(len(age)), now] if sigma_m is None else paper_covariance(age, 1, sigma_m)[:, 0]
+    off = expected_positions(tracks, age)[:, None] - xy_m[None]
+    distance = mahalanobis(off, (cov + noise_m**2 * np.eye(2))[:, None])
+    return np.where(np.isnan(distance), np.inf, distance)

@@ -13,7 +13,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_starts
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories
-from mcaptrack.transforms.retrack.weights import Logistic, probability
+from mcaptrack.transforms.retrack.weights import Logistic, columns, probability
 
 # The features that tell people from false tracks: how long, where and how regularly a track was seen.
 #
@@ -23,21 +23,10 @@ from mcaptrack.transforms.retrack.weights import Logistic, probability
 # Letters: K tracks, N rows of trajectories, F features, G gaps, P pairs of rows.
 
 
-#: The features of a track: logarithms of its seconds, samples, extent, mean speed and mean squared residual; the share
-#: of its steps with a sample; the share of its rows near a track that began before and ended after; the share of its
-#: samples beside one longer track, and how constantly it was at the same side of that one; and how rare its gaps are.
-FEATURES: Final = (
-    "log length",
-    "log count",
-    "log extent",
-    "log speed",
-    "log roughness",
-    "observed",
-    "duplicate",
-    "beside",
-    "in step",
-    "rare gaps",
-)
+#: Whether a track is a person; the features of that, and their means and spreads.
+_PEOPLE: Final = Logistic.of("people")
+FEATURES: Final = _PEOPLE.names
+_MEAN, _SPREAD = (np.array([_PEOPLE.numbers[what][name] for name in FEATURES]) for what in ("mean", "spread"))
 #: A duplicate of a track is nearer to it than this.
 _DUPLICATE_M: Final = 1.2
 #: A track lies inside another if it begins more than so many steps after it and ends as many before it.
@@ -72,19 +61,20 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State) ->
     roughness = np.add.reduceat((residual**2).sum(axis=1), first) / count / (2 * model.noise_m**2)
     speed = np.hypot(smoothed.mean[:, 2], smoothed.mean[:, 3])
     mean_speed = np.add.reduceat(speed, first) / length
-    return np.column_stack(
-        [
-            np.log(length * model.step_s),
-            np.log(count),
-            np.log(extent + 0.3),
-            np.log(mean_speed + 0.1),
-            np.log(roughness + 0.1),
-            count / length,
-            _duplicate_share(trajectories, xy),
-            *_beside(trajectories, xy, model.noise_m, np.sqrt(roughness)),
-            _rare_gaps(trajectories, extent > _GOES_M),
-        ]
-    )
+    beside, in_step = _beside(trajectories, xy, model.noise_m, np.sqrt(roughness))
+    values = {
+        "log length": np.log(length * model.step_s),
+        "log count": np.log(count),
+        "log extent": np.log(extent + 0.3),
+        "log speed": np.log(mean_speed + 0.1),
+        "log roughness": np.log(roughness + 0.1),  # the mean squared residual
+        "observed": count / length,
+        "duplicate": _duplicate_share(trajectories, xy),
+        "beside": beside,
+        "in step": in_step,
+        "rare gaps": _rare_gaps(trajectories, extent > _GOES_M),
+    }
+    return columns(FEATURES, values)
 
 
 def stand_throughout(
@@ -189,9 +179,6 @@ def _rare_gaps(trajectories: Trajectories, goes: Bools) -> Floats:
     return np.asarray(total / np.maximum(count, 1))
 
 
-#: Whether a track is a person; means and spreads of features.
-_PEOPLE: Final = Logistic.of("people", FEATURES)
-_MEAN, _SPREAD = (np.array([_PEOPLE.numbers[what][name] for name in FEATURES]) for what in ("mean", "spread"))
 #: What is added to the log odds of tracks that stand for the whole log.
 _THROUGHOUT: Final = float(_PEOPLE.numbers["stands throughout"])
 #: How strongly weights stay as they were fitted while they follow a log, and how much each sample of a track counts

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.arrays import Floats, Ints, taken
 from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
-from mcaptrack.transforms.retrack.assignments import Tracks
 from mcaptrack.transforms.retrack.linking import (
+    FEATURES,
     Fit,
     Gaps,
     TrackEnds,
-    assigned_links,
+    best_links,
     chains,
     features,
     features_of,
@@ -34,58 +34,14 @@ from mcaptrack.transforms.retrack.linking import (
     log_speed,
     pairs_in_reach,
 )
-from mcaptrack.transforms.retrack.motion_model import MotionModel, State, filtered, to_trajectories
-from mcaptrack.transforms.retrack.weights import Choices
+from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Tracks, filtered, to_trajectories
+from mcaptrack.transforms.retrack.weights import Choices, columns
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-#: The terms of a link: by the motion of the tracks that both tracklets are part of, by that of the tracklets alone,
-#: the seconds between, whether the input or the online tracker took both for one, the numbers of samples of both and
-#: of the tracks before and after, and two that are the same for all links of a log: how often its input ids change, and
-#: how many online tracks it has.
-LINK_TERMS: Final = (
-    "link",
-    "miss",
-    "misfit to noise",
-    "misfit",
-    "misfit or stay",
-    "turn",
-    "stay and speed",
-    "misfit and speed",
-    "speed",
-    "noise",
-    "miss alone",
-    "misfit to noise alone",
-    "gap",
-    "log gap",
-    "same input id",
-    "same track",
-    "beside one track",
-    "samples before",
-    "samples after",
-    "track before",
-    "track after",
-    "rate of input ids",
-    "rate of tracks",
-)
-#: The terms of an end where a person leaves, or of a beginning where one comes.
-END_TERMS: Final = (
-    "end",
-    "ends here",
-    "beside a track",
-    "border",
-    "speed",
-    "last second",
-    "log left",
-    "long left",
-    "samples",
-    "single",
-    "few",
-)
 #: Links have weights by the length of their gap: no step between, and up to so many seconds.
 GAPS_S: Final = (1.7, 5.0)
-GAP_NAMES: Final = ("next step", "up to 1.7 s", "up to 5 s", "longer")
 #: The number of ends and beginnings with the usual shares that count beside those of a log.
 _USUAL_ENDS: Final = 20.0
 #: A person who is lost beside another one may be hidden by that one, or in one detection with that one; from this
@@ -100,7 +56,7 @@ _LONG, _FEW, _CELL_M = 8, 4, 1.0
 #: cost more than wrong ones that go together. (Chosen on synthetic crowds.)
 _ENOUGH: Final = 1 / 5
 #: What ends and beginnings choose.
-CHOICES = Choices.of("choices", GAP_NAMES, LINK_TERMS, END_TERMS)
+CHOICES = Choices.of("choices")
 
 
 class Tracklets(NamedTuple):
@@ -139,7 +95,8 @@ class Hypotheses(NamedTuple):
     """The hypotheses about the tracklets of a log.
 
     ``before`` and ``after`` (E,) are the tracklets of candidate links, ``gap_s`` (E,) the seconds between them and
-    ``gap`` (E,) the class of that; ``terms`` (E, F) are those of links, ``leaves`` and ``comes`` (K, G) of ends.
+    ``gap`` (E,) the class of that; ``terms`` (E, F) are those of links, ``leaves`` and ``comes`` (K, G) of ends where a
+    person leaves, and of beginnings where one comes.
     ``evidence`` (E,) is the log likelihood ratio of what else tells whether both are one person.
     """
 
@@ -164,17 +121,9 @@ class Hypotheses(NamedTuple):
         tracklets = Tracklets.in_tracks(tracks)
         tracked, beside = _tracked(model, tracks, tracklets)
         _, row, paths = to_trajectories(tracks.step, tracklets.of, tracks.xy_m)
-        alone = [taken(states, row) for states in filtered(model, paths)]
-        ends, ends_alone = (
-            TrackEnds(
-                model,
-                tracklets.begins,
-                tracklets.ends,
-                taken(backward, tracklets.first),
-                taken(forward, tracklets.last),
-            )
-            for forward, backward in (tracked, alone)
-        )
+        forward, backward = filtered(model, paths)
+        ends = _ends(model, tracklets, *tracked)
+        ends_alone = _ends(model, tracklets, taken(forward, row), taken(backward, row))
         follows = following(tracks.track[tracklets.first], tracklets.begins)
         before, after = _candidates(ends, follows, max_gap_s)
         if asked is not None and len(asked[0]):
@@ -182,38 +131,41 @@ class Hypotheses(NamedTuple):
             more = more[:, tracklets.ends[more[0]] < tracklets.begins[more[1]]]
             before, after = np.unique(np.concatenate([[before, after], more], axis=1), axis=1)
         gaps = ends.gaps(before, after)
-        gap_s = gaps.seconds
-        terms = np.column_stack(
-            [
-                np.ones(len(before)),
-                *_motion_terms(model, gaps),
-                *features(model, ends_alone.gaps(before, after))[:, :2].T,
-                gap_s,
-                np.log(gap_s + 0.2),
-                *_same(tracklets, before, after),
-                np.asarray(beside[0][before].minimum(beside[1][after]).max(axis=1).todense()).ravel(),
-                *_samples(tracks, tracklets, before, after),
-                *np.broadcast_to(_rates(tracks, tracklets)[:, None], (2, len(before))),
-            ]
-        )
-        nearest = [np.asarray(near.max(axis=1).todense()).ravel() for near in beside]
+        gap_s, alone = gaps.seconds, features(model, ends_alone.gaps(before, after))
+        same_track = tracklets.online[before] == tracklets.online[after]
+        so_far, left = _samples(tracks, tracklets)
+        of_ids, of_tracks = _rates(tracks, tracklets)
+        terms = {
+            "link": np.ones(len(before)),
+            **_motion_terms(model, gaps),
+            "miss alone": alone[:, 0],
+            "misfit to noise alone": alone[:, 1],
+            "gap": gap_s,
+            "log gap": np.log(gap_s + 0.2),
+            "same input id": tracklets.source[before] == tracklets.source[after],
+            "same track": same_track,
+            "beside one track": _largest(beside[0][before].minimum(beside[1][after])),
+            "samples before": np.log(tracklets.samples[before]),
+            "samples after": np.log(tracklets.samples[after]),
+            "track before": np.log(so_far[before]),
+            "track after": np.log(left[after]),
+            "rate of input ids": np.full(len(before), of_ids),
+            "rate of tracks": np.full(len(before), of_tracks),
+        }
+        near_end, near_begin = map(_largest, beside)
         apart_m = np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T)
         is_alone = (tracklets.begins[after] - tracklets.ends[before] == 1) & (apart_m < _WALK_M_PER_S * gap_s)
-        is_alone &= tracklets.online[before] == tracklets.online[after]
-        is_alone &= nearest[0][before] + nearest[1][after] == 0
+        is_alone &= same_track & (near_end[before] + near_begin[after] == 0)
         bounds = np.maximum.accumulate([1.5 * model.step_s, *GAPS_S])
-        leaves, comes = (
-            _end_terms(model, tracks, tracklets, tracked, nearest[not leaving], leaving) for leaving in (True, False)
-        )
         return cls(
             tracklets,
             before,
             after,
             gap_s,
             np.searchsorted(bounds, gap_s),
-            terms.astype(np.float64),
-            leaves,
-            comes,
+            columns(CHOICES.terms, terms),
+            _end_terms(model, tracks, tracklets, tracked[0], near_end, leaving=True),
+            _end_terms(model, tracks, tracklets, tracked[1], near_begin, leaving=False),
             np.where(is_alone, _ALONE, 0.0),
         )
 
@@ -267,8 +219,7 @@ class Scored(NamedTuple):
 def best_next(before: Ints, after: Ints, gain: Floats, count: int) -> Ints:
     """The tracklet that follows each one (K,) by the best set of links (E,) with these gains; -1 where none does."""
     out = np.full(count, -1)
-    good = np.flatnonzero(gain > 0)
-    links = good[assigned_links(before[good], after[good], np.round(gain[good], 6), count)]
+    links = best_links(before, after, gain, count)
     out[before[links]] = after[links]
     return out
 
@@ -330,35 +281,41 @@ def following(track: Ints, begins: Ints) -> Ints:
     return out
 
 
-def _motion_terms(model: MotionModel, gaps: Gaps) -> list[Floats]:
+def _ends(model: MotionModel, tracklets: Tracklets, forward: State, backward: State) -> TrackEnds:
+    """The ends of tracklets, from the states of all assignments (C,)."""
+    begun, ended = taken(backward, tracklets.first), taken(forward, tracklets.last)
+    return TrackEnds(model, tracklets.begins, tracklets.ends, begun, ended)
+
+
+def _largest(near: csr_array) -> Floats:
+    """The largest of each row."""
+    return np.asarray(near.max(axis=1).todense()).ravel()
+
+
+def _motion_terms(model: MotionModel, gaps: Gaps) -> dict[str, Floats]:
     """The terms of how the motion before a gap fits that after it."""
     fit = Fit.of(model, gaps)
-    miss, to_noise, _, _, turn, stay, misfit = features_of(fit, gaps.seconds).T
-    shorter = log_distance(np.minimum(fit.misfit, fit.stay))
-    speed, noise = log_speed(fit.speed), np.log(fit.spread_m2)
-    return [miss, to_noise, np.log(fit.misfit + 0.2), shorter, turn, stay, misfit, speed, noise]
+    of_link = dict(zip(FEATURES, features_of(fit, gaps.seconds).T, strict=True))
+    return {
+        "miss": of_link["miss"],
+        "misfit to noise": of_link["misfit"],
+        "misfit": np.log(fit.misfit + 0.2),
+        "misfit or stay": log_distance(np.minimum(fit.misfit, fit.stay)),
+        "turn": of_link["turn"],
+        "stay and speed": of_link["distance and speed"],
+        "misfit and speed": of_link["misfit and speed"],
+        "speed": log_speed(fit.speed),
+        "noise": np.log(fit.spread_m2),
+    }
 
 
-def _same(tracklets: Tracklets, before: Ints, after: Ints) -> tuple[Bools, Bools]:
-    """Whether links (E,) join one input id, and one online track."""
-    return tracklets.source[before] == tracklets.source[after], tracklets.online[before] == tracklets.online[after]
-
-
-def _samples(tracks: Tracks, tracklets: Tracklets, before: Ints, after: Ints) -> list[Floats]:
-    """The logarithms of the numbers of samples of both tracklets of links (E,), and of their tracks up to the end of
-    the one and from the beginning of the other on.
-    """
+def _samples(tracks: Tracks, tracklets: Tracklets) -> tuple[Ints, Ints]:
+    """The numbers of samples of tracks up to the ends of tracklets (K,), and from their beginnings on, (K,)."""
     order = tracks.order
-    starts = run_starts(tracks.track[order])
-    length = np.diff(np.append(np.flatnonzero(starts), len(order)))
-    place = np.empty_like(order)
-    place[order] = ragged_range(0, length)
-    rest = np.empty_like(order)
-    rest[order] = np.repeat(length, length)
-    so_far, left = place[tracklets.last] + 1, (rest - place)[tracklets.first]
-    return [
-        np.log(count) for count in (tracklets.samples[before], tracklets.samples[after], so_far[before], left[after])
-    ]
+    length = np.diff(np.append(np.flatnonzero(run_starts(tracks.track[order])), len(order)))
+    place, rest = np.empty_like(order), np.empty_like(order)
+    place[order], rest[order] = ragged_range(0, length), np.repeat(length, length)
+    return place[tracklets.last] + 1, (rest - place)[tracklets.first]
 
 
 def _rates(tracks: Tracks, tracklets: Tracklets) -> Floats:
@@ -368,42 +325,34 @@ def _rates(tracks: Tracks, tracklets: Tracklets) -> Floats:
 
 
 def _end_terms(
-    model: MotionModel,
-    tracks: Tracks,
-    tracklets: Tracklets,
-    states: tuple[State, State],
-    beside: Floats,
-    leaving: bool,
+    model: MotionModel, tracks: Tracks, tracklets: Tracklets, state: State, beside: Floats, leaving: bool
 ) -> Floats:
     """The terms of leaving at the ends of tracklets, or of coming at their beginnings, (K, G).
 
-    ``beside`` (K,) is how near another track is there, from 0 to 1.
+    ``state`` (C,) are the states of assignments, ``beside`` (K,) is how near another track is there, from 0 to 1.
     """
-    at, state = (tracklets.last, states[0]) if leaving else (tracklets.first, states[1])
-    here = tracks.xy_m[at]
-    speed = np.hypot(*state.mean[at, 2:].T)
-    is_long = tracklets.samples >= _LONG
+    at = tracklets.last if leaving else tracklets.first
+    here, is_long = tracks.xy_m[at], tracklets.samples >= _LONG
     sides = np.concatenate([tracks.xy_m[tracklets.first[is_long]], tracks.xy_m[tracklets.last[is_long]]])
     low, high = np.percentile(tracks.xy_m, [1, 99], axis=0)
     ends_here = np.maximum(_around(sides, here) - is_long + 0.5, 0.1) / (_around(tracks.xy_m, here) + 5)
     border_m = np.maximum(np.minimum(here - low, high - here).min(axis=1), 0.0)
     steps = tracks.step.max() - tracklets.ends if leaving else tracklets.begins - tracks.step.min()
     left_s = steps * model.step_s
-    return np.column_stack(
-        [
-            np.ones(len(at)),
-            np.log(ends_here),
-            beside,
-            np.log(border_m + 0.5),
-            np.log(speed + 0.1),
-            left_s < 1,
-            np.log(left_s + 1),
-            left_s > 20,
-            np.log(tracklets.samples),
-            tracklets.samples == 1,
-            tracklets.samples < _FEW,
-        ]
-    ).astype(np.float64)
+    terms = {
+        "end": np.ones(len(at)),
+        "ends here": np.log(ends_here),
+        "beside a track": beside,
+        "border": np.log(border_m + 0.5),
+        "speed": np.log(np.hypot(*state.mean[at, 2:].T) + 0.1),
+        "last second": left_s < 1,
+        "log left": np.log(left_s + 1),
+        "long left": left_s > 20,
+        "samples": np.log(tracklets.samples),
+        "single": tracklets.samples == 1,
+        "few": tracklets.samples < _FEW,
+    }
+    return columns(CHOICES.end_terms, terms)
 
 
 def _around(points: Floats, xy: Floats) -> Floats:

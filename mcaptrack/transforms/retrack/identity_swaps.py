@@ -11,15 +11,16 @@ Letters: C encounters, T steps of them, N rows of trajectories.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
+from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.transforms.retrack.appearance import Sides
-from mcaptrack.transforms.retrack.motion_model import MotionModel, Trajectories
+from mcaptrack.transforms.retrack.motion_model import MotionModel, StateRows, Trajectories, update
 
 #: Drifts of a relative velocity within a second, in m/s: the most likely of these is taken for each encounter. With the
 #: largest, of people who walk to and fro, motion says little.
@@ -44,7 +45,7 @@ _MIN_GAIN: Final = 1.0
 # Which encounters are changed at once: of those that need the same track at the same time, the one that gains most.
 #
 # Whether two tracks were swapped is judged as if all other tracks were right. So of two encounters that overlap in
-# time and have a track in common only one is changed, and the other is judged again afterwards.
+# time and have a track in common only one is changed.
 
 
 def compatible(pair: Ints, low: Ints, high: Ints, gain: Floats) -> Ints:
@@ -71,18 +72,13 @@ class Encounters(NamedTuple):
 
 
 def resolve_swaps(
-    model: MotionModel,
-    trajectories: Trajectories,
-    row: Ints,
-    source: Ints,
-    examined: Bools | None = None,
-    seen: Sides | None = None,
+    model: MotionModel, trajectories: Trajectories, row: Ints, source: Ints, seen: Sides | None = None
 ) -> tuple[Ints, int]:
     """The track that each row of the trajectories belongs to (N,), and the number of encounters that were changed.
 
-    ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter is left for the next
-    call if a better one changes one of its tracks at the same time. Only encounters of ``examined`` tracks (K,) are
-    looked at, by default all. ``seen`` compares what the tracks look like before and after an encounter.
+    ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter stays as it is if a
+    better one changes one of its tracks at the same time. ``seen`` compares what the tracks look like before and after
+    an encounter.
     """
     track = group_index(np.diff(trajectories.first))
     input_id = np.full(len(track), -1)
@@ -90,12 +86,10 @@ def resolve_swaps(
     encounters = find_encounters(trajectories)
     if len(encounters.i) == 0:
         return track, 0
-    if examined is not None:
-        encounters = taken(encounters, examined[encounters.i] | examined[encounters.j])
     i, j, low, high, meet, part_ways = encounters
     evidence = np.zeros(len(i)) if seen is None else seen.of_swaps(i, j, meet, part_ways)
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
-    swaps: dict[int, _Swaps] = {}
+    swaps: dict[int, list[tuple[int, int, int]]] = {}  # of each encounter that is changed: steps, and both tracks
     gain = np.zeros(len(i))
     for part in _batches(high - low + 1):
         steps = low[part, None] + np.arange(int((high - low)[part].max()) + 1)
@@ -108,33 +102,21 @@ def resolve_swaps(
         paths, gain[part] = find_swaps(model, relative, cost, evidence[part])
         for at, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
             if gain[at] >= _MIN_GAIN:
-                swaps[at] = _Swaps(int(i[at]), int(j[at]), int(low[at]), path[: length + 1].copy())
+                changes = low[at] + np.flatnonzero(np.diff(path[: length + 1], prepend=False))
+                swaps[at] = [(step, int(i[at]), int(j[at])) for step in changes.tolist()]
     which = np.array(sorted(swaps), np.int64)
     chosen = which[compatible(np.stack([i, j], axis=1)[which], low[which], high[which], gain[which])]
-    return _exchanged(trajectories, track, [swaps[at] for at in chosen.tolist()]), len(chosen)
+    in_order = sorted(swap for at in chosen.tolist() for swap in swaps[at])
+    return _exchanged(trajectories, track, in_order), len(chosen)
 
 
-class _Swaps(NamedTuple):
-    """The swaps of an encounter of the tracks ``a`` and ``b``: whether they are swapped at steps from ``low`` on."""
+def _exchanged(trajectories: Trajectories, track: Ints, swaps: list[tuple[int, int, int]]) -> Ints:
+    """The track that each row (N,) belongs to after swaps: steps, rising, and the two tracks that are swapped there.
 
-    a: int
-    b: int
-    low: int
-    is_swapped: Bools
-
-
-def _exchanged(trajectories: Trajectories, track: Ints, encounters: list[_Swaps]) -> Ints:
-    """The track that each row (N,) belongs to after the swaps of encounters, of which no two change a track at once.
-
-    Two tracks that are swapped go on as each other, or as whoever these are by then.
+    These go on as each other, or as whichever tracks they are by then.
     """
     owner = track.copy()
     now: dict[int, int] = {}
-    swaps = sorted(
-        (met.low + int(at), met.a, met.b)
-        for met in encounters
-        for at in np.flatnonzero(np.diff(met.is_swapped, prepend=False))
-    )
     for step, a, b in swaps:
         now[a], now[b] = now.get(b, b), now.get(a, a)
         for number in (a, b):
@@ -200,60 +182,49 @@ def find_swaps(
     """
     swapped = np.zeros(len(relative_m)) if evidence is None else evidence
     drifts = len(DRIFTS_M_PER_S)  # all at once: a step of few encounters takes as long as one of many
-    power = np.repeat(np.square(DRIFTS_M_PER_S), len(relative_m))
+    drift = np.repeat(DRIFTS_M_PER_S, len(relative_m))[:, None]
     paths, gain, likelihood = _viterbi(
-        model, np.tile(relative_m, (drifts, 1, 1)), np.tile(swap_cost, (drifts, 1)), np.tile(swapped, drifts), power
+        replace(model, drift_m_per_s=drift, drift_ratio=0.0, noise_m=np.sqrt(2) * model.noise_m),
+        np.tile(relative_m, (drifts, 1, 1)),
+        np.tile(swap_cost, (drifts, 1)),
+        np.tile(swapped, drifts),
     )
     best = np.argmax(likelihood.reshape(drifts, -1), axis=0) * len(relative_m) + np.arange(len(relative_m))
     return paths[best], gain[best]
 
 
 def _viterbi(
-    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats, power: Floats
+    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats
 ) -> tuple[Bools, Floats, Floats]:
-    """Swaps (C, T), their gain (C,) and log likelihood (C,) for drifts of the relative velocity, squared (C,)."""
+    """Swaps (C, T), their gain (C,) and log likelihood (C,) with the noise and drift of relative positions."""
     count, steps = relative_m.shape[:2]
-    r, step_s, power = 2 * model.noise_m**2, model.step_s, power[:, None]
-    mean = np.zeros((count, 3, 4))  # hypotheses: as labelled, swapped, and never swapped at all
-    cov = np.tile([r, 0.0, 2 * model.speed_m_per_s**2], (count, 3, 1))
+    # hypotheses: as labelled, swapped, and never swapped at all
+    state = StateRows(np.zeros((4, count, 3)), np.zeros((3, count, 3)))
+    state.cov[0], state.cov[2] = model.noise_m**2, 2 * model.speed_m_per_s**2
     total = np.tile([0.0, -np.inf, 0.0], (count, 1))
     came_swapped = np.zeros((steps, count, 2), bool)  # whether the best predecessor has the other labels
-    started = np.zeros(count, bool)
+    started, row = np.zeros(count, bool), np.arange(count)[:, None]
     sign = np.array([1.0, -1.0, 1.0])
     for step in range(steps):
         observed = np.isfinite(relative_m[:, step, 0])
-        z = np.where(observed[:, None], relative_m[:, step], 0.0)
-        p, c, v = cov[..., 0], cov[..., 1], cov[..., 2]
+        new, go = observed & ~started, (observed & started)[:, None]
+        z = np.where(observed, relative_m[:, step].T, 0.0)[..., None]
         if step:
-            p = p + step_s * (2 * c + step_s * (v + step_s * power / 3))
-            c = c + step_s * (v + step_s * power / 2)
-            v = v + step_s * power
-            mean[..., :2] += step_s * mean[..., 2:]
-        new = observed & ~started
-        mean[new, :, :2] = z[new, None] * sign[None, :, None]
-        mean[new, :, 2:] = 0.0
-        s = p + r
-        go = observed & started
+            model.predict(state, model.step_s, state)
+        state.mean[:2, new], state.mean[2:, new] = (z * sign)[:, new], 0.0
         # from each hypothesis (0, 1, 2) to each labelling (+1, -1)
-        off = z[:, None, None] * np.array([1.0, -1.0])[None, None, :, None] - mean[:, :, None, :2]
+        off = z[..., None] * sign[:2] - state.mean[:2, ..., None]
+        s = state.cov[0] + model.noise_m**2
         # Student's distribution in the plane
-        like = -(_FREEDOM / 2 + 1) * np.log1p((off**2).sum(-1) / s[..., None] / _FREEDOM) - np.log(s)[..., None]
-        like = np.where(go[:, None, None], like, 0.0)
+        like = -(_FREEDOM / 2 + 1) * np.log1p((off**2).sum(0) / s[..., None] / _FREEDOM) - np.log(s)[..., None]
+        like = np.where(go[..., None], like, 0.0)
         stay = total[:, :2] + np.stack([like[:, 0, 0], like[:, 1, 1]], axis=1)
         change = total[:, 1::-1] + np.stack([like[:, 1, 0], like[:, 0, 1]], axis=1) - swap_cost[:, step, None]
-        jumped = (change > stay) & go[:, None]
-        came_swapped[step] = jumped
+        came_swapped[step] = jumped = (change > stay) & go
         total = np.concatenate([np.where(jumped, change, stay), (total[:, 2] + like[:, 2, 0])[:, None]], axis=1)
         source = np.concatenate([np.where(jumped, [1, 0], [0, 1]), np.full((count, 1), 2)], axis=1)
-        row = np.arange(count)[:, None]
-        mean = mean[row, source]
-        p, c, v = p[row, source], c[row, source], v[row, source]
-        s = s[row, source]
-        gain, gain_rate = np.where(go[:, None], p / s, 0.0), np.where(go[:, None], c / s, 0.0)
-        off = z[:, None] * sign[None, :, None] - mean[..., :2]
-        mean[..., :2] += gain[..., None] * off
-        mean[..., 2:] += gain_rate[..., None] * off
-        cov = np.stack([p * (1 - gain), c * (1 - gain), v - gain_rate * c], axis=-1)
+        state = StateRows(state.mean[:, row, source], state.cov[:, row, source])
+        update(state, z * sign, np.where(go, model.noise_m, np.inf))
         started |= observed
     total[:, 1] += is_swapped
     path = np.zeros((count, steps), bool)

@@ -23,14 +23,14 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
 from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, filtered_rows, joined_parts, mapped_rows
 from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence
-from mcaptrack.transforms.retrack.assignments import Tracks
-from mcaptrack.transforms.retrack.weights import Logistic, probability
+from mcaptrack.transforms.retrack.motion_model import Tracks
+from mcaptrack.transforms.retrack.weights import Logistic, columns, probability
 
 #: Tracks are cut at gaps of more seconds than that, and more than a missing frame.
 CUT_S: Final = 0.2
@@ -54,31 +54,16 @@ _MOST: Final = 30.0
 _TIMES: Final = 6
 #: A box hides those behind it: its lower edge is at most so many of their heights above theirs.
 _BEHIND: Final = 0.05
-#: Pairs at once, for what is hidden.
-_AT_ONCE: Final = 4096
+#: Pairs of boxes at once, for what is hidden.
+_AT_ONCE: Final = 2**17
 #: The height of a person, for how far people may have walked between two places in the picture: as if all were as far
 #: away as the usual box.
 _PERSON_M: Final = 1.7
 
-#: What tells right links from wrong ones.
-FEATURES: Final = (
-    "log miss",
-    "log growth",
-    "change of width",
-    "log gap",
-    "gap",
-    "same track",
-    "hidden after",
-    "hidden",
-    "least hidden",
-    "log rarity",
-    "short before",
-    "short after",
-)
-#: What tells them among others: their log odds by themselves, and how likely one of the others is that would take the
-#: place before or after the gap, as a logarithm.
-AMONG_OTHERS: Final = ("alone", "others after", "others before")
-_PAIRS, _LINKS = Logistic.of("pairs in pictures", FEATURES), Logistic.of("links in pictures", AMONG_OTHERS)
+#: What tells right links from wrong ones; and what tells them among others: their log odds by themselves, and how
+#: likely one of the others is that would take the place before or after the gap, as a logarithm.
+_PAIRS, _LINKS = Logistic.of("pairs in pictures"), Logistic.of("links in pictures")
+FEATURES, AMONG_OTHERS = _PAIRS.names, _LINKS.names
 
 
 class Linked(NamedTuple):
@@ -353,35 +338,27 @@ def find_candidates(pieces: BoxPieces, max_gap_s: float, across_classes: bool = 
     near = np.flatnonzero((miss < _MOST_MISSED) & (growth < _MOST_MISSED))
     i, j, gap_s = i[near], j[near], gap_s[near]
     rarity = -np.log(2 * np.pi * spread[near]) - np.log(tall[near]) / 2 - np.log(_births(pieces))
-    hidden = np.concatenate(
-        [
-            np.empty((0, _TIMES)),
-            *(
-                _hidden_between(pieces, lost, begun, i[low : low + _AT_ONCE], j[low : low + _AT_ONCE])
-                for low in range(0, len(i), _AT_ONCE)
-            ),
-        ]
-    )
+    hidden = _hidden_between(pieces, lost, begun, i, j)
     every = np.arange(len(pieces.source))
     hidden_after = np.maximum(
         _hidden(pieces, begun.frame, begun.boxes, every, every),
         _hidden(pieces, np.maximum(begun.frame - 1, 0), begun.boxes, every, every),
     )
-    features = (
-        np.log1p(edge[near]),
-        np.log1p(growth[near]),
-        wider[near],
-        np.log(gap_s),
-        gap_s,
-        (pieces.source[i] == pieces.source[j]) & (j == i + 1),
-        hidden_after[j],
-        hidden.mean(axis=1),
-        hidden.min(axis=1, initial=1.0),
-        rarity,
-        1 / np.sqrt(_ERRORS_PER_S * lost.known_s[i] + 0.1),
-        1 / np.sqrt(_ERRORS_PER_S * begun.known_s[j] + 0.1),
-    )
-    return i, j, np.column_stack(features).astype(np.float64)
+    values = {
+        "log miss": np.log1p(edge[near]),
+        "log growth": np.log1p(growth[near]),
+        "change of width": wider[near],
+        "log gap": np.log(gap_s),
+        "gap": gap_s,
+        "same track": (pieces.source[i] == pieces.source[j]) & (j == i + 1),
+        "hidden after": hidden_after[j],
+        "hidden": hidden.mean(axis=1),
+        "least hidden": hidden.min(axis=1, initial=1.0),
+        "log rarity": rarity,
+        "short before": 1 / np.sqrt(_ERRORS_PER_S * lost.known_s[i] + 0.1),
+        "short after": 1 / np.sqrt(_ERRORS_PER_S * begun.known_s[j] + 0.1),
+    }
+    return i, j, columns(FEATURES, values)
 
 
 def _births(pieces: BoxPieces) -> float:
@@ -411,12 +388,13 @@ def _hidden(pieces: BoxPieces, frame: Ints, boxes: Floats, own: Ints, other: Int
     """The share of boxes (E, 4) at frames (E,) that one box of a third piece hides, which is nearer to the camera."""
     order = np.argsort(pieces.frame, kind="stable")
     low, high = (np.searchsorted(pieces.frame[order], frame, side) for side in ("left", "right"))
-    which, row = group_index(high - low), order[ragged_range(low, high - low)]
-    hiding, hidden, piece = pieces.boxes[row], boxes[which], pieces.piece[row]
-    corner = np.minimum(hiding[:, :2] + hiding[:, 2:], hidden[:, :2] + hidden[:, 2:])
-    overlap = np.clip(corner - np.maximum(hiding[:, :2], hidden[:, :2]), 0, None).prod(axis=1)
-    is_nearer = hiding[:, 1] + hiding[:, 3] > hidden[:, 1] + (1 - _BEHIND) * hidden[:, 3]
-    counts = is_nearer & (piece != own[which]) & (piece != other[which])
-    share = np.zeros(len(frame))
-    np.maximum.at(share, which, np.where(counts, overlap / hidden[:, 2:].prod(axis=1), 0.0))
+    share, piece_of = np.zeros(len(frame)), pieces.piece
+    for part in batches(high - low, _AT_ONCE):
+        which, row = part.start + group_index((high - low)[part]), order[ragged_range(low[part], (high - low)[part])]
+        hiding, hidden, piece = pieces.boxes[row], boxes[which], piece_of[row]
+        corner = np.minimum(hiding[:, :2] + hiding[:, 2:], hidden[:, :2] + hidden[:, 2:])
+        overlap = np.clip(corner - np.maximum(hiding[:, :2], hidden[:, :2]), 0, None).prod(axis=1)
+        is_nearer = hiding[:, 1] + hiding[:, 3] > hidden[:, 1] + (1 - _BEHIND) * hidden[:, 3]
+        counts = is_nearer & (piece != own[which]) & (piece != other[which])
+        np.maximum.at(share, which, np.where(counts, overlap / hidden[:, 2:].prod(axis=1), 0.0))
     return share

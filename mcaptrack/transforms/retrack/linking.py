@@ -14,19 +14,18 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
-from mcaptrack.geometry.assignment import Pairs, assign_by_gain, assign_pairs_by_gain
-from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
+from mcaptrack.geometry.assignment import max_weight_matching
+from mcaptrack.geometry.ragged import batches, find_rows, group_index, ragged_range
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State
-from mcaptrack.transforms.retrack.weights import Logistic, probability
+from mcaptrack.transforms.retrack.weights import Logistic, columns, probability
 
 #: A track that continues another begins no farther from its end than this, and so much more for each second between.
 _REACH_M, _MAX_SPEED_M_PER_S = 1.0, 2.5
-#: The features of a link, see ``features``.
-FEATURES: Final = ("miss", "misfit", "gap", "misfit or stay", "turn", "distance and speed", "misfit and speed")
 #: Weight of each feature as a log odds ratio; and the log odds without any, in logs where a share of ``_PRIOR`` of the
-#: best links is right. Links with log odds below ``_MIN_LOG_ODDS`` are not considered.
-_LINKS: Final = Logistic.of("links", FEATURES)
-_PRIOR, _MIN_LOG_ODDS = (float(_LINKS.numbers[name]) for name in ("usual", "least"))
+#: best links is right. Links with log odds below ``MIN_LOG_ODDS`` are not considered.
+_LINKS: Final = Logistic.of("links")
+FEATURES: Final = _LINKS.names
+_PRIOR, MIN_LOG_ODDS = (float(_LINKS.numbers[name]) for name in ("usual", "least"))
 #: Gaps are of classes with these bounds in seconds; the mean probability of the best links of each, where as many are
 #: right as usual; and with how many links more this is taken to be so in a log.
 _GAPS_S: Final = (0.9, 1.7, 3.3, 6.5, 13.0)
@@ -39,10 +38,6 @@ _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 ENOUGH: Final = 1 / 3
 #: The number of pairs that are examined at once.
 _BATCH: Final = 1_000_000
-#: So few links are decided together: splitting them would take longer.
-_FEW: Final = 50
-#: The largest table of ends and beginnings that is made: 16 MB.
-_TABLE_CELLS: Final = 2_000_000
 
 
 class Gaps(NamedTuple):
@@ -77,6 +72,15 @@ def chains(continued_by: Ints, begins: Ints) -> Ints:
     return root
 
 
+def best_links(ends: Ints, begins: Ints, gain: Floats, count: int) -> Ints:
+    """Which links (E,) between ends and beginnings of so many tracks have the largest sum of gains, by ends."""
+    gain = np.round(gain, 6)
+    good = np.flatnonzero(gain > 0)
+    pairs, _ = max_weight_matching((ends[good], begins[good]), gain[good], (count, count))
+    links = find_rows((ends, begins), pairs)
+    return np.asarray(links[np.argsort(ends[links], kind="stable")])
+
+
 def log_odds(values: Floats) -> Floats:
     """The log odds that links with these features (E, F) are right, where as many are as usual."""
     return _LINKS.log_odds(values)
@@ -84,26 +88,7 @@ def log_odds(values: Floats) -> Floats:
 
 def has_chance(log_odds: Floats) -> Bools:
     """Whether links with these log odds (E,) are considered at all."""
-    return np.asarray(log_odds > _MIN_LOG_ODDS)
-
-
-def best_links(i: Ints, j: Ints, log_odds: Floats, count: int) -> Ints:
-    """The best set of the links (E,) between ends ``i`` and beginnings ``j`` of so many tracks, by ends."""
-    good = np.flatnonzero(has_chance(log_odds))
-    links = good[assigned_links(i[good], j[good], np.round(log_odds[good] - _MIN_LOG_ODDS, 6), count)]
-    return np.asarray(links[np.argsort(i[links], kind="stable")])
-
-
-def assigned_links(ends: Ints, begins: Ints, gain: Floats, count: int) -> Ints:
-    """Which links (E,) between ends and beginnings of so many tracks have the largest sum of gains; these are > 0."""
-    continued_by = np.full(count, -1)
-    parts = [np.arange(len(gain))] if len(gain) <= _FEW else _components(ends, begins, count)
-    for edges in parts:
-        own, other = np.unique(ends[edges]), np.unique(begins[edges])
-        pairs = np.searchsorted(own, ends[edges]), np.searchsorted(other, begins[edges])
-        row, column = _assigned(pairs, gain[edges], (len(own), len(other)))
-        continued_by[own[row]] = other[column]
-    return np.flatnonzero(continued_by[ends] == begins)
+    return np.asarray(log_odds > MIN_LOG_ODDS)
 
 
 def pairs_in_reach(ends: TrackEnds, max_gap_s: float) -> Iterator[tuple[Ints, Ints, Gaps]]:
@@ -120,26 +105,11 @@ def pairs_in_reach(ends: TrackEnds, max_gap_s: float) -> Iterator[tuple[Ints, In
         yield i[near], j[near], taken(gaps, near)
 
 
-def reach_m(gap_s: Floats) -> Floats:
-    """The distance that people walk within gaps (E,), at most."""
-    return np.asarray(_REACH_M + _MAX_SPEED_M_PER_S * gap_s)
-
-
 def are_in_reach(gaps: Gaps) -> Bools:
     """Whether people may get from the one side to the other within the gaps (E,)."""
-    return np.asarray(_length(gaps.before.mean[:, :2] - gaps.after.mean[:, :2]) <= reach_m(gaps.seconds))
-
-
-def _assigned(pairs: Pairs, gain: Floats, shape: tuple[int, int]) -> Pairs:
-    """The best set of links among candidates (E,) of ends and beginnings.
-
-    Thousands of broken tracks that hang together would have a table of gigabytes, nearly all of it empty.
-    """
-    if shape[0] * shape[1] > _TABLE_CELLS:
-        return assign_pairs_by_gain(pairs, gain, shape)[0]
-    table = np.full(shape, -1.0)
-    table[pairs] = gain
-    return assign_by_gain(table)
+    return np.asarray(
+        _length(gaps.before.mean[:, :2] - gaps.after.mean[:, :2]) <= _REACH_M + _MAX_SPEED_M_PER_S * gaps.seconds
+    )
 
 
 def prior_shift(log_odds: Floats) -> float:
@@ -176,18 +146,6 @@ def prior_shifts(log_odds: Floats, gap_s: Floats) -> Floats:
         share = (right + _GAP_LINKS * expected) / links
         shifts = np.log(share / (1 - share)) - usual
     return shifts
-
-
-def _components(i: Ints, j: Ints, count: int) -> list[Ints]:
-    """The edges of each connected component of the graph from ends ``i`` to beginnings ``j``."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(i)), (i, count + j)), shape=(2 * count, 2 * count))
-    _, label = connected_components(graph, directed=False)
-    order = np.argsort(label[i], kind="stable")
-    starts = np.flatnonzero(run_starts(label[i][order]))
-    return list(np.split(order, starts[1:])) if len(order) else []
 
 
 class Fit(NamedTuple):
@@ -244,18 +202,16 @@ def features(model: MotionModel, gaps: Gaps) -> Floats:
 def features_of(fit: Fit, gap_s: Floats) -> Floats:
     """The same of gaps (E,) with this fit and so many seconds."""
     speed = log_speed(fit.speed)
-    return np.stack(
-        [
-            log_distance(fit.miss),
-            np.log1p(fit.misfit**2 / fit.spread_m2 / 2),
-            gap_s,
-            log_distance(np.minimum(fit.misfit, fit.stay)) * np.log(gap_s + 0.4),
-            log_speed(fit.turn),
-            log_distance(fit.stay) * speed,
-            log_distance(fit.misfit) * speed,
-        ],
-        axis=1,
-    )
+    values = {
+        "miss": log_distance(fit.miss),
+        "misfit": np.log1p(fit.misfit**2 / fit.spread_m2 / 2),
+        "gap": gap_s,
+        "misfit or stay": log_distance(np.minimum(fit.misfit, fit.stay)) * np.log(gap_s + 0.4),
+        "turn": log_speed(fit.turn),
+        "distance and speed": log_distance(fit.stay) * speed,
+        "misfit and speed": log_distance(fit.misfit) * speed,
+    }
+    return columns(FEATURES, values)
 
 
 def log_distance(distance_m: Floats) -> Floats:

@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, repeat
 from types import MappingProxyType
-from typing import ClassVar, Final, TypeAlias, TypeVar
+from typing import Any, ClassVar, Final, TypeAlias
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Ints
-from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.clocks import seconds_to_ns
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.notices import warn
 from mcaptrack.predictors import warn_if_weak
 from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, Frame, Rows
-from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns, collect
-from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.by_class import join_classes, split_classes
+from mcaptrack.schema.frame_columns import FrameColumns, collect
+from mcaptrack.schema.framing import filtered_rows
 from mcaptrack.schema.resampling import resample_parts
 from mcaptrack.transforms.forecasts import Forecaster
 from mcaptrack.transforms.protocol import ModelCard
-from mcaptrack.transforms.retrack.appearance import AppearanceCalibration
-from mcaptrack.transforms.retrack.assignments import (
-    Movers,
-    OnlinePass,
-    at_pace_of_log,
-    join_classes,
-    movers_of,
-    split_classes,
-    usual_score,
-)
+from mcaptrack.transforms.retrack.appearance import AppearanceCalibration, appearance_rows
 from mcaptrack.transforms.retrack.consistency import ConsistencyPass
 from mcaptrack.transforms.retrack.in_pictures import link_in_picture
-from mcaptrack.transforms.retrack.likelihood import LikelihoodPass, motion_model
-from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
-from mcaptrack.transforms.retrack.offline import appearance_rows, offline_tracks
+from mcaptrack.transforms.retrack.offline import offline_tracks
 from mcaptrack.transforms.retrack.options import (
     APPEARANCE_OUTPUT,
     WORLDS_OUTPUT,
@@ -43,9 +33,16 @@ from mcaptrack.transforms.retrack.options import (
     LikelihoodOptions,
     RetrackOptions,
 )
+from mcaptrack.transforms.retrack.passes import (
+    KeptIds,
+    LikelihoodPass,
+    OnlinePass,
+    at_pace_of_log,
+    motion_model,
+    movers_of,
+    usual_score,
+)
 from mcaptrack.transforms.to_video_rate import steady_s, to_metres
-
-Options = TypeVar("Options", bound=RetrackOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,9 +64,12 @@ class Retrack(LikelihoodOptions):
     {1}
     """
 
+    #: The class of its online pass.
+    new_pass: ClassVar[type[Any]] = LikelihoodPass
+
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
         seen: list[AppearanceCalibration] = []
-        yield from _retrack(self, LikelihoodPass, frames, seen)
+        yield from _retrack(self, frames, seen)
         object.__setattr__(self, "_seen", seen)
 
     def model_card(self) -> ModelCard:
@@ -94,93 +94,29 @@ class RetrackByConsistency(ConsistencyOptions):
 
     #: Rows of people outside of the picture stay, as in the paper (see ``pipeline.visible``).
     keeps_unseen: ClassVar[bool] = True
+    new_pass: ClassVar[type[Any]] = ConsistencyPass
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
-        return _retrack(self, ConsistencyPass, frames)
+        return _retrack(self, frames, [])
 
 
 Retracking: TypeAlias = Retrack | RetrackByConsistency
 
 
-# Online re-tracking of tracks in metres: input ids are kept.
-#
-# A tracker of 3D boxes associates in metres and at the boxes' own rate, which is more than samples can add. What is
-# left is done offline: to link tracks over long gaps, to leave out false ones, and to smooth. Letters: R rows, K
-# tracks.
-
-
-class KeptIds(OnlinePass):
-    """Online re-tracking that keeps the ids of the input.
-
-    Parameters
-    ----------
-    options : RetrackOptions
-    movers : Movers
-    frames : FrameColumns
-        Samples of tracks; each goes to the track of its input id.
-    """
-
-    def __init__(self, options: RetrackOptions, movers: Movers, frames: FrameColumns) -> None:
-        super().__init__(options.rate_hz, LAST_NS / NS_PER_S)
-        self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
-        self._number: dict[int, int] = {}
-        self._forecaster = Forecaster(
-            options.predictor,
-            options.horizon_s,
-            options.min_history,
-            options.rate_hz,
-            options.class_names,
-            options.class_limits,
-            adapt=options.follows_log,
-        )
-        self.online = self._read(frames)
-
-    def _read(self, frames: FrameColumns) -> FrameColumns:
-        """The online tracks: frames with the samples under numbers of their own."""
-        out = FrameCollector(TRACKS)
-        for low, high, joined in joined_parts(TRACKS, frames):
-            for t_ns in joined.t_ns.tolist():
-                self.advance(t_ns)
-            rows = joined.rows.take(np.lexsort((joined.rows["track_id"], joined.frame)))
-            numbers = frames.numbers[low:high]
-            self.samples.extend(joined.t_ns, numbers, joined.ends, rows)
-            source = rows["track_id"].copy()
-            own = self._numbers(source)
-            self.assignments.add(np.array(self.steps[low:high], np.int64)[joined.frame], own, source)
-            online = rows.copy()
-            online["source_id"], online["track_id"] = source, own
-            out.extend(joined.t_ns, numbers, joined.ends, online)
-        return out.done()
-
-    def _numbers(self, source: Ints) -> Ints:
-        """The number of the track of each input id (R,): from 1 on in the order in which they come."""
-        ids, first, which = np.unique(source, return_index=True, return_inverse=True)
-        for number in ids[np.argsort(first)].tolist():
-            self._number.setdefault(number, len(self._number) + 1)
-        return np.array([self._number[number] for number in ids.tolist()], np.int64)[which]
-
-    def outputs(self) -> tuple[FrameColumns, FrameColumns]:
-        return self.online, self._forecaster.predict_all(self.online)
-
-
 def _retrack(
-    options: Options,
-    new_pass: Callable[[Options, Movers], OnlinePass],
-    frames: Iterable[Frame],
-    seen: list[AppearanceCalibration] | None = None,
+    options: Retracking, frames: Iterable[Frame], seen: list[AppearanceCalibration]
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame the offline tracks, the online tracks and their predictions, and further outputs that the options
     write; each class by itself. How appearance tells tracks apart is added to ``seen``, for each class.
     """
     warn_if_weak(options.predictor)
-    calibrations = [] if seen is None else seen
     if options.leaves_unchanged:
-        yield from _keep_ids(options, frames, calibrations)
+        yield from _keep_ids(options, frames, seen)
         return
     frames = _placed(collect(TRACKS, frames))
     classes = [frames] if options.across_classes else split_classes(frames)
     score = usual_score(frames)
-    outputs = [_retracked(options, new_pass, part, score, calibrations) for part in classes]
+    outputs = [_retracked(options, part, score, seen) for part in classes]
     if len(classes) > 1:
         yield from join_classes([list(map(collect, options.writes.values(), part)) for part in outputs])
         return
@@ -190,15 +126,12 @@ def _retrack(
 
 def _placed(frames: FrameColumns) -> FrameColumns:
     """The frames without the rows that have no position in metres; how many these are is said."""
-    counts = [(~_is_placed(part.rows)).sum() for _, _, part in joined_parts(TRACKS, frames)]
-    if not any(counts):
+    placed = filtered_rows(TRACKS, frames, lambda part: np.isfinite(part.rows["x_m"]) & np.isfinite(part.rows["y_m"]))
+    lost = int(frames.ends[-1] - placed.ends[-1])
+    if not lost:
         return frames
-    warn(f"{sum(counts):,} rows of tracks have no position in metres, and are left out", "left-out")
-    return collect(TRACKS, (frame._replace(rows=frame.rows[_is_placed(frame.rows)]) for frame in frames))
-
-
-def _is_placed(rows: Rows) -> Bools:
-    return np.asarray(np.isfinite(rows["x_m"]) & np.isfinite(rows["y_m"]))
+    warn(f"{lost:,} rows of tracks have no position in metres, and are left out", "left-out")
+    return placed
 
 
 def _keep_ids(
@@ -242,35 +175,22 @@ def _sampled(tracks: FrameColumns, at_ns: Ints, gap_s: float, planes: Planes) ->
 
 
 def _retracked(
-    options: Options,
-    new_pass: Callable[[Options, Movers], OnlinePass],
-    frames: FrameColumns,
-    score: float,
-    seen: list[AppearanceCalibration],
+    options: Retracking, frames: FrameColumns, score: float, seen: list[AppearanceCalibration]
 ) -> list[Iterable[Frame]]:
     """The outputs of re-tracking without regard to classes; ``score`` is the usual one of the log."""
     movers = movers_of(frames, options.class_names, score, options.class_limits)
-    online = KeptIds(options, movers, frames) if movers.on_ground else _passed(new_pass(options, movers), frames)
+    online: OnlinePass = (KeptIds if movers.on_ground else options.new_pass)(options, movers, frames)
     run = online
     if options.follows_speed and not movers.on_ground and (paced := at_pace_of_log(movers, frames)) != movers:
-        movers, run = paced, _passed(new_pass(options, paced), frames)
+        movers, run = paced, options.new_pass(options, paced, frames)
     model = motion_model(options, run.noise_m, movers)
-    offline = offline_tracks(options, model, run.assignments, run.samples, run.steps, frames.t_ns, movers)
-    seen.extend([] if offline.calibration is None else [offline.calibration])
-    times = frames.t_ns.tolist(), frames.numbers.tolist()
+    rows, calibration = offline_tracks(options, model, run, movers)
+    seen.extend([] if calibration is None else [calibration])
     causal, predictions = online.outputs()
     outputs: dict[str, Iterable[Frame]] = {"online": causal, "predictions": predictions}
-    of_log = {"": offline.tracks, "decisions": offline.decisions, APPEARANCE_OUTPUT: offline.looks}
-    outputs |= {name: map(Frame, *times, rows) for name, rows in (of_log | {WORLDS_OUTPUT: offline.worlds}).items()}
+    for name, of_frames in rows.items():
+        outputs[name] = map(Frame, frames.t_ns.tolist(), frames.numbers.tolist(), of_frames)
     return [outputs[name] for name in options.writes]
-
-
-def _passed(run: OnlinePass, frames: FrameColumns) -> OnlinePass:
-    """A pass that has seen all frames."""
-    for frame in frames:
-        run.step(frame)
-    run.finish()
-    return run
 
 
 _PAPER: Final = RetrackByConsistency(

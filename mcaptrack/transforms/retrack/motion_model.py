@@ -42,7 +42,7 @@ class MotionModel:
 
     noise_m: float
     speed_m_per_s: float
-    drift_m_per_s: float
+    drift_m_per_s: Floats | float
     drift_ratio: float
     step_s: float
 
@@ -85,6 +85,25 @@ def update(state: StateRows, xy_m: Floats, noise_m: Floats | float) -> None:
     v -= of_velocity * c
     p *= 1 - of_place
     c *= 1 - of_place
+
+
+class Tracks(NamedTuple):
+    """Samples that are assigned to tracks, (C,) each: step, track, input id, sample, position (C, 2) in units, the
+    descriptor of what is seen of it, or -1, and the online track.
+    """
+
+    step: Ints
+    track: Ints
+    source: Ints
+    sample: Ints
+    xy_m: Floats
+    look: Ints
+    online: Ints
+
+    @property
+    def order(self) -> Ints:
+        """The order by track, then step."""
+        return np.lexsort((self.step, self.track))
 
 
 class Trajectories(NamedTuple):
@@ -135,7 +154,9 @@ class _Steps(NamedTuple):
     @classmethod
     def of(cls, first: Ints) -> _Steps:
         """The steps of tracks that begin at these rows, (K + 1,)."""
-        order, alive = _by_length(first)
+        length = np.diff(first)
+        order = np.argsort(-length, kind="stable")
+        alive = np.searchsorted(-length[order], -np.arange(int(length.max(initial=0))), "left")
         step, place = group_index(alive), ragged_range(0, alive)
         forward = first[:-1][order][place] + step
         return cls(forward, first[1:][order][place] - 1 - step, [0, *np.cumsum(alive).tolist()])
@@ -307,15 +328,6 @@ def _smooth_back(model: MotionModel, states: StateRows, bounds: Sequence[int]) -
         cov[0] += g00**2 * dp + 2 * g00 * g01 * dc + g01**2 * dv
         cov[1] += g00 * g10 * dp + (g00 * g11 + g01 * g10) * dc + g01 * g11 * dv
         cov[2] += g10**2 * dp + 2 * g10 * g11 * dc + g11**2 * dv
-
-
-def _by_length(first: Ints) -> tuple[Ints, Ints]:
-    """Tracks from the longest to the shortest, and for each k how many of them have a row k."""
-    length = np.diff(first)
-    order = np.argsort(-length, kind="stable")
-    longest = int(length.max(initial=0))
-    alive = np.searchsorted(-length[order], -np.arange(longest), "left")
-    return order, alive
 
 
 def _filter(model: MotionModel, xy_m: Floats, noise_m: Floats, bounds: Sequence[int]) -> StateRows:

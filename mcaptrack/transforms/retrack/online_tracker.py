@@ -20,8 +20,8 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
+from mcaptrack.geometry.hull import GrowingHull
 from mcaptrack.geometry.neighbours import Pairing, near_pairs
-from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, StateRows, update
 
@@ -32,9 +32,10 @@ _OUTSIDE: Final = 0.1
 _MIN_RATE: Final = 0.01
 #: The squared radius of that circle, for a variance of 1.
 _CIRCLE: Final = -2 * np.log(_OUTSIDE)
-#: The rows of the whole numbers of tracks: id, input id of the last observation (-1: of a merged detection), number of
-#: observations, steps since the last one, and steps for which the track is merged into the detection of another one.
-IDS, SOURCE, HITS, MISSED, MERGED = range(5)
+#: The rows of the whole numbers of tracks: id, input id of the last observation (-1: of a merged detection), its number
+#: in the log, how many there were, steps since the last one, and steps for which the track is merged into the detection
+#: of another one.
+IDS, SOURCE, SAMPLE, HITS, MISSED, MERGED = range(6)
 
 
 # Online links: which new track continues a lost one, decided from when the new one begins until it has lasted.
@@ -61,11 +62,12 @@ _BATCH: Final = 200_000
 
 
 class _Known(NamedTuple):
-    """Tracks (K,): ids, the steps at which they began, were last observed and are over, the number of observations, the
-    state at the first one, and at the last one.
+    """Tracks (K,): ids, those under which they are written, or -1, the steps at which they began, were last observed
+    and are over, the number of observations, the state at the first one, and at the last one.
     """
 
     ids: Ints
+    names: Ints
     began: Ints
     last: Ints
     over: Ints
@@ -76,7 +78,7 @@ class _Known(NamedTuple):
 
 _NONE: Final = np.empty(0, np.int64)
 _NO_STATE: Final = State(np.empty((0, 4)), np.empty((0, 3)))
-_NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, _NO_STATE, _NO_STATE)
+_NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, _NONE, _NO_STATE, _NO_STATE)
 
 
 class _Links(NamedTuple):
@@ -112,71 +114,61 @@ class OnlineLinks:
         self._confirm_hits, self._settled_hits = confirm_hits, _lasting(confirm_hits)
         self._sure = float(np.log(min_confidence / (1 - min_confidence)))
         self._least = self._sure + float(np.log(linking.ENOUGH))
-        self._names: dict[int, int] = {}  # the ids under which tracks are written, of those that were
-        self._alive, self._lost = (
-            _NO_TRACKS,
-            _NO_TRACKS,
-        )  # lost ones are over, were written, and are continued by no other
+        self._alive, self._lost = _NO_TRACKS, _NO_TRACKS  # lost ones were written, and are continued by no other
         self._links: deque[tuple[float, float]] = deque(maxlen=_LINKS)  # log odds and seconds
         self._link_count, self._estimated = 0, 0
         self._shifts = linking.prior_shifts(np.empty(0), np.empty(0))
 
-    def __call__(
-        self, steps: Ints, tick: Ints, tracks: Ints, state: State, is_observed: Bools, is_written: Bools
-    ) -> tuple[Ints, Bools]:
-        """The ids under which the tracks alive at each of F steps are written, (R,), and whether they are, (R,).
+    def __call__(self, seen: Alive, is_written: Bools) -> tuple[Ints, Bools]:
+        """The ids under which the tracks alive at some steps are written, (R,), and whether they are, (R,).
 
-        ``steps`` (F,) are the numbers of the steps, ``tick`` (R,) the index of the step of each track, rising;
-        ``tracks`` (5, R) and ``state`` (R,) are as in ``Step``. ``is_written`` (R,) says which are written in any case.
-        Nothing is known at a step that was not known then.
+        ``is_written`` (R,) says which are written in any case. Nothing is known at a step that was not known then.
         """
+        steps, _, tick, tracks, state = seen
         if self._max_gap_steps <= 0:
             return np.asarray(tracks[IDS]), is_written
-        alive, which = self._known(steps, tick, tracks, state, is_observed)
-        count = len(tick)
-        is_named = self._are_named(alive.ids)
+        alive, which = self._known(seen)
+        count, is_observed = len(tick), seen.is_observed
+        is_named, is_own = alive.names >= 0, (alive.names < 0) | (alive.names == alive.ids)
         first = np.full(len(alive.ids), count)  # the row from which on a track is written that was not written before
         written = np.flatnonzero(is_written & ~is_named[which])
         np.minimum.at(first, which[written], written)
         is_early = (np.arange(count) <= first[which]) & ~is_named[which]
         is_judged = is_early | (tracks[HITS] <= self._settled_hits)
-        is_own = np.array([self._names.get(track, track) == track for track in alive.ids.tolist()], bool)
         rows = np.flatnonzero(((is_written & is_early) | is_observed) & is_judged & is_own[which])
         of = which[rows]
         new = taken(alive, of)._replace(last=steps[tick[rows]], hits=tracks[HITS, rows], state=taken(state, rows))
-        over = np.flatnonzero(alive.over < _NEVER)
-        lost = joined([self._lost, taken(alive, over)])
+        known, before = joined([self._lost, alive]), len(self._lost.ids)
+        is_over = known.over < _NEVER
+        lost_at = np.flatnonzero(is_over)
+        lost_at = lost_at[np.argsort(known.ids[lost_at])]  # links of equal odds are chosen by ids
+        lost, names = taken(known, lost_at), known.names.copy()
         # a lost track was written before it was over; or else it has to continue another one
-        was_written = np.append(np.ones(len(self._lost.ids), bool), first[over] < count)
-        order = np.argsort(lost.ids)  # however many steps are read at once, links of equal odds are chosen by ids
-        lost, was_written = taken(lost, order), was_written[order]
+        was_written = np.append(np.ones(before, bool), first < count)[lost_at]
         is_first = rows == first[of]
         is_settled = new.hits >= self._settled_hits
         links = self._candidates(lost, new, is_first)
         since = np.full(len(alive.ids), count)  # those that continue another one are written whenever they are observed
         since[~is_own] = 0
-        used = np.zeros(len(lost.ids), bool)
+        used = np.zeros(len(lost_at), bool)
         for at_once in np.split(np.arange(len(links.new)), np.flatnonzero(np.diff(tick[rows[links.new]])) + 1):
             may_be = ~used[links.lost[at_once]] & (since[of[links.new[at_once]]] == count)
-            may_be &= was_written[links.lost[at_once]] | self._are_named(lost.ids[links.lost[at_once]])
+            may_be &= was_written[links.lost[at_once]] | (names[lost_at[links.lost[at_once]]] >= 0)
             edges = taken(links, at_once[may_be])
             chosen = self._decide(edges, is_first[edges.new], is_settled[edges.new])
-            for ended, other in zip(edges.lost[chosen].tolist(), edges.new[chosen].tolist(), strict=True):
-                self._names[int(new.ids[other])] = self._names.get(int(lost.ids[ended]), int(lost.ids[ended]))
-                used[ended], since[of[other]] = True, rows[other]
-        for track in alive.ids[first < count].tolist():
-            self._names.setdefault(track, track)
+            ended, other = edges.lost[chosen], edges.new[chosen]
+            own = names[lost_at[ended]]
+            names[before + of[other]] = np.where(own >= 0, own, lost.ids[ended])
+            used[ended], since[of[other]] = True, rows[other]
+        is_new = np.append(np.zeros(before, bool), first < count) & (names < 0)
+        names[is_new] = known.ids[is_new]
+        known = known._replace(names=names)
         reached = lost.last >= steps[-1] - self._max_gap_steps
-        self._lost = taken(lost, reached & ~used & self._are_named(lost.ids))
-        self._alive = taken(alive, alive.over == _NEVER)
-        names = np.array([self._names.get(track, track) for track in alive.ids.tolist()], np.int64)
-        kept = {*self._alive.ids.tolist(), *self._lost.ids.tolist()}
-        self._names = {track: name for track, name in self._names.items() if track in kept}
+        self._lost = taken(known, lost_at[reached & ~used & (names[lost_at] >= 0)])
+        self._alive = taken(known, ~is_over)
+        shown = np.where(names < 0, known.ids, names)[before:]
         continues = np.arange(count) >= since[which]
-        return np.where(continues, names[which], tracks[IDS]), is_written | (is_observed & continues)
-
-    def _are_named(self, ids: Ints) -> Bools:
-        return np.array([track in self._names for track in ids.tolist()], bool)
+        return np.where(continues, shown[which], tracks[IDS]), is_written | (is_observed & continues)
 
     def _candidates(self, lost: _Known, new: _Known, is_written: Bools) -> _Links:
         """The links with a chance from lost tracks (L,) to new ones (N,), ordered by these, at the steps ``new.last``.
@@ -217,7 +209,7 @@ class OnlineLinks:
         if not len(is_made):
             return is_made
         ends, begins = (np.unique(side, return_inverse=True)[1] for side in (links.lost, links.new))
-        best = linking.best_links(ends, begins, links.log_odds, len(is_made))
+        best = linking.best_links(ends, begins, links.log_odds - linking.MIN_LOG_ODDS, len(is_made))
         shifted = links.log_odds[best] + self._shifts[linking.gap_classes(links.gap_s[best])]
         is_right = shifted > np.where(is_first[best], self._least, self._sure)
         counts = best[is_settled[best] | is_right]
@@ -225,38 +217,29 @@ class OnlineLinks:
         is_made[best[is_right]] = True
         return is_made
 
-    def _known(self, steps: Ints, tick: Ints, tracks: Ints, state: State, is_observed: Bools) -> tuple[_Known, Ints]:
+    def _known(self, seen: Alive) -> tuple[_Known, Ints]:
         """All tracks as known at the last step or when they were over, (K,), and the one that each row (R,) is of."""
-        before = self._alive
-        names, which = np.unique(np.concatenate([before.ids, tracks[IDS]]), return_inverse=True)
-        had, which = which[: len(before.ids)], which[len(before.ids) :]
-        ends = np.full(len(names), -1)
-        ends[which] = tick  # rising, so the last one stays
-        last_row = np.full(len(names), -1)
-        seen = np.flatnonzero(is_observed)
-        last_row[which[seen]] = seen
-        began = np.full(len(names), _NEVER)
-        np.minimum.at(began, which, steps[tick])
-        began[had] = before.began
-        (last, hits), mean, cov = (
-            np.zeros((2, len(names)), np.int64),
-            np.zeros((len(names), 4)),
-            np.zeros((len(names), 3)),
+        before, count = self._alive, len(self._alive.ids)
+        at, hits = seen.steps[seen.tick], seen.tracks[HITS]
+        ids, first, which = np.unique(
+            np.concatenate([before.ids, seen.tracks[IDS]]), return_index=True, return_inverse=True
         )
-        begun = State(np.zeros((len(names), 4)), np.zeros((len(names), 3)))
-        is_new = np.ones(len(names), bool)
-        is_new[had] = False
-        first_row = np.full(len(names), len(tick))
-        np.minimum.at(first_row, which, np.arange(len(tick)))
-        for column, at_birth, now_at in zip(begun, before.begun, state, strict=True):
-            column[had] = at_birth
-            column[is_new] = now_at[first_row[is_new]]
-        earlier, now = (before.last, before.hits, *before.state), (steps[tick], tracks[HITS], *state)
-        is_seen = last_row >= 0
-        for values, was, is_now in zip((last, hits, mean, cov), earlier, now, strict=True):
-            values[had] = was
-            values[is_seen] = is_now[last_row[is_seen]]
-        return _Known(names, began, last, np.append(steps, _NEVER)[ends + 1], hits, begun, State(mean, cov)), which
+        observed = np.concatenate([np.arange(count), count + np.flatnonzero(seen.is_observed)])
+        last = np.empty(len(ids), np.int64)
+        last[which[observed]] = observed  # rising, so the last one stays
+        ends = np.full(len(ids), -1)
+        ends[which[count:]] = seen.tick
+        known = _Known(
+            ids,
+            np.append(before.names, np.full(len(hits), -1))[first],
+            np.concatenate([before.began, at])[first],
+            np.concatenate([before.last, at])[last],
+            np.append(seen.steps, _NEVER)[ends + 1],
+            np.concatenate([before.hits, hits])[last],
+            taken(joined([before.begun, seen.state]), first),
+            taken(joined([before.state, seen.state]), last),
+        )
+        return known, which[count:]
 
     def _learn(self, log_odds: Floats, gap_s: Floats) -> None:
         """Learn from the best links so far how many are right after gaps of what length."""
@@ -299,14 +282,32 @@ class Association:
 class Step(NamedTuple):
     """The tracks alive after a step.
 
-    ``tracks`` (5, K) are their whole numbers (``IDS`` to ``MERGED``), ``row`` (K,) is the observation that each has, or
-    -1, and ``mean`` (4, K) and ``cov`` (3, K) are their states, as in ``StateRows``.
+    ``tracks`` (6, K) are their whole numbers (``IDS`` to ``MERGED``), ``mean`` (4, K) and ``cov`` (3, K) are their
+    states, as in ``StateRows``.
     """
 
     tracks: Ints
-    row: Ints
     mean: Floats
     cov: Floats
+
+
+class Alive(NamedTuple):
+    """The tracks alive at each of F steps, R in all, laid end to end.
+
+    ``steps`` (F,) are the numbers of the steps, ``passed`` (F,) is by how many time advanced to each, and ``tick`` (R,)
+    the index of the step of each track, rising. ``tracks`` (6, R) are as in ``Step``, ``state`` (R,) are their states.
+    """
+
+    steps: Ints
+    passed: Ints
+    tick: Ints
+    tracks: Ints
+    state: State
+
+    @property
+    def is_observed(self) -> Bools:
+        """Which tracks have an observation at that step, (R,)."""
+        return np.asarray(self.tracks[MISSED] == 0)
 
 
 @dataclass
@@ -324,7 +325,7 @@ class OnlineTracker:
     confirm_hits: int
     max_age_tentative: int
     estimate_noise: bool = True
-    tracks: Ints = field(default_factory=lambda: np.empty((5, 0), np.int64))
+    tracks: Ints = field(default_factory=lambda: np.empty((6, 0), np.int64))
     state: StateRows = field(default_factory=lambda: StateRows(np.empty((4, 0)), np.empty((3, 0))))
     next_id: int = 1
     judged: int = 0
@@ -334,12 +335,11 @@ class OnlineTracker:
     def __post_init__(self) -> None:
         self.noise_m = self.model.noise_m
 
-    def step(self, xy_m: Floats, source: Ints, passed: int, most_noise_m: float = np.inf) -> Step:
+    def step(self, xy_m: Floats, source: Ints, sample: Ints, passed: int) -> Step:
         """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,).
 
-        The noise of positions is estimated as no larger than ``most_noise_m``.
+        ``sample`` (N,) are the numbers of the observations in the log.
         """
-        self._limit_noise(most_noise_m)
         self.tracks[MISSED] += passed
         is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
         is_over = is_over < self.tracks[MISSED]
@@ -349,79 +349,55 @@ class OnlineTracker:
         if self.tracks.shape[1]:
             self.model.predict(self.state, passed * self.model.step_s, self.state)
         track, row = self._assigned(xy_m, source)
-        observed = xy_m[:, row]
-        occluded, occluder = self._merged_detections(track, observed)
-        if len(occluded):
-            self._update_occluded(occluded, observed[:, occluder], passed)
         if len(track):
-            self._update(track, observed, source[row], occluder)
-            self._limit_noise(most_noise_m)
-        row_of = np.full(self.tracks.shape[1], -1)
-        row_of[track] = row
+            occluder = self._merge(track, xy_m[:, row], passed)
+            self._update(track, xy_m[:, row], source[row], occluder)
+            self.tracks[SAMPLE, track] = sample[row]
         if len(row) < len(source):
             is_free = np.ones(len(source), bool)
             is_free[row] = False
             free = is_free.nonzero()[0]
-            row_of = np.concatenate([row_of, free])
-            self._start(xy_m[:, free], source[free])
+            self._start(xy_m[:, free], source[free], sample[free])
         self.known_sources.update(source.tolist())
-        return Step(self.tracks.copy(), row_of, self.state.mean.copy(), self.state.cov.copy())
+        return Step(self.tracks.copy(), self.state.mean.copy(), self.state.cov.copy())
 
-    def _merged_detections(self, track: Ints, observed: Floats) -> tuple[Ints, Ints]:
-        """Find pairs of tracks merged into one detection (occlusion), and which track has that detection.
+    def _merge(self, track: Ints, observed: Floats, passed: int) -> Ints:
+        """Update lost tracks that are merged into one detection with another track (occlusion).
 
         A lost track becomes occluded by another one if the observation of the latter lies between both, and the middle
-        makes it likelier than its own track does. ``observed`` (2, P) are the observations of the tracks ``track``
-        (P,). Returns the occluded tracks, and for each the index into ``track`` of the one that occludes it.
+        makes it likelier than its own track does. It says little about the position of each, and its input id nothing
+        about either track once they separate. ``observed`` (2, P) are the observations of the tracks ``track`` (P,).
+        Returns the indices into ``track`` of those that occlude others.
         """
-        tracks, (p, _, _) = self.tracks, self.state.cov
+        tracks, limits, (p, _, _) = self.tracks, self.association, self.state.cov
         is_confirmed = tracks[HITS] >= self.confirm_hits
-        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < self.association.merge_timeout_s)
+        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < limits.merge_timeout_s)
         is_lost[track] = False
-        lost = is_lost.nonzero()[0]
-        if len(lost) == 0:
-            return _NOTHING
-        confirmed = is_confirmed[track].nonzero()[0]
-        if len(confirmed) == 0:
-            return _NOTHING
+        lost, confirmed = is_lost.nonzero()[0], is_confirmed[track].nonzero()[0]
+        if not len(lost) or not len(confirmed):
+            return np.empty(0, np.int64)
         seen, expected = observed[:, confirmed], self.state.mean[:2, lost]
-        if len(lost) * len(confirmed) > LARGE_TABLE:
-            from scipy.spatial import cKDTree
-
-            distance, nearest = cKDTree(seen.T).query(expected.T)
-            is_merged = distance < self.association.merge_distance_m
-        else:
-            squared = _squared(expected[:, :, None] - seen[:, None])
-            nearest = squared.argmin(axis=1)
-            is_merged = squared.min(axis=1) < self.association.merge_distance_m**2
-        if not is_merged.any():
-            return _NOTHING
-        lost, expected, nearest = lost[is_merged], expected[:, is_merged], nearest[is_merged]
-        seen, owner = seen[:, nearest], track[confirmed[nearest]]
-        own = self.state.mean[:2, owner]
+        distance_m, nearest = _nearest(expected, seen)
+        is_near = distance_m < limits.merge_distance_m
+        lost, expected, host = lost[is_near], expected[:, is_near], confirmed[nearest[is_near]]
+        seen, owner = observed[:, host], track[host]
+        own, noise = self.state.mean[:2, owner], self.noise_m**2
         to_own, to_middle = _squared(seen - own), _squared(seen - (own + expected) / 2)
-        noise = self.noise_m**2
         alone, together = p[owner] + noise, (p[owner] + p[lost]) / 4 + noise  # the middle of two: a quarter of both
         evidence = to_own / alone - to_middle / together + 2 * np.log(alone / together)
         was_merged = (tracks[MERGED, lost] > 0) | (tracks[SOURCE, lost] == -1)  # they may take turns at having it
-        is_merged = (to_middle < to_own) & (was_merged | (evidence > self.association.merge_evidence))
-        return lost[is_merged], confirmed[nearest[is_merged]]
-
-    def _update_occluded(self, occluded: Ints, xy_m: Floats, passed: int) -> None:
-        """Update occluded tracks with the merged detection, which says little about the position of each.
-
-        Its input id says nothing about either track once they separate.
-        """
-        state = self.state.take(occluded)
-        update(state, xy_m, np.full(len(occluded), self.association.merge_distance_m / 2))
-        self.state.mean[:, occluded], self.state.cov[:, occluded] = state
-        self.tracks[MISSED, occluded] = np.maximum(self.tracks[MISSED, occluded] - passed, 1)
-        self.tracks[MERGED, occluded] += passed
+        is_merged = (to_middle < to_own) & (was_merged | (evidence > limits.merge_evidence))
+        lost, host = lost[is_merged], host[is_merged]
+        state = self.state.take(lost)
+        update(state, observed[:, host], limits.merge_distance_m / 2)
+        self.state.mean[:, lost], self.state.cov[:, lost] = state
+        tracks[MISSED, lost] = np.maximum(tracks[MISSED, lost] - passed, 1)
+        tracks[MERGED, lost] += passed
+        return np.asarray(host)
 
     def _update(self, track: Ints, xy_m: Floats, source: Ints, occluder: Ints) -> None:
         """Update tracks (P,) with their observations (2, P); those of ``occluder`` are merged with others."""
-        state = self.state.take(track)
-        noise_m = np.full(len(track), self.noise_m)
+        state, noise_m = self.state.take(track), np.full(len(track), self.noise_m)
         noise_m[occluder] = self.association.merge_distance_m / 2
         if self.estimate_noise:
             self._adapt_noise(state, xy_m, (self.tracks[HITS, track] >= self.confirm_hits) & (noise_m == self.noise_m))
@@ -442,10 +418,6 @@ class OnlineTracker:
         rate = max(_MIN_RATE, 5 / (self.judged + 50))  # fast at first
         log_noise = np.log(self.noise_m) + rate * float((outside - _OUTSIDE).sum())
         self.noise_m = min(max(float(np.exp(log_noise)), NOISE_M[0]), NOISE_M[1])
-
-    def _limit_noise(self, most_noise_m: float) -> None:
-        if self.estimate_noise:
-            self.noise_m = min(self.noise_m, most_noise_m)
 
     def _assigned(self, xy_m: Floats, source: Ints) -> tuple[Ints, Ints]:
         """Tracks and observations that belong together, (P,) each."""
@@ -469,12 +441,12 @@ class OnlineTracker:
             return assign_by_gain(gain)
         return assign_pairs_by_gain(pairs.chosen(gain > 0), gain[gain > 0], pairs.shape)[0]
 
-    def _start(self, xy_m: Floats, source: Ints) -> None:
+    def _start(self, xy_m: Floats, source: Ints, sample: Ints) -> None:
         """Birth: start a track for each observation (2, N) that was not matched."""
         count = len(source)
-        born = np.zeros((5, count), np.int64)
+        born = np.zeros((6, count), np.int64)
         born[IDS] = range(self.next_id, self.next_id + count)
-        born[SOURCE], born[HITS] = source, 1
+        born[SOURCE], born[SAMPLE], born[HITS] = source, sample, 1
         self.next_id += count
         self.tracks = np.concatenate([self.tracks, born], axis=1)
         new = self.model.initial(xy_m, self.noise_m)
@@ -489,6 +461,17 @@ def _is_crowded(xy_m: Floats, crowd_m: float) -> Bools:
         return np.bincount(pairs, minlength=count) > 0
     near = _squared(xy_m[:, :, None] - xy_m[:, None]) < crowd_m**2
     return np.asarray(near.sum(axis=0) > 1)
+
+
+def _nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
+    """The distance of each point (2, N) to the nearest one of others (2, M), and which it is, (N,)."""
+    if points.shape[1] * others.shape[1] > LARGE_TABLE:
+        from scipy.spatial import cKDTree
+
+        distance, nearest = cKDTree(others.T).query(points.T)
+        return distance, nearest
+    squared = _squared(points[:, :, None] - others[:, None])
+    return np.sqrt(squared.min(axis=1)), squared.argmin(axis=1)
 
 
 def _squared(off: Floats) -> Floats:
@@ -548,8 +531,6 @@ _NEAR_M: Final = 2.0
 _USUAL: Final = 8.0
 #: So many of the last tracks count.
 _LAST: Final = 2000
-#: What happens to tracks, in the order in which it is looked at within a step.
-_OVER, _BACK, _LOST = range(3)
 
 
 class PlaceOdds:
@@ -578,121 +559,27 @@ class PlaceOdds:
 
 
 class PlacesOfLosses:
-    """Where tracks were lost, and what became of them: called with the steps of a log, some at a time."""
+    """Where tracks were lost, and what became of them: called with each step of a log."""
 
     def __init__(self) -> None:
         self._odds = PlaceOdds()
         self._lost: dict[int, tuple[Place, float]] = {}  # where each lost track was lost, and the ratio there
 
-    def __call__(self, passed: Ints, tick: Ints, ids: Ints, is_observed: Bools, xy_m: Floats) -> Floats:
-        """The odds that lost tracks (R,) come back, as ratios to those of the whole log; 1 for others.
+    def __call__(self, passed: int, ids: list[int], is_observed: Bools, xy_m: Floats) -> list[float]:
+        """The odds that lost tracks (K,) come back, as ratios to those of the whole log; 1 for others.
 
-        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the index of the step of each track, rising,
-        and ``xy_m`` (2, R) where it is. Nothing is known at a step that was not known then.
+        ``passed`` is by how many steps time advanced, and ``xy_m`` (2, K) where tracks are.
         """
-        order = np.lexsort((tick, ids))
-        ids, tick, missed = ids[order], tick[order], ~is_observed[order]
-        starts = run_starts(ids)
-        first, last = np.flatnonzero(starts), np.flatnonzero(run_ends(starts))
-        names = ids[first].tolist()
-        for name in self._lost.keys() - set(names):
-            self._end(name, is_told=bool(passed[0] == 1))
-        was_missed = np.append(False, missed[:-1])[: len(ids)]
-        was_missed[first] = [name in self._lost for name in names]
-        happened = (
-            last[missed[last] & (tick[last] < len(passed) - 1)],
-            np.flatnonzero(was_missed & ~missed),
-            np.flatnonzero(missed & ~was_missed),
-        )
-        row, what = np.concatenate(happened), np.repeat(range(len(happened)), [len(rows) for rows in happened])
-        when = tick[row] + (what == _OVER)
-        x_m, y_m = xy_m[:, order[row]].tolist()
-        ratio = np.ones(len(ids))  # at the row from which on it holds
-        ratio[first] = [self._lost[name][1] if name in self._lost else 1.0 for name in names]
-        events = zip(when.tolist(), what.tolist(), row.tolist(), ids[row].tolist(), x_m, y_m, strict=True)
-        for step, event, at, name, x, y in sorted(events):
-            if event == _OVER:
-                self._end(name, is_told=bool(passed[step] == 1))
-            elif event == _BACK:
-                self._odds.add(self._lost.pop(name)[0], True)
-                ratio[at] = 1.0
-            else:
-                ratio[at] = self._odds.ratio((x, y))
-                self._lost[name] = (x, y), float(ratio[at])
-        changes = np.union1d(first, row[what != _OVER])
-        out = np.empty(len(order))
-        out[order] = np.repeat(ratio[changes], np.diff(np.append(changes, len(order))))
-        return out
-
-    def _end(self, name: int, is_told: bool) -> None:
-        """A lost track is over; a gap of the log ends tracks without telling anything of them."""
-        place, _ = self._lost.pop(name)
-        if is_told:
-            self._odds.add(place, False)
-
-
-# Convex hulls that grow. Letters: N points, V vertices.
-
-
-#: Points so little outside are taken for inside, in units of length.
-_SLACK: Final = 1e-6
-
-
-@dataclass
-class GrowingHull:
-    """The convex hull of all points so far.
-
-    Attributes
-    ----------
-    vertices : (V, 2) of float
-        Its vertices, anticlockwise; fewer than three if no area was seen yet, which has no inside.
-
-    Examples
-    --------
-    >>> hull = GrowingHull()
-    >>> hull.add(np.array([[0.0, 4.0, 4.0, 0.0, 2.0], [0.0, 0.0, 4.0, 4.0, 2.0]]))
-    >>> hull.vertices.tolist()
-    [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]]
-    >>> hull.holds(np.array([[1.0, 5.0], [1.0, 1.0]])).tolist()
-    [True, False]
-    """
-
-    vertices: Floats = field(default_factory=lambda: np.empty((0, 2)))
-    _normals: Floats = field(init=False, default_factory=lambda: np.empty((0, 2)))
-    _limits: Floats = field(init=False, default_factory=lambda: np.empty((0, 1)))
-
-    def holds(self, xy: Floats) -> Bools:
-        """Which points (2, N) are inside, (N,); those that are NaN are not."""
-        if not len(self._normals):
-            return np.zeros(xy.shape[1], bool)
-        return np.asarray((self._normals @ xy <= self._limits).all(axis=0))
-
-    def add(self, xy: Floats) -> None:
-        """Add points (2, N); those that are NaN are left out."""
-        new = xy[:, np.isfinite(xy).all(axis=0) & ~self.holds(xy)]
-        if not new.shape[1]:
-            return
-        points = sorted({(x, y) for x, y in [*self.vertices.tolist(), *new.T.tolist()]})
-        ring = [*_chain(points), *_chain(points[::-1])]
-        self.vertices = np.array(ring)
-        if len(ring) > 2:
-            edges = np.roll(self.vertices, -1, axis=0) - self.vertices
-            outwards = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-            self._normals = outwards / np.hypot(*outwards.T)[:, None]
-            self._limits = (self._normals * self.vertices).sum(axis=1)[:, None] + _SLACK
-
-
-def _chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """One side of the hull of sorted points, without the last one (A. M. Andrew, 1979)."""
-    out: list[tuple[float, float]] = []
-    for x, y in points:
-        while len(out) > 1:
-            (ax, ay), (bx, by) = out[-2:]
-            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
-                break
-            out.pop()
-        out.append((x, y))
-    return out[:-1] if len(out) > 1 else out
+        alive = dict(zip(ids, is_observed.tolist(), strict=True))
+        for name in [name for name in self._lost if alive.get(name, True)]:
+            place, _ = self._lost.pop(name)
+            if name in alive or passed == 1:  # a gap of the log ends tracks without telling anything of them
+                self._odds.add(place, name in alive)
+        for k in np.flatnonzero(~is_observed).tolist():
+            if ids[k] not in self._lost:
+                place = float(xy_m[0, k]), float(xy_m[1, k])
+                self._lost[ids[k]] = place, self._odds.ratio(place)
+        return [self._lost[name][1] if name in self._lost else 1.0 for name in ids]
 
 
 class ShownTracks:
@@ -727,22 +614,19 @@ class ShownTracks:
         #: Of the last step: id, levels of observations and of steps without one, and whether outside, (4, K).
         self._last: Ints = np.empty((4, 0), np.int64)
 
-    def __call__(self, passed: Ints, tick: Ints, is_observed: Bools, tracks: Ints, xy_m: Floats) -> Bools:
-        """Which of the tracks alive at each of F steps are written, (R,).
-
-        ``passed`` (F,) is by how many steps time advanced, ``tick`` (R,) the number of the step of each row, rising;
-        ``tracks`` (5, R) and ``xy_m`` (2, R) are as in ``Step``. Nothing is known at a step that was not known then.
-        """
+    def __call__(self, alive: Alive) -> Bools:
+        """Which of the tracks alive at some steps are written, (R,). Nothing is known that was not known then."""
+        (_, passed, tick, tracks, _), is_observed = alive, alive.is_observed
         is_confirmed, may_coast = tracks[HITS] >= self._confirm_hits, tracks[MISSED] <= self._coast
         if not self._adapts:
             is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
             return np.asarray(np.where(is_observed, is_confirmed, may_coast & is_old))
-        outside = ~self._inside(len(passed), tick, is_observed & is_confirmed, xy_m)
+        inside, ratio = self._where(alive, is_observed & is_confirmed)
+        outside = ~inside
         level, next_level = (self._level(tracks[HITS] + more) for more in (0, 1))
         age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
         lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
         lasting, where = level >= self._levels, outside.astype(np.intp)
-        ratio = self._places(passed, tick, tracks[IDS], is_observed, xy_m)
         early = lasts[tick, level] >= 0.5
         comes_back = _at_odds(returns[tick, where, age], ratio) * lasts[tick, next_level] >= 0.5
         stays = may_coast & ((lasting & ~outside) | comes_back)
@@ -751,16 +635,20 @@ class ShownTracks:
     def _level(self, hits: Ints) -> Ints:
         return -(-np.minimum(hits, self._lasting) * self._levels // self._lasting)
 
-    def _inside(self, count: int, tick: Ints, is_sure: Bools, xy_m: Floats) -> Bools:
-        """Which tracks (R,) are in the area in which others, or they themselves, were seen before."""
-        bounds = np.searchsorted(tick, np.arange(count + 1)).tolist()
-        inside = np.zeros(len(tick), bool)
-        for low, high in pairwise(bounds):
+    def _where(self, alive: Alive, is_sure: Bools) -> tuple[Bools, Floats]:
+        """Which tracks (R,) are in the area in which others, or they themselves, were seen before; and how much better
+        or worse than everywhere the odds are that lost ones come back, where they were lost, (R,).
+        """
+        xy_m, ids = alive.state.mean[:, :2].T, alive.tracks[IDS].tolist()
+        bounds, is_observed = np.searchsorted(alive.tick, np.arange(len(alive.steps) + 1)).tolist(), alive.is_observed
+        inside, ratio = np.zeros(len(ids), bool), np.ones(len(ids))
+        for passed, (low, high) in zip(alive.passed.tolist(), pairwise(bounds), strict=True):
             here = xy_m[:, low:high]
             inside[low:high] = self._seen.holds(here)
             if (is_sure[low:high] & ~inside[low:high]).any():
                 self._seen.add(here[:, is_sure[low:high]])
-        return inside
+            ratio[low:high] = self._places(passed, ids[low:high], is_observed[low:high], here)
+        return inside, ratio
 
     def _learn(self, passed: Ints, tick: Ints, now: Ints) -> tuple[Floats, Floats]:
         """Learn from what became of tracks, of which ``now`` (4, R) is known at each step.

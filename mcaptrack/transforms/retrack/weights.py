@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mcaptrack.geometry.arrays import Floats
 
@@ -20,17 +21,20 @@ _FILE: Final[Mapping[str, Any]] = json.loads(WEIGHTS.read_text(encoding="utf-8")
 
 
 class Logistic(NamedTuple):
-    """A logistic regression: weights of features (F,) as log odds ratios, the log odds without any, other numbers."""
+    """A logistic regression: weights of features (F,), by name, as log odds ratios, the log odds without any, and other
+    numbers.
+    """
 
+    names: tuple[str, ...]
     weights: Floats
     bias: float
     numbers: Mapping[str, Any]
 
     @classmethod
-    def of(cls, model: str, features: Sequence[str]) -> Logistic:
-        """The model of this name in the file, for features in this order."""
+    def of(cls, model: str) -> Logistic:
+        """The model of this name in the file."""
         entry = _FILE[model]
-        return cls(np.array([entry["weights"][name] for name in features]), float(entry["bias"]), entry)
+        return cls(tuple(entry["weights"]), np.array([*entry["weights"].values()]), float(entry["bias"]), entry)
 
     def log_odds(self, features: Floats) -> Floats:
         """The log odds (N,) of what has these features (N, F)."""
@@ -44,11 +48,13 @@ class Logistic(NamedTuple):
 class Choices(NamedTuple):
     """Multinomial logits of what ends and beginnings of tracklets choose: one of the links, or none.
 
-    ``links`` (H, F) are the weights of the terms of links by the class of their gap, ``leaves`` and ``comes`` (G,) of
-    the terms of ends and beginnings; ``usual_leaves`` and ``usual_comes`` (H + 1,) say how often each class is chosen
-    where they were fitted, and none (the last).
+    ``links`` (H, F) are the weights of ``terms`` of links by the class of their gap, ``leaves`` and ``comes`` (G,) of
+    ``end_terms`` of ends and beginnings; ``usual_leaves`` and ``usual_comes`` (H + 1,) say how often each class is
+    chosen where they were fitted, and none (the last).
     """
 
+    terms: tuple[str, ...]
+    end_terms: tuple[str, ...]
     links: Floats
     leaves: Floats
     comes: Floats
@@ -56,19 +62,23 @@ class Choices(NamedTuple):
     usual_comes: Floats
 
     @classmethod
-    def of(cls, model: str, gaps: Sequence[str], terms: Sequence[str], end_terms: Sequence[str]) -> Choices:
-        """The model of this name in the file, for terms in this order."""
-        return cls.from_entry(_FILE[model], gaps, terms, end_terms)
+    def of(cls, model: str) -> Choices:
+        """The model of this name in the file."""
+        return cls.from_entry(_FILE[model])
 
     @classmethod
-    def from_entry(
-        cls, entry: Mapping[str, Any], gaps: Sequence[str], terms: Sequence[str], end_terms: Sequence[str]
-    ) -> Choices:
+    def from_entry(cls, entry: Mapping[str, Any]) -> Choices:
         """The model of an entry of such a file."""
-        links = [[entry["links"][gap][name] for name in terms] for gap in gaps]
+        terms, end_terms = tuple(next(iter(entry["links"].values()))), tuple(entry["leaves"])
+        links = [[weights[name] for name in terms] for weights in entry["links"].values()]
         ends = [[entry[side][name] for name in end_terms] for side in ("leaves", "comes")]
-        usual = [[entry[side][name] for name in (*gaps, "none")] for side in ("usual_leaves", "usual_comes")]
-        return cls(np.array(links), *map(np.array, (*ends, *usual)))
+        usual = [[entry[side][name] for name in (*entry["links"], "none")] for side in ("usual_leaves", "usual_comes")]
+        return cls(terms, end_terms, np.array(links), *map(np.array, (*ends, *usual)))
+
+
+def columns(names: Sequence[str], values: Mapping[str, ArrayLike]) -> Floats:
+    """Values (N,) by name as columns in the order of the names, (N, F)."""
+    return np.column_stack([values[name] for name in names]).astype(np.float64)
 
 
 def probability(log_odds: Floats) -> Floats:
