@@ -230,12 +230,14 @@ def test_an_option_has_an_effect(command, option, see):
         KNOWN[case.base] = see(case.base)
         assert see(case.base) == KNOWN[case.base]  # what differs is the option's doing
     before, after = KNOWN[case.base], see(f"{case.base} {case.words}")
+    assert 0 in (before.code, after.code), before.err  # where both are refused, nothing is seen of the option
     assert after.code != 2, after.err
     assert before != after
 
 
-#: Options that need data of their own to be seen: rules that differ in rare frames, a table that isn't asked for, classes.
-BY_DATA = ("set", "seed", "with", "classes")
+#: Options that need data of their own to be seen: rules that differ in rare frames, a table that isn't asked for, classes,
+#: several gates.
+BY_DATA = ("set", "seed", "with", "classes", "all")
 #: Other things that commands are used for: an option that does nothing there has to be refused, or a line says so.
 USES = {
     "evaluate": [

@@ -28,13 +28,25 @@ _KINDS = {bool: "", int: "whole number", float: "number", Path: "path"}
 
 
 class Completed(griffe.Extension):
-    """Docstrings of declared functions, with the parameters that annotations describe: what Python has when it runs."""
+    """Declared functions with what Python has when it runs: options of extensions, and docstrings that describe all."""
 
     def on_function(self, *, func: griffe.Function, **_: Any) -> None:
-        """Replace the docstring of a function that is a command."""
-        if any(str(decorator.value).startswith("declared(") for decorator in func.decorators):
-            doc = inspect.getdoc(getattr(import_module(func.module.path), func.name)) or ""
-            func.docstring = griffe.Docstring(doc, parent=func, parser=griffe.Parser.numpy)
+        """Replace the docstring of a function that is a command, and its ``**more`` by the options that are there."""
+        if not any(str(decorator.value).startswith("declared(") for decorator in func.decorators):
+            return
+        command = getattr(import_module(func.module.path), func.name)
+        parameters = inspect.signature(command).parameters
+        for name in [parameter.name for parameter in func.parameters if parameter.name not in parameters]:
+            del func.parameters[name]
+        for name, parameter in parameters.items():
+            if name not in func.parameters:
+                kind = inspect.formatannotation(get_args(parameter.annotation)[0])
+                keyword = griffe.ParameterKind.keyword_only
+                func.parameters.add(
+                    griffe.Parameter(name, annotation=kind, kind=keyword, default=repr(parameter.default))
+                )
+        doc = inspect.getdoc(command) or ""
+        func.docstring = griffe.Docstring(doc, parent=func, parser=griffe.Parser.numpy)
 
 
 def on_config(config: Any) -> Any:

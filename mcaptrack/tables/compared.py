@@ -208,7 +208,7 @@ def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions)
     if role == "tracks" and path.is_file() and _is_blank(path):
         return _no_tracks(path)
     labels = options.read(path, role, replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks"))
-    if options.size is not None and labels.is_normalised:
+    if options.size is not None and labels.boxes_px is not None:
         labels = fitted(labels, options.size)
     if labels.times_s is not None or labels.is_normalised:
         what = "times instead of frames" if labels.times_s is not None else "boxes in shares of the picture's size"

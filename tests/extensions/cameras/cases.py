@@ -22,7 +22,7 @@ EFFECTS = {
             "fuser": "--fuser grid",
             "output": "-o b.mcap",
             "sidecar": "--sidecar",
-            "views": "--views",
+            "views": ("fuse a.mcap", "--views"),  # drawn on the pictures of its camera
             "force": ("fuse two.mcap -o fresh.mcap", "--force"),
         },
     ),

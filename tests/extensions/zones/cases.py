@@ -91,7 +91,10 @@ def _most_inside(seven: Any) -> list[list[Any]]:
     return [[*key, count] for key, count in sorted(most.items())]
 
 
-QUERIES = {("docs/extensions/zones.md", "zone_visits"): _visits, ("docs/zones.md", "zone_counts"): _most_inside}
+QUERIES = {
+    ("docs/extensions/zones.md", "zone_visits"): _visits,
+    ("docs/extensions/zones.md", "zone_counts"): _most_inside,
+}
 TOPICS = {"zones": ("tracks", _of_topic)}
 PROPOSALS = {
     "extensions/zones/counting.py:make_zones:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
