@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
@@ -235,27 +235,27 @@ def own(kind: Kind) -> dict[str, str]:
 
 def points(kind: Kind) -> list[Point]:
     """The entry points of a kind; those with a name that is taken don't count."""
-    listed = entry_points(_group(kind))
-    own = {point.name for point in listed if point.is_own}
-    return [point for point in listed if not _owner(kind, point, own)]
+    return [point for point, owner in _owners(kind) if not owner]
 
 
 def ignored(kind: Kind) -> dict[str, str]:
     """Why entry points of a kind don't count, by their title. Imports nothing."""
-    listed = entry_points(_group(kind))
-    own = {point.name for point in listed if point.is_own}
-    owners = {titled(kind, point.name, point.package): _owner(kind, point, own) for point in listed}
+    owners = {titled(kind, point.name, point.package): owner for point, owner in _owners(kind)}
     return {what: f"{what} is ignored: there is {owner}; rename it" for what, owner in owners.items() if owner}
 
 
-def _owner(kind: Kind, point: Point, own: Set[str]) -> str:
-    """The entry with the name of an entry point, which can't have it: a built-in one, one of those that are our
-    ``own``, or a command; "" if none.
+def _owners(kind: Kind) -> Iterator[tuple[Point, str]]:
+    """Each entry point of a kind, and the entry that has its name already: a built-in one, one of an extension, or a
+    command; "" if none.
     """
-    if point.name in BUILT_IN[kind] or (point.name in own and not point.is_own):
-        return f"a built-in {titled(kind, point.name)}"
-    taken = names("command") if kind == "stage" else BUILT_IN["command"] if kind == "finisher" else ()
-    return f"a {titled('command', point.name)}" if point.name in taken else ""
+    listed = entry_points(_group(kind))
+    own = {point.name for point in listed if point.is_own}
+    commands = names("command") if kind == "stage" else BUILT_IN["command"] if kind == "finisher" else ()
+    for point in listed:
+        if point.name in BUILT_IN[kind] or (point.name in own and not point.is_own):
+            yield point, f"a built-in {titled(kind, point.name)}"
+        else:
+            yield point, f"a {titled('command', point.name)}" if point.name in commands else ""
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:
