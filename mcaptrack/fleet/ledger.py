@@ -183,7 +183,8 @@ class Claims:
         except OSError:  # it was given up at this moment, or is taken over by another fleet
             return Taken(is_mine=False)
         self._mine[location] = path
-        return Taken(is_mine=True, note=_taken_over(location, owner))
+        machine, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
+        return Taken(is_mine=True, note=f"{location}: taken over from process {pid} on {machine}, which has ended")
 
     def beat(self) -> None:
         """Give a sign of life, if it is time."""
@@ -220,11 +221,6 @@ def _write(handle: int, content: bytes) -> bool:
         return os.write(handle, content) == len(content)
     except OSError:
         return False
-
-
-def _taken_over(location: str, owner: Mapping[str, Any]) -> str:
-    machine, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
-    return f"{location}: taken over from process {pid} on {machine}, which has ended"
 
 
 def sweep(folder: Path, locations: set[str]) -> None:

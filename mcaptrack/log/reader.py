@@ -458,26 +458,25 @@ class Log:
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """The last metadata record of that name."""
-        if self.results is not None and (of_results := self.results.metadata(name)) is not None:
-            return of_results
-        offsets = [listed.offset for listed in self.index.metadata if listed.name == name]
-        if not offsets:
-            return None
-        with self.snapshot.reporting_damage():
-            whole = self.snapshot.record(offsets[-1])
-            return records.read_metadata(whole, records.record_at(whole, 0)).metadata
+        return self._last(name, "metadata", lambda whole, at: records.read_metadata(whole, at).metadata)
 
     def attachment(self, name: str) -> bytes | None:
         """The data of the last attachment of that name."""
-        if self.results is not None and (of_results := self.results.attachment(name)) is not None:
-            return of_results
-        offsets = [listed.offset for listed in self.index.attachments if listed.name == name]
-        if not offsets:
-            return None
-        with self.snapshot.reporting_damage():
-            whole = self.snapshot.record(offsets[-1])
-            attachment = records.read_attachment(whole, records.record_at(whole, 0))
+
+        def data(whole: memoryview, record: records.Record) -> bytes:
+            attachment = records.read_attachment(whole, record)
             return bytes(whole[attachment.start : attachment.end])
+
+        return self._last(name, "attachments", data)
+
+    def _last(self, name: str, kind: str, read: Callable[[memoryview, records.Record], T]) -> T | None:
+        """Read the last "metadata" or "attachments" record of that name: of the sidecar, or else of the log."""
+        for part in reversed(self.parts):
+            if offsets := [listed.offset for listed in getattr(part.index, kind) if listed.name == name]:
+                with part.snapshot.reporting_damage():
+                    whole = part.snapshot.record(offsets[-1])
+                    return read(whole, records.record_at(whole, 0))
+        return None
 
     def messages(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
         """The messages of a channel in time order, from ``start_ns`` (inclusive) to ``end_ns`` (exclusive), if given.

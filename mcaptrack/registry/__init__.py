@@ -50,7 +50,7 @@ Kind = Literal[
     "stage",
     "label_format",
     "message_reader",
-    "recording",
+    "recording",  # other containers than MCAP, by what their names or first bytes say
     "exporter",
     "judge",
     "finisher",
@@ -58,9 +58,9 @@ Kind = Literal[
     "command",
     "page",
     "player",
-    "viewer",
-    "name",
-    "scene",
+    "viewer",  # on the web, which `mcaptrack view` links besides Lichtblick and Foxglove
+    "name",  # in Python, such as classes of results; those of the core are in mcaptrack/__init__.py
+    "scene",  # what makes a scene of several cameras (mcaptrack.pipeline.scenes)
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
@@ -83,6 +83,7 @@ _BY_ENTRY_POINT: Final = (
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
+        **{kind: {} for kind in KINDS},
         "detector": {
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
@@ -111,7 +112,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "likelihood": "mcaptrack.transforms.retrack:Retrack",
             "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
         },
-        "fuser": {},
         # The default transform of each; mcaptrack.transforms.stages says the rest.
         "stage": {
             "detect": "mcaptrack.transforms.detect.median:MedianDetector",
@@ -135,26 +135,15 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "visualization_msgs/MarkerArray": f"{_SOLIDS}:marker_solids",
             "visualization_msgs/Marker": f"{_SOLIDS}:marker_solids",
         },
-        # Of other containers than MCAP, by what their names or first bytes say.
-        "recording": {},
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
             "mot": "mcaptrack.sources.box_files:MotFile",
         },
-        "judge": {},
         # What is made of the results of stages at the end of a run.
         "finisher": {"events": "mcaptrack.pipeline.events:Watch"},
-        "report_section": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         "page": {"tables": "mcaptrack.api.viewing:tables_page"},
-        "player": {},
-        # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
-        "name": {},
-        # What makes a scene of several cameras (mcaptrack.pipeline.scenes).
-        "scene": {},
-        # Viewers on the web that `mcaptrack view` links, besides Lichtblick and Foxglove.
-        "viewer": {},
     }
 )
 

@@ -69,16 +69,7 @@ def records_table(table: Table, records: Sequence[Mapping[str, Any]]) -> Any:
     """A table about a log from its records; missing values are null."""
     import pyarrow as pa
 
-    kinds = {field.name: field.type for field in table.arrow}
-    columns = []
-    for name, kind in kinds.items():
-        values = [record.get(name) for record in records]
-        columns.append(
-            pa.array(values, pa.string()).dictionary_encode().cast(kind)
-            if pa.types.is_dictionary(kind)
-            else pa.array(values, kind)
-        )
-    return pa.table(columns, schema=table.arrow)
+    return pa.Table.from_pylist(records, table.arrow)
 
 
 def with_recording(table: Any, recording: str) -> Any:

@@ -104,13 +104,10 @@ class Table:
 
     def is_of_tracks(self) -> bool:
         """Whether its rows name tracks by their ids, and so have the classes of these."""
-        return "track_id" in (names := self._columns_of_ours) and "class_id" not in names
-
-    @property
-    def _columns_of_ours(self) -> set[str]:
-        """The columns of its rows, if they are of a schema of mcaptrack."""
-        of = self.rows_of
-        return {column.name for column in of.columns} if of is not None and of.name in SCHEMAS else set()
+        if self.rows_of is None or self.rows_of.name not in SCHEMAS:
+            return False
+        names = {column.name for column in self.rows_of.columns}
+        return "track_id" in names and "class_id" not in names
 
 
 def _with_unit(field: Any) -> Any:

@@ -464,10 +464,7 @@ class _Job:
         return out
 
     def _topic_files(self) -> Iterator[Path]:
-        tail = (f"recording={self.contents.recording}", f"part-0.{self.form}")
-        folder = self.folder / TOPICS
-        members = sorted(folder.iterdir()) if folder.is_dir() else []
-        yield from (path for member in members if (path := member.joinpath(*tail)).is_file())
+        yield from (path for folder in self._topic_folders() if (path := folder / f"part-0.{self.form}").is_file())
 
     def tidy(self) -> None:
         """Remove what processes that were killed have left: temporary files, and folders of channels without a file."""
