@@ -113,21 +113,20 @@ class Session:
     def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """The outputs, in order; one that holds no numbers is empty, of type object. Raises SessionError."""
         try:
-            outputs = self._session.run(None, inputs)
-        except Exception as error:
-            if "memory" not in str(error):
-                raise SessionError(f"can't be run: {_short(error)}") from None
-            outputs = self._run_alone(inputs)
+            outputs = self._run(inputs)
+        except SessionError as error:
+            if not error.limit:
+                raise
+            with self._alone:  # while no other thread runs it, after all of them together took too much
+                outputs = self._run(inputs)
         return [_numbers(output) for output in outputs]
 
-    def _run_alone(self, inputs: Mapping[str, NDArray[Any]]) -> list[Any]:
-        """Run while no other thread does, after all of them together took too much memory."""
-        with self._alone:
-            try:
-                return list(self._session.run(None, inputs))
-            except Exception as error:
-                limit: Limit = "memory" if "memory" in str(error) else ""
-                raise SessionError(f"can't be run: {_short(error)}", limit) from None
+    def _run(self, inputs: Mapping[str, NDArray[Any]]) -> list[Any]:
+        try:
+            return list(self._session.run(None, inputs))
+        except Exception as error:
+            limit: Limit = "memory" if "memory" in str(error) else ""
+            raise SessionError(f"can't be run: {_short(error)}", limit) from None
 
 
 def is_installed() -> bool:

@@ -199,7 +199,8 @@ class _PairJob(LabelJob):
 def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions) -> BoxTable:
     if _is_exported(path):
         return _read_parquet(path, role, topics)
-    if role == "tracks" and path.is_file() and _is_blank(path):
+    is_short = role == "tracks" and path.is_file() and path.stat().st_size < _BLANK_BYTES
+    if is_short and not path.read_bytes().strip():
         return _no_tracks(path)
     labels = options.read(path, role, replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks"))
     if options.size is not None and labels.is_normalised:
@@ -218,10 +219,6 @@ def _is_exported(path: Path) -> bool:
         return False
     metadata = tables.file_metadata(path, "parquet")
     return metadata is None or "table_version" in metadata  # what can't be read is refused as such a table
-
-
-def _is_blank(path: Path) -> bool:
-    return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
 def _no_tracks(path: Path) -> BoxTable:

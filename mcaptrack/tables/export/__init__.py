@@ -231,14 +231,10 @@ def _owner(file: Path, form: TableFormat) -> _Owner | None:
 def _first_row(file: Path, form: TableFormat) -> Mapping[str, Any]:
     try:
         with file.open(encoding="utf-8", newline="") as stream:
-            rows: Sequence[Mapping[str, Any]]
-            if form == "csv":
-                rows = [row for row, _ in zip(csv.DictReader(stream), range(1), strict=False)]
-            else:
-                rows = [json.loads(line) for line, _ in zip(stream, range(1), strict=False)]
+            row: Any = next(csv.DictReader(stream), {}) if form == "csv" else json.loads(next(stream, "{}"))
     except (OSError, ValueError, csv.Error):
         return {}
-    return rows[0] if rows and isinstance(rows[0], dict) else {}
+    return row if isinstance(row, dict) else {}
 
 
 def export(

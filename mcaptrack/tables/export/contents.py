@@ -31,6 +31,7 @@ from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of, payload_decoder
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
+from mcaptrack.tables.fields import SCORES
 
 #: Tables about the places of messages, or about the whole log.
 _OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
@@ -90,8 +91,6 @@ _BEST: Final = ("retracks", "retracks/online", "tracks")
 #: The rules by which they are scored, the first that gave a score.
 RULES: Final = (("metres", GATE_M), ("iou", 0.5))
 RULES_3D: Final = (("metres", GATE_3D_M), *RULES)
-#: The scores that are taken over.
-_SCORES: Final = ("MOTA", "IDF1", "HOTA", "IDSW")
 
 
 def location_of(path: Location) -> str:
@@ -140,7 +139,7 @@ def worst_score(topics: Sequence[str], scores: Sequence[Mapping[str, Any]]) -> d
     if not headlines:
         return {}
     worst = min(headlines, key=lambda row: row["IDF1"])
-    return {"scored": worst["topic"]} | {name: worst[name] for name in ("similarity", "gate", *_SCORES)}
+    return {"scored": worst["topic"]} | {name: worst[name] for name in ("similarity", "gate", *SCORES)}
 
 
 def _headline(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
