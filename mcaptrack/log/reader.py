@@ -28,7 +28,7 @@ from mcaptrack.location import Location, Url, is_remote
 from mcaptrack.log import in_place, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile, ReadFile, Signature, open_file
 from mcaptrack.log.chunks import MAX_NS
-from mcaptrack.log.index import Index, read_index
+from mcaptrack.log.index import Index, ends_with_magic, read_index, starts_with_magic
 from mcaptrack.log.journal import changed, find_journal, recover_hint
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, Payloads, Span, TimeOutOfRange
 from mcaptrack.log.records import Damaged
@@ -232,7 +232,8 @@ def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
             raise Damaged("it is empty")
         index = read_index(source)
     except Damaged as error:
-        hint = f"; {recover_hint(path)}" if _looks_like_mcap(file, signature.size) else ""
+        whole = ByteSource.of(file)  # with the magic bytes at one end, `recover` may find something in it
+        hint = f"; {recover_hint(path)}" if starts_with_magic(whole) or ends_with_magic(whole) else ""
         refusal = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
         if not _is_unchanged(path, file, signature):
             return refusal
@@ -244,13 +245,6 @@ def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
     if journal:
         notices.warn(journal.message, "journal")
     return Snapshot(path, file, source, index, signature, is_certain)
-
-
-def _looks_like_mcap(file: ReadFile, size: int) -> bool:
-    """Whether a file begins or ends with the MCAP magic bytes, so that `recover` may find something in it."""
-    source = ByteSource.of(file)
-    ends = (source[at : at + len(records.MAGIC)] for at in (0, max(size - len(records.MAGIC), 0)))
-    return any(bytes(end) == records.MAGIC for end in ends)
 
 
 def _is_unchanged(path: Location, file: ReadFile, signature: Signature) -> bool:

@@ -452,15 +452,12 @@ class _Job:
     def known_topics(self) -> dict[str, MessagesPart]:
         """The channels of this log with tables of their own in the folder, and what these hold."""
         out = {}
-        for path in self._topic_files():
-            metadata = tables.file_metadata(path, self.form) or {}
+        for folder in self._topic_folders():
+            metadata = tables.file_metadata(folder / f"part-0.{self.form}", self.form) or {}
             if metadata.get("recording") == file_name(self.contents.opened.path) and "topic" in metadata:
                 blobs, columns, *span = json.loads(metadata.get("part", "[false, [], null, null]"))
                 out[metadata["topic"]] = MessagesPart(blobs, tuple(columns), *span)
         return out
-
-    def _topic_files(self) -> Iterator[Path]:
-        yield from (path for folder in self._topic_folders() if (path := folder / f"part-0.{self.form}").is_file())
 
     def tidy(self) -> None:
         """Remove what processes that were killed have left: temporary files, and folders of channels without a file."""

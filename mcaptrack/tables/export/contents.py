@@ -24,7 +24,7 @@ from mcaptrack.log.messages import Payloads
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
-from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.framing import unique_values
 from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
@@ -420,7 +420,7 @@ class LogTables:
         names = [*topics, *(file_name(part.path) for part in self.opened.parts)]
 
         def pieces() -> Iterator[Any]:
-            return (tables.frames_table({topic: self._pointers(topic)}, names) for topic in topics)
+            return (tables.frames_table(topic, self._pointers(topic), names) for topic in topics)
 
         return TablePieces(TABLES["frames"].arrow, sum(self.opened.channel(topic).messages for topic in topics), pieces)
 
@@ -591,21 +591,16 @@ class LogTables:
         """The columns that tell a log from thousands of others."""
         topics = self.topics("tracks")
         best = [topic for camera in cameras(self.opened) if (topic := best_tracks(camera, topics))]
+        track_ids = (unique_values(TRACKS, self._frames(topic), "track_id") for topic in best)
         versions = {how.version for topic in self.opened.channels if (how := provenance_of(self.opened, topic))}
         return {
             "location": location_of(self.opened.path),
             "cameras": len(cameras(self.opened)),
-            "tracks": sum(map(self._count_tracks, best)) if best else None,
+            "tracks": sum(map(len, track_ids)) if best else None,
             **worst_score(best, self._scores),
             **in_one_row(self._warnings),
             "versions": ", ".join(sorted(versions)) or None,
         }
-
-    def _count_tracks(self, topic: str) -> int:
-        ids: set[int] = set()
-        for _, _, joined in joined_parts(TRACKS, self._frames(topic)):
-            ids.update(np.unique(joined.rows["track_id"]).tolist())
-        return len(ids)
 
 
 def _origin_of_plane(row: np.void) -> str:
