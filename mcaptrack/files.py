@@ -165,16 +165,12 @@ _ABANDONED_S: Final = 3600.0
 
 def _part_of(path: Path) -> Path:
     pid = os.getpid()
-    return path.with_name(f".{_short(path.name)}.{pid}.{mark_of(pid)}{secrets.token_hex(3)}.part")
-
-
-def _short(name: str) -> str:
-    return shortened(name, _NAME_BYTES)
+    return path.with_name(f".{shortened(path.name, _NAME_BYTES)}.{pid}.{mark_of(pid)}{secrets.token_hex(3)}.part")
 
 
 def sweep(folder: Path, name: str = "") -> None:
     """Remove from a folder the temporary files of processes that have ended: those of the file ``name``, or all."""
-    _remove_left(folder, _PART, _short(name))
+    _remove_left(folder, _PART, shortened(name, _NAME_BYTES))
 
 
 def temporary_folder() -> TemporaryDirectory[str]:

@@ -23,7 +23,6 @@ _PLACE: Final = rf"{re.escape(_EXTENSIONS)}\.(\w+)"
 #: A folder with what pip says of a package, and the name of the package in it.
 _INFO: Final = re.compile(r"(.+?)(-.*)?\.(dist|egg)-info")
 _FILES: Final = ("METADATA", "PKG-INFO")
-_HEADERS: Final = ("Name", "Version")
 
 
 class Point(NamedTuple):
@@ -231,4 +230,4 @@ def _name_and_version(info: Path) -> tuple[str, str]:
             name, _, value = line.partition(":")
             headers.setdefault(name.strip(), value.strip())
         break
-    return headers.get(_HEADERS[0], ""), headers.get(_HEADERS[1], "")
+    return headers.get("Name", ""), headers.get("Version", "")

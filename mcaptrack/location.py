@@ -21,7 +21,7 @@ from typing import Final, Self, TypeGuard, TypeVar
 from mcaptrack.errors import McaptrackError
 
 __all__ = [
-    "SCHEMES", "Location", "Url", "distinct_names", "hide_secrets", "is_remote", "join", "local_name", "parse",
+    "SCHEMES", "Location", "Url", "distinct_names", "hide_secrets", "is_remote", "local_name", "parse",
     "shortened", "sibling",
 ]  # fmt: skip
 
@@ -135,13 +135,6 @@ def parse(text: str | os.PathLike[str]) -> Location:
     if wrong := [part for part in parts if part in ("", ".", "..")]:
         raise McaptrackError(f"{url} can't be read: a part of its name is {wrong[0]!r}; give the name of an object")
     return url
-
-
-def join(base: Location, *names: str) -> Location:
-    """The location of a name below another, as with ``/``."""
-    for name in names:
-        base = base / name
-    return base
 
 
 P = TypeVar("P", Path, Url, Location)

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from types import FrameType
 from typing import Final, Literal, NamedTuple, get_args
 
 __all__ = ["Notice", "collected", "warn"]
@@ -125,13 +124,11 @@ def _level_of_caller() -> int:
     """The number of calls from the caller of this function up to the first line outside of the package."""
     package = str(Path(__file__).parent) + os.sep
     frame, level = sys._getframe(1), 1
-    while frame.f_back is not None and (frame.f_code.co_filename.startswith(package) or _is_contextlib(frame)):
+    while frame.f_back is not None and (
+        frame.f_code.co_filename.startswith(package) or frame.f_globals.get("__name__") == "contextlib"
+    ):
         frame, level = frame.f_back, level + 1
     return level
-
-
-def _is_contextlib(frame: FrameType) -> bool:
-    return frame.f_globals.get("__name__") == "contextlib"
 
 
 @contextmanager

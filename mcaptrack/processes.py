@@ -79,10 +79,8 @@ def is_running(pid: int) -> bool:
     """Return whether there is a process of this id, whoever owns it."""
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
+    except OSError as error:  # such as that it is of another user
+        return not isinstance(error, ProcessLookupError)
     return True
 
 

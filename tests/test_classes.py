@@ -320,7 +320,7 @@ def test_tables_without_a_class_column_are_read_as_before(tmp_path):
     new = tables.rows_in_pieces(TRACKS, {"/a": frames}, {"/a": {3: "cart"}}).table()
     old = new.drop_columns(["class_id", "class"])
     assert new.to_pylist()[0]["class"] == "cart"
-    places = tables.frames_table({"/a": tables.Pointers("f", *(np.array([n]) for n in (1, 0, 1, 0, 0)))})
+    places = tables.frames_table("/a", tables.Pointers("f", *(np.array([n]) for n in (1, 0, 1, 0, 0))))
     assert table_to_frames(TRACKS, old, places, "/a")[0].rows["class_id"].tolist() == [0]
     assert table_to_frames(TRACKS, new, places, "/a")[0].rows["class_id"].tolist() == [3]
 

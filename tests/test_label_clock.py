@@ -273,9 +273,9 @@ def test_files_that_are_compared_or_tuned_have_the_same_frames(tmp_path, name, r
             f.index: [f.index] for f in both.tracks
         } == {f.index: [f.index] for f in both.ground_truth}
     elif role == "detections":
-        tuned = detections_and_ground_truth(found, every, IngestOptions(fps=Fraction(FPS)))
-        assert [(f.t_ns, f.index) for f in tuned.ground_truth] == [(t, k) for k, t in enumerate(CLIP_NS)]
-        assert [(f.t_ns, f.index, len(f.rows)) for f in tuned.detections] == world.expected(CLIP_NS)
+        detections, truth, _ = detections_and_ground_truth(found, every, IngestOptions(fps=Fraction(FPS)))
+        assert [(f.t_ns, f.index) for f in truth] == [(t, k) for k, t in enumerate(CLIP_NS)]
+        assert [(f.t_ns, f.index, len(f.rows)) for f in detections] == world.expected(CLIP_NS)
     else:
         frames = label_frames({"truth": found, "tracks": every}, IngestOptions(fps=Fraction(FPS)))["truth"]
         assert [(f.t_ns, f.index, len(f.rows)) for f in frames] == world.expected(CLIP_NS)

@@ -398,12 +398,18 @@ class _Struct(_Type):
             for of in types:
                 self.size += -self.size % of.align + of.size
 
+    def _wanted(self, cursor: Cursor) -> Iterator[tuple[str, _Type]]:
+        """The fields that are wanted, for the caller to read one after the other; the others are skipped."""
+        for name, of, is_wanted in self.fields:
+            if is_wanted:
+                yield name, of
+            else:
+                of.skip(cursor)
+
     def columns(self, cursor: Cursor, path: Path = ()) -> Iterator[tuple[Path, pa.Array]]:
         """The columns of all fields that are wanted, by their path."""
-        for name, of, is_wanted in self.fields:
-            if not is_wanted:
-                of.skip(cursor)
-            elif isinstance(of, _Struct) and not of.is_time:
+        for name, of in self._wanted(cursor):
+            if isinstance(of, _Struct) and not of.is_time:
                 yield from of.columns(cursor, (*path, name))
             else:
                 yield (*path, _titled(name, of)), of.read(cursor)
@@ -413,16 +419,10 @@ class _Struct(_Type):
             seconds, parts = (of.read(cursor).to_numpy().astype(np.int64) for _, of, _ in self.fields)
             t_ns = pa.array(seconds * _NS_PER_S + parts)
             return t_ns if self.is_duration else as_times(t_ns)
-        columns, names = [], []
-        for name, of, is_wanted in self.fields:
-            if is_wanted:
-                columns.append(of.read(cursor))
-                names.append(_titled(name, of))
-            else:
-                of.skip(cursor)
+        columns = [(of.read(cursor), _titled(name, of)) for name, of in self._wanted(cursor)]
         if not columns:
             return pa.Array.from_buffers(pa.struct([]), len(cursor.base), [None])
-        return pa.StructArray.from_arrays(columns, names)
+        return pa.StructArray.from_arrays(*zip(*columns, strict=True))
 
     def skip(self, cursor: Cursor) -> None:
         if self.size >= 0:

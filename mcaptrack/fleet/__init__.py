@@ -241,11 +241,6 @@ def task_of(function: Callable[..., Any], options: Mapping[str, Any]) -> bytes:
     return task
 
 
-def location_of(log: Location) -> str:
-    """Return the name of a log in ledgers and claims: its path without links, or its URL."""
-    return str(place_of(log))
-
-
 @checked
 def run(
     function: Callable[..., T],
@@ -351,7 +346,8 @@ def run(
     for number, named_log in enumerate(named_logs):
         own = {"output": outputs[number]} if outputs else {}
         place = _claimed_in(named_log.path, claims_in) if writes and folder is None else claims_in
-        work.append(QueuedLog(number, named_log.path, location_of(named_log.path), own, place))
+        location = str(place_of(named_log.path))  # its name in ledgers and claims: without links
+        work.append(QueuedLog(number, named_log.path, location, own, place))
     for output in outputs:
         _make_folder(output.parent)
     limits = WorkerLimits(min(jobs or 1, len(named_logs)), os.getcwd(), timeout_s, memory_in_bytes(memory_limit))

@@ -70,15 +70,13 @@ def memory_in_bytes(size: str | float | None) -> int | None:
     """
     if size is None:
         return None
-    match = _SIZE.fullmatch(str(size).strip())
+    match, wrong = _SIZE.fullmatch(str(size).strip()), f"needs a size such as 2GB or 500MB, not {str(size)!r:.40}"
     if match is None:
-        raise McaptrackError(f"`memory_limit=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}")
+        raise McaptrackError(f"`memory_limit=` {wrong}")
     number, unit, binary = match.groups()
     amount = int(float(number) * (1024 if binary else 1000) ** (" kmgt".index(unit.lower() or " ")))
     if amount < 1_000_000:
-        raise McaptrackError(
-            f"`memory_limit=` needs a size such as 2GB or 500MB, not {str(size)!r:.40}: that is too little"
-        )
+        raise McaptrackError(f"`memory_limit=` {wrong}: that is too little")
     return amount
 
 

@@ -30,6 +30,15 @@ from mcaptrack.processes import host, is_running, started
 _KEYS: Final = ("location", "command", "settings", "state", "digest")
 
 
+@contextmanager
+def _opened(path: Path, flags: int) -> Iterator[int]:
+    handle = os.open(path, flags | os.O_CLOEXEC, 0o644)
+    try:
+        yield handle
+    finally:
+        os.close(handle)
+
+
 class Ledger:
     """The lines of one command in a ledger: those that stand, those that other fleets add, and own ones.
 
@@ -44,7 +53,7 @@ class Ledger:
         self._bad = 0
         self._can_append = True
         try:
-            with self._opened(os.O_RDWR | os.O_CREAT) as handle:
+            with _opened(path, os.O_RDWR | os.O_CREAT) as handle:
                 start = os.pread(handle, 4096, 0).lstrip()
         except OSError as error:
             raise McaptrackError(f"the ledger {path} can't be written: {error.strerror or error}") from error
@@ -56,14 +65,6 @@ class Ledger:
             which = f"{self._bad} lines of the ledger {path}" if self._bad > 1 else f"a line of the ledger {path}"
             were = "were" if self._bad > 1 else "was"
             warn(f"{which} can't be read and {were} left out; these logs may be done again", "left-out")
-
-    @contextmanager
-    def _opened(self, flags: int) -> Iterator[int]:
-        handle = os.open(self._path, flags | os.O_CLOEXEC, 0o644)
-        try:
-            yield handle
-        finally:
-            os.close(handle)
 
     def refresh(self) -> None:
         """Read the lines that were added since the last time."""
@@ -106,7 +107,7 @@ class Ledger:
         whole = {"location": values.pop("location"), "command": self._command, "settings": self._settings, **values}
         line = json.dumps(whole, allow_nan=False).encode("ascii") + b"\n"
         try:
-            with self._opened(os.O_RDWR | os.O_APPEND | os.O_CREAT) as handle:
+            with _opened(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT) as handle:
                 with suppress(OSError):  # a file system without locks
                     fcntl.flock(handle, fcntl.LOCK_EX)
                 size = os.fstat(handle).st_size
@@ -154,15 +155,12 @@ class Claims:
         path = folder / claim_name(location)
         content = json.dumps({"location": location, **self._me, "since": round(time(), 3)}).encode()
         try:
-            handle = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o644)
+            with _opened(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY) as handle:
+                is_written = _write(handle, content)
         except FileExistsError:
             return self._take_over(location, path, content)
         except OSError:  # a folder that can't be written: the command says so, if it matters
             return Taken(is_mine=True)
-        try:
-            is_written = _write(handle, content)
-        finally:
-            os.close(handle)
         if is_written:
             self._mine[location] = path
         else:
@@ -183,7 +181,8 @@ class Claims:
         except OSError:  # it was given up at this moment, or is taken over by another fleet
             return Taken(is_mine=False)
         self._mine[location] = path
-        return Taken(is_mine=True, note=_taken_over(location, owner))
+        machine, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
+        return Taken(is_mine=True, note=f"{location}: taken over from process {pid} on {machine}, which has ended")
 
     def beat(self) -> None:
         """Give a sign of life, if it is time."""
@@ -222,11 +221,6 @@ def _write(handle: int, content: bytes) -> bool:
         return False
 
 
-def _taken_over(location: str, owner: Mapping[str, Any]) -> str:
-    machine, pid = str(owner.get("host", "?")).partition("/")[0], owner.get("pid", "?")
-    return f"{location}: taken over from process {pid} on {machine}, which has ended"
-
-
 def sweep(folder: Path, locations: set[str]) -> None:
     """Remove claims on these logs that fleets which ended have left."""
     wanted = {claim_name(location) for location in locations}
@@ -243,12 +237,9 @@ def sweep(folder: Path, locations: set[str]) -> None:
 @contextmanager
 def _locked(path: Path, wait: bool = False) -> Iterator[int]:
     """Open a claim with a lock. Raises OSError if another fleet has the lock."""
-    handle = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-    try:
+    with _opened(path, os.O_RDWR) as handle:
         fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         yield handle
-    finally:
-        os.close(handle)
 
 
 def _owner(handle: int) -> tuple[dict[str, Any], bool]:

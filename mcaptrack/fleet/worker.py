@@ -7,6 +7,7 @@ its parent through one socket. What a log may do to it is the parent's to notice
 from __future__ import annotations
 
 import faulthandler
+import inspect
 import os
 import pickle
 import resource
@@ -61,10 +62,14 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
     try:
         function, options = pickle.loads(request.task)  # noqa: S301  # from the parent
         with listening(warnings.append), about(request.own.get("output") or request.log):
-            result = function(request.log, **options, **request.own, **_taking(function, progress))
+            takes_progress = "progress" in inspect.signature(function).parameters
+            taken = {"progress": progress} if takes_progress else {}
+            result = function(request.log, **options, **request.own, **taken)
         state: State = "up-to-date" if getattr(result, "is_up_to_date", False) else "done"
         answer, digest = pickle.dumps(result), digest_of_log(request.log)
-        reply = Reply(request.log, state, answer, digest=digest, files=_files_of(result))
+        # Files beside the log that the result names are owed: without them the log isn't done.
+        files = tuple(os.path.abspath(file) for file in getattr(result, "files", ()) if isinstance(file, Path))
+        reply = Reply(request.log, state, answer, digest=digest, files=files)
     except McaptrackError as error:
         reply = Reply(request.log, "failed", error=" ".join(str(error).split()))
     except MemoryError:
@@ -76,18 +81,6 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
     seconds, cpu = round(monotonic() - began, 3), round(_cpu_seconds() - used, 3)
     unique_warnings = tuple(dict.fromkeys(warnings))
     return replace(reply, seconds=seconds, cpu_seconds=cpu, peak_bytes=_peak_bytes(), warnings=unique_warnings)
-
-
-def _files_of(result: object) -> tuple[str, ...]:
-    """Return the files beside a log that a result says are owed: without them the log isn't done."""
-    return tuple(os.path.abspath(file) for file in getattr(result, "files", ()) if isinstance(file, Path))
-
-
-def _taking(function: Any, progress: Any) -> dict[str, Any]:
-    """Return ``progress`` as a keyword, for functions that take it."""
-    import inspect
-
-    return {"progress": progress} if "progress" in inspect.signature(function).parameters else {}
 
 
 def serve(handle: int, life: int) -> None:

@@ -228,8 +228,9 @@ class _Rewrite:
         for chunk in index.chunks:
             if chunk.chunk_start_offset >= self.cut:
                 for offset in chunk.message_index_offsets.values():
-                    channel, count = records.read_message_index(self.source, records.record_at(self.source, offset))
-                    counts[channel] = counts.get(channel, 0) - count
+                    record = records.record_at(self.source, offset)
+                    channel, entries = records.read_message_entries(self.source, record)
+                    counts[channel] = counts.get(channel, 0) - len(entries) // 16
         return replace(
             index,
             schemas=schemas,

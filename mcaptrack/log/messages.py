@@ -348,14 +348,9 @@ class MessageBatches:
 
     def in_order(self) -> Iterator[list[MessageBatch]]:
         """Batches in groups that follow one another in time; batches of one group overlap, and keep their order."""
-        numbers = np.flatnonzero(np.diff(self.edges))
-        first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
-        order = np.argsort(first_ns, kind="stable")
         group: list[int] = []
         last = (-1, -1)  # time and number of the last message and batch so far
-        for first, until, number in zip(
-            first_ns[order].tolist(), last_ns[order].tolist(), numbers[order].tolist(), strict=True
-        ):
+        for number, first, until in zip(*(values.tolist() for values in self._spans()), strict=True):
             if group and (first, number) > last:
                 yield [self[member] for member in sorted(group)]
                 group = []
@@ -366,12 +361,16 @@ class MessageBatches:
 
     def apart(self) -> list[list[int]]:
         """The numbers of batches in groups: all messages of a group are earlier than those of the next."""
+        numbers, first_ns, last_ns = self._spans()
+        starts = 1 + np.flatnonzero(first_ns[1:] > np.maximum.accumulate(last_ns)[:-1])
+        return [group.tolist() for group in np.split(numbers, starts) if len(group)]
+
+    def _spans(self) -> tuple[Ints, Times, Times]:
+        """The numbers of batches that are not empty, and their first and last times, in the order of the first."""
         numbers = np.flatnonzero(np.diff(self.edges))
         first_ns, last_ns = self.t_ns[self.edges[numbers]], self.t_ns[self.edges[numbers + 1] - 1]
         order = np.argsort(first_ns, kind="stable")
-        until = np.maximum.accumulate(last_ns[order])
-        starts = 1 + np.flatnonzero(first_ns[order][1:] > until[:-1])
-        return [group.tolist() for group in np.split(numbers[order], starts) if len(group)]
+        return numbers[order], first_ns[order], last_ns[order]
 
 
 def joined_by_chunk(batches: Sequence[MessageBatch], *, reverse: bool) -> tuple[list[MessageBatch], Ints]:

@@ -28,7 +28,7 @@ from mcaptrack.location import Location, Url, is_remote
 from mcaptrack.log import in_place, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile, ReadFile, Signature, open_file
 from mcaptrack.log.chunks import MAX_NS
-from mcaptrack.log.index import Index, read_index
+from mcaptrack.log.index import Index, ends_with_magic, read_index, starts_with_magic
 from mcaptrack.log.journal import changed, find_journal, recover_hint
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, Payloads, Span, TimeOutOfRange
 from mcaptrack.log.records import Damaged
@@ -232,7 +232,8 @@ def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
             raise Damaged("it is empty")
         index = read_index(source)
     except Damaged as error:
-        hint = f"; {recover_hint(path)}" if _looks_like_mcap(file, signature.size) else ""
+        whole = ByteSource.of(file)  # with the magic bytes at one end, `recover` may find something in it
+        hint = f"; {recover_hint(path)}" if starts_with_magic(whole) or ends_with_magic(whole) else ""
         refusal = McaptrackError(f"{path} can't be read as an MCAP file: {error}{hint}")
         if not _is_unchanged(path, file, signature):
             return refusal
@@ -244,13 +245,6 @@ def _look(path: Location, file: ReadFile) -> Snapshot | McaptrackError:
     if journal:
         notices.warn(journal.message, "journal")
     return Snapshot(path, file, source, index, signature, is_certain)
-
-
-def _looks_like_mcap(file: ReadFile, size: int) -> bool:
-    """Whether a file begins or ends with the MCAP magic bytes, so that `recover` may find something in it."""
-    source = ByteSource.of(file)
-    ends = (source[at : at + len(records.MAGIC)] for at in (0, max(size - len(records.MAGIC), 0)))
-    return any(bytes(end) == records.MAGIC for end in ends)
 
 
 def _is_unchanged(path: Location, file: ReadFile, signature: Signature) -> bool:
@@ -458,26 +452,25 @@ class Log:
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """The last metadata record of that name."""
-        if self.results is not None and (of_results := self.results.metadata(name)) is not None:
-            return of_results
-        offsets = [listed.offset for listed in self.index.metadata if listed.name == name]
-        if not offsets:
-            return None
-        with self.snapshot.reporting_damage():
-            whole = self.snapshot.record(offsets[-1])
-            return records.read_metadata(whole, records.record_at(whole, 0)).metadata
+        return self._last(name, "metadata", lambda whole, at: records.read_metadata(whole, at).metadata)
 
     def attachment(self, name: str) -> bytes | None:
         """The data of the last attachment of that name."""
-        if self.results is not None and (of_results := self.results.attachment(name)) is not None:
-            return of_results
-        offsets = [listed.offset for listed in self.index.attachments if listed.name == name]
-        if not offsets:
-            return None
-        with self.snapshot.reporting_damage():
-            whole = self.snapshot.record(offsets[-1])
-            attachment = records.read_attachment(whole, records.record_at(whole, 0))
+
+        def data(whole: memoryview, record: records.Record) -> bytes:
+            attachment = records.read_attachment(whole, record)
             return bytes(whole[attachment.start : attachment.end])
+
+        return self._last(name, "attachments", data)
+
+    def _last(self, name: str, kind: str, read: Callable[[memoryview, records.Record], T]) -> T | None:
+        """Read the last "metadata" or "attachments" record of that name: of the sidecar, or else of the log."""
+        for part in reversed(self.parts):
+            if offsets := [listed.offset for listed in getattr(part.index, kind) if listed.name == name]:
+                with part.snapshot.reporting_damage():
+                    whole = part.snapshot.record(offsets[-1])
+                    return read(whole, records.record_at(whole, 0))
+        return None
 
     def messages(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Message]:
         """The messages of a channel in time order, from ``start_ns`` (inclusive) to ``end_ns`` (exclusive), if given.

@@ -227,12 +227,6 @@ def read_chunk(buffer: Bytes, record: Record) -> ChunkHead:
     return ChunkHead(*head, r.at, r.at + size)
 
 
-def read_message_index(buffer: Bytes, record: Record) -> tuple[int, int]:
-    """The channel of a message index and the number of its entries."""
-    channel, entries = read_message_entries(buffer, record)
-    return channel, len(entries) // 16
-
-
 def read_message_entries(buffer: Bytes, record: Record) -> tuple[int, memoryview]:
     """The channel of a message index and its entries: log time and offset, 8 bytes each."""
     if record.opcode != Opcode.MESSAGE_INDEX:

@@ -91,15 +91,18 @@ class Session:
         is_on_gpu = _CUDA in self._session.get_providers()
         if device == "cuda" and not is_on_gpu:
             raise SessionError("can't be run on CUDA here; see what ONNX Runtime's CUDA needs")
-        names = [text for one in self._values() for text in (one.name, *(one.shape or [])) if isinstance(text, str)]
+        inputs, outputs = (
+            [(tensor.name, list(tensor.shape or []), tensor.type) for tensor in tensors]
+            for tensors in (self._session.get_inputs(), self._session.get_outputs())
+        )
+        names = [part for name, shape, _ in (*inputs, *outputs) for part in (name, *shape) if isinstance(part, str)]
         if len(longest := max(names, key=len, default="")) > _LONGEST:
             raise SessionError(f"has a name of {len(longest):,} characters, {longest[:20]}...; give it a shorter one")
         self._alone = Lock()
         metadata = self._session.get_modelmeta().custom_metadata_map
-        inputs = [(tensor.name, list(tensor.shape or []), tensor.type) for tensor in self._session.get_inputs()]
         self.facts: Facts = {
             "inputs": inputs,
-            "outputs": [(tensor.name, list(tensor.shape or []), tensor.type) for tensor in self._session.get_outputs()],
+            "outputs": outputs,
             "sizes": {name: graph.input_size(model, name) for name, shape, _ in inputs if len(shape) == 4},
             "names": {str(index): name for index, name in graph.class_names(model).items()},
             "metadata": {key: text for key, text in metadata.items() if len(key) + len(text) < _LONGEST},
@@ -107,28 +110,23 @@ class Session:
             "is_without_gpu": providers[0] == _CUDA and not is_on_gpu,
         }
 
-    def _values(self) -> list[Any]:
-        """Inputs and outputs, as ONNX Runtime has them."""
-        return [*self._session.get_inputs(), *self._session.get_outputs()]
-
     def run(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """The outputs, in order; one that holds no numbers is empty, of type object. Raises SessionError."""
         try:
-            outputs = self._session.run(None, inputs)
-        except Exception as error:
-            if "memory" not in str(error):
-                raise SessionError(f"can't be run: {_short(error)}") from None
-            outputs = self._run_alone(inputs)
+            outputs = self._run(inputs)
+        except SessionError as error:
+            if not error.limit:
+                raise
+            with self._alone:  # while no other thread runs it, after all of them together took too much
+                outputs = self._run(inputs)
         return [_numbers(output) for output in outputs]
 
-    def _run_alone(self, inputs: Mapping[str, NDArray[Any]]) -> list[Any]:
-        """Run while no other thread does, after all of them together took too much memory."""
-        with self._alone:
-            try:
-                return list(self._session.run(None, inputs))
-            except Exception as error:
-                limit: Limit = "memory" if "memory" in str(error) else ""
-                raise SessionError(f"can't be run: {_short(error)}", limit) from None
+    def _run(self, inputs: Mapping[str, NDArray[Any]]) -> list[Any]:
+        try:
+            return list(self._session.run(None, inputs))
+        except Exception as error:
+            limit: Limit = "memory" if "memory" in str(error) else ""
+            raise SessionError(f"can't be run: {_short(error)}", limit) from None
 
 
 def is_installed() -> bool:

@@ -16,7 +16,7 @@ import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
@@ -336,10 +336,9 @@ def read_ranges(url: Url, version: Version, ranges: Sequence[tuple[int, int]]) -
 
 
 def _read(url: Url, version: Version, start: int, end: int) -> bytes:
-    obstore = library(url)
     options: dict[str, Any] = {"range": (start, end)} | ({"if_match": version.etag} if version.etag else {})
     with reporting_faults(url):
-        present, data = _get(obstore, url, options)
+        present, data = _get(library(url), url, options)
     if present != version:
         raise replaced(url)
     if len(data) != end - start:
@@ -364,21 +363,15 @@ def find(url: Url) -> Version | None:
 
     Raises McaptrackError if the store can't tell.
     """
-    obstore = library(url)
-    with reporting_faults(url):
-        try:
-            return _version(obstore.head(store_of(url), url.key))
-        except FileNotFoundError as error:
-            if meaning_of(url, error):
-                raise
-            return None
+    with suppress(AbsentError), reporting_faults(url):
+        return _version(library(url).head(store_of(url), url.key))
+    return None
 
 
 def read(url: Url) -> bytes:
     """A small object. Raises McaptrackError if there is none, or if it can't be read."""
-    obstore = library(url)
     with reporting_faults(url):
-        return _get(obstore, url, {})[1]
+        return _get(library(url), url, {})[1]
 
 
 def replace(url: Url, file: Path, before: Version | None) -> Version:
@@ -429,17 +422,10 @@ def put_if_unchanged(url: Url, data: bytes, before: Version | None) -> Version |
     """
     obstore = library(url)
     mode: Any = {"e_tag": before.etag} if before else "create"
-    with reporting_faults(url, "written"):
-        try:
-            answer = obstore.put(store_of(url), url.key, data, mode=mode, use_multipart=False)
-            return Version(len(data), answer["e_tag"])
-        except (
-            obstore.exceptions.AlreadyExistsError,
-            obstore.exceptions.PreconditionError,
-            FileNotFoundError,
-        ) as error:
-            if isinstance(error, FileNotFoundError) and meaning_of(url, error):
-                raise
+    is_other = suppress(obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError)
+    with suppress(AbsentError), reporting_faults(url, "written"), is_other:
+        answer = obstore.put(store_of(url), url.key, data, mode=mode, use_multipart=False)
+        return Version(len(data), answer["e_tag"])
     try:
         present, content = read_end(url, max(len(data), 1) + 1)
     except AbsentError:
@@ -449,13 +435,8 @@ def put_if_unchanged(url: Url, data: bytes, before: Version | None) -> Version |
 
 def delete(url: Url) -> None:
     """Remove an object; one that isn't there is no fault."""
-    obstore = library(url)
-    with reporting_faults(url, "removed"):
-        try:
-            obstore.delete(store_of(url), url.key)
-        except FileNotFoundError as error:
-            if meaning_of(url, error):
-                raise
+    with suppress(AbsentError), reporting_faults(url, "removed"):
+        library(url).delete(store_of(url), url.key)
 
 
 def list_objects(prefix: Url) -> Iterator[tuple[Url, Version]]:
@@ -463,10 +444,9 @@ def list_objects(prefix: Url) -> Iterator[tuple[Url, Version]]:
 
     They come in the order of the store, which is alphabetical in most.
     """
-    obstore = library(prefix)
     with reporting_faults(prefix):
         root = Url(f"{prefix.scheme}://{prefix.bucket}")
-        for page in obstore.list(store_of(prefix), prefix=prefix.key.strip("/") or None):
+        for page in library(prefix).list(store_of(prefix), prefix=prefix.key.strip("/") or None):
             yield from ((root / listed["path"], _version(listed)) for listed in page)
 
 

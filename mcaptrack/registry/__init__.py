@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from importlib import import_module
@@ -50,7 +50,7 @@ Kind = Literal[
     "stage",
     "label_format",
     "message_reader",
-    "recording",
+    "recording",  # other containers than MCAP, by what their names or first bytes say
     "exporter",
     "judge",
     "finisher",
@@ -58,9 +58,9 @@ Kind = Literal[
     "command",
     "page",
     "player",
-    "viewer",
-    "name",
-    "scene",
+    "viewer",  # on the web, which `mcaptrack view` links besides Lichtblick and Foxglove
+    "name",  # in Python, such as classes of results; those of the core are in mcaptrack/__init__.py
+    "scene",  # what makes a scene of several cameras (mcaptrack.pipeline.scenes)
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 _OWN: Final = "mcaptrack"
@@ -83,6 +83,7 @@ _BY_ENTRY_POINT: Final = (
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
     {
+        **{kind: {} for kind in KINDS},
         "detector": {
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
@@ -111,7 +112,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "likelihood": "mcaptrack.transforms.retrack:Retrack",
             "consistency": "mcaptrack.transforms.retrack:RetrackByConsistency",
         },
-        "fuser": {},
         # The default transform of each; mcaptrack.transforms.stages says the rest.
         "stage": {
             "detect": "mcaptrack.transforms.detect.median:MedianDetector",
@@ -135,26 +135,15 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "visualization_msgs/MarkerArray": f"{_SOLIDS}:marker_solids",
             "visualization_msgs/Marker": f"{_SOLIDS}:marker_solids",
         },
-        # Of other containers than MCAP, by what their names or first bytes say.
-        "recording": {},
         "exporter": {
             **dict.fromkeys(("parquet", "arrow", "csv", "jsonl"), "mcaptrack.tables.export:export"),
             "mot": "mcaptrack.sources.box_files:MotFile",
         },
-        "judge": {},
         # What is made of the results of stages at the end of a run.
         "finisher": {"events": "mcaptrack.pipeline.events:Watch"},
-        "report_section": {},
         "command": {name: f"{_MODULES[name]}:{name}" for name in _COMMANDS.split()}
         | {"docs": "mcaptrack.cli.docs:documentation"},
         "page": {"tables": "mcaptrack.api.viewing:tables_page"},
-        "player": {},
-        # Other names of mcaptrack in Python, such as classes of results; its own are in mcaptrack/__init__.py.
-        "name": {},
-        # What makes a scene of several cameras (mcaptrack.pipeline.scenes).
-        "scene": {},
-        # Viewers on the web that `mcaptrack view` links, besides Lichtblick and Foxglove.
-        "viewer": {},
     }
 )
 
@@ -235,27 +224,27 @@ def own(kind: Kind) -> dict[str, str]:
 
 def points(kind: Kind) -> list[Point]:
     """The entry points of a kind; those with a name that is taken don't count."""
-    listed = entry_points(_group(kind))
-    own = {point.name for point in listed if point.is_own}
-    return [point for point in listed if not _owner(kind, point, own)]
+    return [point for point, owner in _owners(kind) if not owner]
 
 
 def ignored(kind: Kind) -> dict[str, str]:
     """Why entry points of a kind don't count, by their title. Imports nothing."""
-    listed = entry_points(_group(kind))
-    own = {point.name for point in listed if point.is_own}
-    owners = {titled(kind, point.name, point.package): _owner(kind, point, own) for point in listed}
+    owners = {titled(kind, point.name, point.package): owner for point, owner in _owners(kind)}
     return {what: f"{what} is ignored: there is {owner}; rename it" for what, owner in owners.items() if owner}
 
 
-def _owner(kind: Kind, point: Point, own: Set[str]) -> str:
-    """The entry with the name of an entry point, which can't have it: a built-in one, one of those that are our
-    ``own``, or a command; "" if none.
+def _owners(kind: Kind) -> Iterator[tuple[Point, str]]:
+    """Each entry point of a kind, and the entry that has its name already: a built-in one, one of an extension, or a
+    command; "" if none.
     """
-    if point.name in BUILT_IN[kind] or (point.name in own and not point.is_own):
-        return f"a built-in {titled(kind, point.name)}"
-    taken = names("command") if kind == "stage" else BUILT_IN["command"] if kind == "finisher" else ()
-    return f"a {titled('command', point.name)}" if point.name in taken else ""
+    listed = entry_points(_group(kind))
+    own = {point.name for point in listed if point.is_own}
+    commands = names("command") if kind == "stage" else BUILT_IN["command"] if kind == "finisher" else ()
+    for point in listed:
+        if point.name in BUILT_IN[kind] or (point.name in own and not point.is_own):
+            yield point, f"a built-in {titled(kind, point.name)}"
+        else:
+            yield point, f"a {titled('command', point.name)}" if point.name in commands else ""
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:

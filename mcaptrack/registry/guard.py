@@ -53,28 +53,10 @@ def _write_folder(folder: str) -> None:
         os.chdir(folder)
 
 
-def _read_numpy_errors() -> Any:
-    import numpy as np  # here: commands that run no code of others may not need NumPy
+def _numpy() -> Any:
+    import numpy  # here: commands that run no code of others may not need NumPy
 
-    return np.geterr()
-
-
-def _write_numpy_errors(state: Any) -> None:
-    import numpy as np
-
-    np.seterr(**state)
-
-
-def _read_numpy_random() -> Any:
-    import numpy as np
-
-    return np.random.get_state()  # noqa: NPY002 - the global state, which others may seed
-
-
-def _write_numpy_random(state: Any) -> None:
-    import numpy as np
-
-    np.random.set_state(state)  # noqa: NPY002
+    return numpy
 
 
 def _plain_state(state: Any) -> tuple[Any, ...]:
@@ -127,7 +109,7 @@ _FACETS: Final = (
         )
         for number in _SIGNALS
     ),
-    _Facet("NumPy's handling of errors", _read_numpy_errors, _write_numpy_errors),
+    _Facet("NumPy's handling of errors", lambda: _numpy().geterr(), lambda state: _numpy().seterr(**state)),
     _Facet("the recursion limit", sys.getrecursionlimit, sys.setrecursionlimit),
     _Facet(
         "the filters of warnings",
@@ -142,8 +124,8 @@ _RANDOM: Final = (
     _Facet("the random state of Python", random.getstate, random.setstate),
     _Facet(
         "the random state of NumPy",
-        _read_numpy_random,
-        _write_numpy_random,
+        lambda: _numpy().random.get_state(),  # noqa: PLW0108  # the global one, which others may seed
+        lambda state: _numpy().random.set_state(state),  # noqa: PLW0108  # without NumPy until it is called
         lambda before, after: _plain_state(before) != _plain_state(after),
     ),
 )

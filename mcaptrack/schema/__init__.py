@@ -311,12 +311,6 @@ class EventKind(IntEnum):
 
 
 #: Their names, as in the comments of the schema.
-EVENT_KINDS: Final = {
-    EventKind.MISS: "miss",
-    EventKind.FALSE_TRACK: "false track",
-    EventKind.SWITCH: "identity switch",
-    EventKind.BIRTH: "birth",
-    EventKind.END: "end",
-    EventKind.JOINED: "joined",
-    EventKind.PARTED: "parted",
+EVENT_KINDS: Final = {kind: kind.name.lower().replace("_", " ") for kind in EventKind} | {
+    EventKind.SWITCH: "identity switch"
 }

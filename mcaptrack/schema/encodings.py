@@ -228,11 +228,10 @@ class CdrCodec:
         """
         ends = np.cumsum([len(payload) for payload in payloads], dtype=np.int64)
         starts = np.append(0, ends[:-1])[: len(ends)]
-        decoded = self.decode_at(np.frombuffer(b"".join(payloads), np.uint8), starts, ends)
+        raw = np.frombuffer(b"".join(payloads), np.uint8)
+        decoded = self.decode_at(raw, starts, ends)
         if decoded is None:
-            fits = [
-                self.decode_at(np.frombuffer(payload, np.uint8), *_whole(payload)) is not None for payload in payloads
-            ]
+            fits = [self.decode_at(raw, starts[n : n + 1], ends[n : n + 1]) is not None for n in range(len(ends))]
             bad = payloads[fits.index(False)]
             raise ValueError(f"{len(bad)} bytes are not a CDR message of its definition")
         return decoded
@@ -272,10 +271,6 @@ class CdrCodec:
         """The lengths (M,) of messages with so many rows, without the bytes before them."""
         last = self._starts_of(np.maximum(counts - 1, 0))
         return np.where(counts > 0, last + self._sizes[last % _ALIGN], _COUNT)
-
-
-def _whole(payload: bytes) -> tuple[Ints, Ints]:
-    return np.zeros(1, np.int64), np.array([len(payload)], np.int64)
 
 
 def _take(raw: Bytes, at: Ints, form: np.dtype[Any], count: int = 1) -> NDArray[Any]:

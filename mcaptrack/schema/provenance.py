@@ -114,33 +114,19 @@ class Provenance:
             "digest": self.digest,
             "output": self.output,
             "weights_sha256": self.weights_sha256,
-            "references": json.dumps(dict(self.references), sort_keys=True, separators=(",", ":")),
-            "plugins": json.dumps({key: plugin._asdict() for key, plugin in self.plugins.items()}, sort_keys=True),
-            "classes": json.dumps(dict(self.classes), ensure_ascii=False),
+            "references": _text(self.references, sort_keys=True, separators=(",", ":")),
+            "plugins": _text({key: plugin._asdict() for key, plugin in self.plugins.items()}, sort_keys=True),
+            "classes": _text(self.classes, ensure_ascii=False),
             "class_id": self.class_id,
             "frame_id": self.frame_id,
-            "zones": json.dumps(dict(self.zones), ensure_ascii=False),
+            "zones": _text(self.zones, ensure_ascii=False),
             "columns": self.columns,
-            "model": json.dumps(dict(self.model), sort_keys=True),
-            "warnings": json.dumps(self.warnings, separators=(",", ":")),
-            "continued": json.dumps(dict(self.continued), sort_keys=True),
-            "scores": json.dumps(dict(self.scores), ensure_ascii=False),
-            "boxes": json.dumps(dict(self.boxes), sort_keys=True),
+            "model": _text(self.model, sort_keys=True),
+            "warnings": json.dumps(self.warnings, separators=(",", ":")) if self.warnings else "",
+            "continued": _text(self.continued, sort_keys=True),
+            "scores": _text(self.scores, ensure_ascii=False),
+            "boxes": _text(self.boxes, sort_keys=True),
         }
-        names = (
-            "scores",
-            "boxes",
-            "continued",
-            "warnings",
-            "references",
-            "plugins",
-            "classes",
-            "zones",
-            "model",
-        )
-        for name in names:
-            if not getattr(self, name):
-                del values[name]
         return {_PREFIX + key: value for key, value in values.items() if value}
 
     @classmethod
@@ -157,6 +143,11 @@ class Provenance:
         fields: dict[str, Any] = {key: value for key, value in values.items() if key in cls.__dataclass_fields__}
         fields |= {"references": references, "warnings": warnings, "plugins": plugins, **texts}
         return cls(parameters=parameters, **fields)
+
+
+def _text(values: Mapping[str, Any], **form: Any) -> str:
+    """Values as a JSON object; "" if there are none."""
+    return json.dumps(dict(values), **form) if values else ""
 
 
 def input_of(metadata: Mapping[str, str]) -> str:

@@ -271,15 +271,12 @@ def _interval(value: Any) -> str | None:
     """An interval as DuckDB prints it: 1 month 2 days 00:00:01.5."""
     if value is None:
         return None
-    parts = [f"{count} {name}{'s' * (abs(count) != 1)}" for count, name in _calendar(value) if count]
+    years = math.trunc(value.months / 12)
+    calendar = ((years, "year"), (value.months - 12 * years, "month"), (value.days, "day"))
+    parts = [f"{count} {name}{'s' * (abs(count) != 1)}" for count, name in calendar if count]
     sign, rest = "-" * (value.nanoseconds < 0), abs(value.nanoseconds)
     if rest or not parts:
         seconds, nanos = divmod(rest, 10**9)
         fraction = f".{nanos:09d}".rstrip("0") if nanos else ""
         parts.append(f"{sign}{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}{fraction}")
     return " ".join(parts)
-
-
-def _calendar(value: Any) -> Sequence[tuple[int, str]]:
-    years = math.trunc(value.months / 12)
-    return ((years, "year"), (value.months - 12 * years, "month"), (value.days, "day"))

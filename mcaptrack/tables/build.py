@@ -40,27 +40,21 @@ def table_of(schema: Schema) -> Table:
     return next((table for table in TABLES.values() if table.rows_of is schema), None) or of_rows(schema)
 
 
-def frames_table(channels: Mapping[str, Pointers], names: Sequence[str] = ()) -> Any:
-    """The table ``frames`` of channels, by topic; for a part of it, ``names`` are those of all topics and files."""
+def frames_table(topic: str, messages: Pointers, names: Sequence[str] = ()) -> Any:
+    """The rows of a channel in the table ``frames``, of which ``names`` are all topics and files."""
     import pyarrow as pa
 
-    parts = dict(sorted(channels.items()))
-    counts = [len(part.t_ns) for part in parts.values()]
-
-    def joined(name: str) -> Ints:
-        return np.concatenate([np.empty(0, np.int64), *(getattr(part, name) for part in parts.values())])
-
-    t_ns, rows, chunk = joined("t_ns"), joined("rows"), joined("chunk_offset")
-    schema = TABLES["frames"].arrow
+    file, t_ns, frame, rows, chunk, message = messages
+    schema, counts = TABLES["frames"].arrow, [len(t_ns)]
     columns = {
-        "topic": repeated(list(parts), counts, names),
-        "frame": pa.array(joined("frame")),
+        "topic": repeated([topic], counts, names),
+        "frame": pa.array(frame),
         "t": times(t_ns),
         "t_ns": pa.array(t_ns),
         "rows": pa.array(rows, mask=rows < 0),
-        "file": repeated([part.file for part in parts.values()], counts, names),
+        "file": repeated([file], counts, names),
         "chunk_offset": pa.array(chunk, mask=chunk < 0),
-        "message_offset": pa.array(joined("message_offset")),
+        "message_offset": pa.array(message),
     }
     return pa.table([columns[name] for name in schema.names], schema=schema)
 
@@ -69,16 +63,7 @@ def records_table(table: Table, records: Sequence[Mapping[str, Any]]) -> Any:
     """A table about a log from its records; missing values are null."""
     import pyarrow as pa
 
-    kinds = {field.name: field.type for field in table.arrow}
-    columns = []
-    for name, kind in kinds.items():
-        values = [record.get(name) for record in records]
-        columns.append(
-            pa.array(values, pa.string()).dictionary_encode().cast(kind)
-            if pa.types.is_dictionary(kind)
-            else pa.array(values, kind)
-        )
-    return pa.table(columns, schema=table.arrow)
+    return pa.Table.from_pylist(records, table.arrow)
 
 
 def with_recording(table: Any, recording: str) -> Any:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, TypeGuard
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish
+from mcaptrack.files import publish_stream
 from mcaptrack.location import Location
 from mcaptrack.tables.build import with_recording
 from mcaptrack.tables.fields import RECORDING, TABLES
@@ -50,11 +50,8 @@ def refresh(folder: Path) -> bool:
         return False
     table = _table(folder, members)
     table = table.sort_by(RECORDING.name).replace_schema_metadata({_MEMBERS: json.dumps(members)})
-    try:
-        with publish(folder / FILE) as part, part.open("xb") as stream:
-            pq.write_table(table, stream, compression="zstd")
-    except OSError as error:
-        raise McaptrackError(f"{folder / FILE} can't be written: {error.strerror or error}") from error
+    with publish_stream(folder / FILE) as stream:
+        pq.write_table(table, stream, compression="zstd")
     return True
 
 
@@ -116,7 +113,7 @@ def join(parts: Sequence[tuple[str, Any]], columns: Any = None) -> Any:
         at = schema.get_field_index(RECORDING.name)
         schema = (schema if at < 0 else schema.remove(at)).append(RECORDING.arrow)
         schema = pa.schema([field.with_nullable(True).remove_metadata() for field in schema])
-        table = pa.concat_tables([_filled(table, schema) for table in loose]) if loose else schema.empty_table()
+        table = pa.concat_tables([schema.empty_table(), *loose], promote_options="permissive").cast(schema)
     except (pa.ArrowException, TypeError) as error:
         raise McaptrackError(f"{_COLUMNS}: {str(error).splitlines()[0]}") from None
     if not files:
@@ -134,19 +131,6 @@ def _columns(path: Path) -> Any:
             return pq.read_schema(stream).remove_metadata()
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read as Parquet: {str(error).splitlines()[0]}") from None
-
-
-def _filled(table: Any, schema: Any) -> Any:
-    """A table with all columns, in order; missing ones are null."""
-    import pyarrow as pa
-
-    columns = [
-        table.column(field.name).cast(field.type)
-        if field.name in table.schema.names
-        else pa.nulls(table.num_rows, field.type)
-        for field in schema
-    ]
-    return pa.table(columns, schema=schema)
 
 
 def _dataset(files: Sequence[tuple[str, Path]], schema: Any) -> Any:

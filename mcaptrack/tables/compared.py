@@ -174,17 +174,11 @@ def _boxes_3d(tracks: Path, ground_truth: Path, options: IngestOptions) -> Align
         return AlignedFiles(*frames, job.report.remarks, classes, labelled)
 
 
-@dataclass
-class AlignedDetections:
-    """Detections and ground truth as frames at the same times, and the ground plane, if there is one."""
-
-    detections: list[Frame]
-    ground_truth: list[Frame]
-    planes: tuple[tuple[int, GroundPlane], ...]
-
-
-def detections_and_ground_truth(detections: Path, ground_truth: Path, options: IngestOptions) -> AlignedDetections:
-    """A file of detections and one of ground truth as frames, at the times that the frame rate gives.
+def detections_and_ground_truth(
+    detections: Path, ground_truth: Path, options: IngestOptions
+) -> tuple[list[Frame], list[Frame], tuple[tuple[int, GroundPlane], ...]]:
+    """A file of detections and one of ground truth as frames, at the times that the frame rate gives; and the ground
+    plane, if there is one.
 
     Raises McaptrackError if they can't be read, or if the frame rate is not known.
     """
@@ -192,7 +186,7 @@ def detections_and_ground_truth(detections: Path, ground_truth: Path, options: I
         if not all(labels.boxes_px is not None for labels in job.labels.values()):
             raise McaptrackError(f"{detections} and {ground_truth} have to hold boxes in pixels, both")
         planes = ((0, job.ground),) if job.ground else ()
-        return AlignedDetections(job.all_frames("detections"), job.all_frames("truth"), planes)
+        return job.all_frames("detections"), job.all_frames("truth"), planes
 
 
 class _PairJob(LabelJob):
@@ -205,7 +199,8 @@ class _PairJob(LabelJob):
 def _read(path: Path, role: Role, topics: Sequence[str], options: IngestOptions) -> BoxTable:
     if _is_exported(path):
         return _read_parquet(path, role, topics)
-    if role == "tracks" and path.is_file() and _is_blank(path):
+    is_short = role == "tracks" and path.is_file() and path.stat().st_size < _BLANK_BYTES
+    if is_short and not path.read_bytes().strip():
         return _no_tracks(path)
     labels = options.read(path, role, replace(options.classes or ONLY_PEOPLE, may_lack=role == "tracks"))
     if options.size is not None and labels.boxes_px is not None:
@@ -224,10 +219,6 @@ def _is_exported(path: Path) -> bool:
         return False
     metadata = tables.file_metadata(path, "parquet")
     return metadata is None or "table_version" in metadata  # what can't be read is refused as such a table
-
-
-def _is_blank(path: Path) -> bool:
-    return path.stat().st_size < _BLANK_BYTES and not path.read_bytes().strip()
 
 
 def _no_tracks(path: Path) -> BoxTable:

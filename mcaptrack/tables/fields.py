@@ -6,7 +6,7 @@ Columns are only ever added, and added columns may be missing, so that old files
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any, Final
@@ -104,13 +104,10 @@ class Table:
 
     def is_of_tracks(self) -> bool:
         """Whether its rows name tracks by their ids, and so have the classes of these."""
-        return "track_id" in (names := self._columns_of_ours) and "class_id" not in names
-
-    @property
-    def _columns_of_ours(self) -> set[str]:
-        """The columns of its rows, if they are of a schema of mcaptrack."""
-        of = self.rows_of
-        return {column.name for column in of.columns} if of is not None and of.name in SCHEMAS else set()
+        if self.rows_of is None or self.rows_of.name not in SCHEMAS:
+            return False
+        names = {column.name for column in self.rows_of.columns}
+        return "track_id" in names and "class_id" not in names
 
 
 def _with_unit(field: Any) -> Any:
@@ -238,6 +235,8 @@ _SUMMARY: Final = Table(
     ),
 )
 
+#: The metrics that ``recordings`` has, too.
+SCORES: Final = ("MOTA", "IDF1", "HOTA", "IDSW")
 _METRICS: Final = Table(
     "metrics",
     "One row a channel of tracks, similarity and gate: its scores against the ground truth of its camera, the numbers "
@@ -386,13 +385,7 @@ _RECORDINGS: Final = Table(
         ),
         Field("scored", _NAME, "the tracks that the scores are of: those of the camera with the lowest IDF1", "", True),
         Field("similarity", _NAME, "what they were scored by, as in metrics", nullable=True),
-        Field("gate", _FLOAT, "least overlap, or largest distance in metres, of a match", nullable=True),
-        Field(
-            "MOTA", _FLOAT, "CLEAR: 1 less misses, false positives and switches by rows of the ground truth", "", True
-        ),
-        Field("IDF1", _FLOAT, "identity: F1 of rows under the best assignment of tracks to people", nullable=True),
-        Field("HOTA", _FLOAT, "higher order tracking accuracy, mean over thresholds", nullable=True),
-        Field("IDSW", _INT, "identity switches", nullable=True),
+        *(replace(field, nullable=True) for field in _METRICS.fields if field.name in ("gate", *SCORES)),
         Field("warnings", _INT, "number of warnings about its results", nullable=True),
         Field("warning_texts", _TEXT, "these warnings as JSON, with code and message; null without", nullable=True),
         Field("versions", _TEXT, "versions of mcaptrack that made its channels, with commas", nullable=True),

@@ -57,7 +57,7 @@ def write(
         return file.is_new
     metadata = _stated(provenance)
     if form == "arrow":
-        metadata["digest"] = digest(table.schema, pieces_of(table))
+        metadata["digest"], _ = digest(table.schema, pieces_of(table))
         if not force and _without_source(file_metadata(path, form) or {}) == _without_source(metadata):
             return False
     with _publishing(path) as part:
@@ -102,16 +102,11 @@ def _publishing(path: Path) -> Iterator[Path]:
         ) from None
     except OSError as error:
         raise McaptrackError(f"{path} can't be written: {error.strerror or error}") from error
-    if is_large:
-        _release()
+    if is_large:  # memory that is not used goes back to the system
+        import pyarrow as pa
 
-
-def _release() -> None:
-    """Give memory that is not used back to the system."""
-    import pyarrow as pa
-
-    pa.default_memory_pool().release_unused()
-    release_memory()
+        pa.default_memory_pool().release_unused()
+        release_memory()
 
 
 class _Stream(io.BufferedWriter):
@@ -119,11 +114,10 @@ class _Stream(io.BufferedWriter):
 
     def __init__(self, path: Path) -> None:
         super().__init__(io.FileIO(path, "xb"))
-        self.size, self.content = 0, hashlib.sha256()
+        self.content = hashlib.sha256()
 
     def write(self, data: Any) -> int:
         """Write bytes."""
-        self.size += len(data)
         self.content.update(data)
         return super().write(data)
 
@@ -302,10 +296,7 @@ def verify(path: Path, form: TableFormat = "parquet") -> int:
             else:
                 reader = pa.ipc.open_file(stream)
                 batches = (reader.get_batch(number) for number in range(reader.num_record_batches))
-                total = _TableDigest(reader.schema)
-                for batch in batches:
-                    total.add(pa.Table.from_batches([batch]))
-                rows, content = total.rows, total.hexdigest()
+                content, rows = digest(reader.schema, (pa.Table.from_batches([batch]) for batch in batches))
     except (OSError, pa.ArrowException) as error:
         raise McaptrackError(f"{path} can't be read back: {str(error).splitlines()[0]}") from None
     if content != stored:
@@ -313,34 +304,19 @@ def verify(path: Path, form: TableFormat = "parquet") -> int:
     return int(rows)
 
 
-def digest(schema: Any, pieces: Iterable[Any]) -> str:
-    """SHA-256 of the content of a table: names, types and values, independent of pieces."""
-    total = _TableDigest(schema)
+def digest(schema: Any, pieces: Iterable[Any]) -> tuple[str, int]:
+    """SHA-256 of the content of a table (names, types and values, independent of pieces), and its number of rows."""
+    columns, rows = [_ColumnDigest() for _ in schema], 0
     for piece in pieces:
-        total.add(piece)
-    return total.hexdigest()
-
-
-class _TableDigest:
-    """The digest of a table: ``add`` its pieces."""
-
-    def __init__(self, schema: Any) -> None:
-        self._schema, self._columns, self.rows = schema, [_ColumnDigest() for _ in schema], 0
-
-    def add(self, piece: Any) -> None:
-        """Add the next rows, an Arrow table."""
-        for column, values in zip(self._columns, piece.columns, strict=True):
+        for column, values in zip(columns, piece.columns, strict=True):
             for chunk in values.chunks:
                 if len(chunk):  # lists of nothing are as no lists
                     column.add(chunk)
-        self.rows += piece.num_rows
-
-    def hexdigest(self) -> str:
-        """The digest of all added rows."""
-        total = hashlib.sha256(self.rows.to_bytes(8, "little"))
-        for field, column in zip(self._schema, self._columns, strict=True):
-            total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
-        return total.hexdigest()
+        rows += piece.num_rows
+    total = hashlib.sha256(rows.to_bytes(8, "little"))
+    for field, column in zip(schema, columns, strict=True):
+        total.update(f"{field.name}\0{_kind(field.type)}\0{column.digest()}\0".encode())
+    return total.hexdigest(), rows
 
 
 def _kind(kind: Any) -> str:

@@ -129,7 +129,7 @@ class _Rows:
         places = Pointers(
             self._source.file, messages.t_ns, frame, np.full(count, -1), messages.chunk_offset, messages.offset
         )
-        return frames_table({self._source.topic: places}).drop_columns(["rows"])
+        return frames_table(self._source.topic, places).drop_columns(["rows"])
 
     def table(self, messages: Payloads, values: Columns) -> Any:
         """The next messages as rows; fields without values are null."""

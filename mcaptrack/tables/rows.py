@@ -5,6 +5,7 @@ Letters: N rows, K tracks.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -256,41 +257,23 @@ def _codes(numbers: NDArray[Any], names: Mapping[int, str], places: Mapping[str,
     return np.array([places.get(names.get(number, ""), -1) for number in unique.tolist()], np.int32)[which]
 
 
-class _Pairs(NamedTuple):
-    """Different pairs of track and class, (P,): both, the first row of each, and how many rows there are of it."""
-
-    track: Ints
-    of_class: Ints
-    first: Ints
-    rows: Ints
-
-    def joined(self) -> _Pairs:
-        """Each pair once; earlier rows stand before later ones."""
-        tracks, track = np.unique(self.track, return_inverse=True)
-        classes, of_class = np.unique(self.of_class, return_inverse=True)
-        pair, first, which = np.unique(track * len(classes) + of_class, return_index=True, return_inverse=True)
-        rows = np.bincount(which, self.rows, len(pair)).astype(np.int64)
-        return _Pairs(
-            tracks[pair // max(len(classes), 1)], classes[pair % max(len(classes), 1)], self.first[first], rows
-        )
-
-
 def names_by_track(frames: FrameColumns, names: Mapping[int, str]) -> dict[int, str]:
     """The names of the classes of tracks by id, as far as they have one; ``names`` are those of classes by number.
 
     A track has the class of most of its rows; of several, the one that comes first.
     """
-    pairs = _Pairs(*(np.empty(0, np.int64) for _ in _Pairs._fields))
-    for low, _, joined in joined_parts(frames.schema, frames):
-        track, of_class = (joined.rows[name].astype(np.int64) for name in ("track_id", "class_id"))
-        place = np.arange(len(track)) + frames.ends[low]
-        here = _Pairs(track, of_class, place, np.ones(len(track), np.int64)).joined()
-        pairs = _Pairs(*(np.concatenate(both) for both in zip(pairs, here, strict=True))).joined()
-    order = np.lexsort((pairs.first, -pairs.rows, pairs.track))
-    ids, begin = np.unique(pairs.track[order], return_index=True)
-    classes = pairs.of_class[order][begin].tolist()
+    counts: Counter[tuple[int, int]] = Counter()  # rows by track and class, in the order in which these appear
+    for _, _, joined in joined_parts(frames.schema, frames):
+        pairs = np.stack([joined.rows[name].astype(np.int64) for name in ("track_id", "class_id")], axis=1)
+        different, first, rows = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+        order = np.argsort(first)
+        for (track_id, number), count in zip(different[order].tolist(), rows[order].tolist(), strict=True):
+            counts[track_id, number] += count
+    classes: dict[int, int] = {}
+    for (track_id, number), _ in counts.most_common():
+        classes.setdefault(track_id, number)
     all_names = {PERSON: _PERSON, **names}
-    return {track_id: all_names[of] for track_id, of in zip(ids.tolist(), classes, strict=True) if of in all_names}
+    return {track_id: all_names[number] for track_id, number in classes.items() if number in all_names}
 
 
 def summary_table(channels: Mapping[str, FrameColumns], names: Mapping[str, Mapping[int, str]] = {}) -> Any:

@@ -26,7 +26,7 @@ from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
 from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
 from mcaptrack.files import place_of
 from mcaptrack.geometry.arrays import Floats
-from mcaptrack.location import Location, distinct_names, join
+from mcaptrack.location import Location, distinct_names
 from mcaptrack.log.recording_files import results_path
 from mcaptrack.notices import warn
 from mcaptrack.tables import TABLES
@@ -105,7 +105,7 @@ class _FolderTables:
 
     def __init__(self, folder: Path, recording: str) -> None:
         self.folder, self.recording = folder, recording
-        self.where: Location = join(place_of(folder), recording)
+        self.where: Location = place_of(folder) / recording
         self._member = Path(f"recording={recording}", "part-0.parquet")
 
     def part(self, name: str) -> Any:

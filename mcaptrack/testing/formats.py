@@ -28,7 +28,7 @@ from mcaptrack.sources.ingest.labels.format import LabelFile
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage
 from mcaptrack.sources.ingest.labels.reading import read_by
 from mcaptrack.sources.ingest.labels.table import COLUMNS, Asked
-from mcaptrack.testing.transforms import LawError, same_process
+from mcaptrack.testing.transforms import LawError, law, same_process
 
 #: What a label format may raise for a file that isn't of it.
 _REFUSALS: Final = (McaptrackError, ValueError)
@@ -70,7 +70,8 @@ def check_label_format(label_format: LabelFormat, path: PathLike) -> None:
     >>> check_label_format(Corners(), "a.corners")
     """
     entry = _entry("label_format", label_format, "read")
-    _in_space(entry, label_format)
+    with law("declares"):
+        is_in_space(entry, label_format)
     made = FormatOfPackage(entry, label_format)
     file = as_path(path).absolute()
     with same_process(entry.name), TemporaryDirectory() as folder:
@@ -93,13 +94,10 @@ def check_label_format(label_format: LabelFormat, path: PathLike) -> None:
             raise LawError("pure: it changes its file")
 
 
-def _labels(made: FormatOfPackage, path: Path, law: str) -> list[Any]:
-    """The boxes of a file as labels, as values that can be compared."""
-    try:
-        with collected():
-            rows = read_by(made, LabelFile(path), Asked(made.entry.name, "detections"))
-    except McaptrackError as error:
-        raise LawError(f"{law}: {error}") from None
+def _labels(made: FormatOfPackage, path: Path, name: str) -> list[Any]:
+    """The boxes of a file as labels, as values that can be compared; ``name`` is that of the law that they keep."""
+    with law(name), collected():
+        rows = read_by(made, LabelFile(path), Asked(made.entry.name, "detections"))
     columns = [getattr(rows, name) for name in COLUMNS]
     return [None if column is None else np.asarray(column).tobytes() for column in (*columns, rows.labelled)]
 
@@ -122,10 +120,8 @@ def _damaged(path: Path, folder: Path) -> list[tuple[str, Path]]:
 def _check_recognition(made: FormatOfPackage, path: Path, others: Iterable[Path]) -> None:
     if not made.recognises_any:
         return
-    try:
+    with law("recognises"):
         answers = [made.recognises(LabelFile(file)) for file in (path, *others, path)]
-    except McaptrackError as error:
-        raise LawError(f"recognises: {error}") from None
     if not (answers[0] and answers[-1]):
         raise LawError(f"recognises: it doesn't recognise {path}")
 
@@ -159,7 +155,8 @@ def check_message_reader(reader: MessageReader, messages: Sequence[Any]) -> None
     >>> check_message_reader(Things(), [{"things": [{"x": 1, "y": 2, "w": 3, "h": 4}]}])
     """
     entry = _entry("message_reader", reader, "read")
-    in_space = _in_space(entry, reader)
+    with law("declares"):
+        in_space = is_in_space(entry, reader)
     decoded = [_decoded(message) if isinstance(message, dict) else message for message in messages]
     if not decoded:
         raise LawError("there are no messages to check the reader with")
@@ -169,10 +166,8 @@ def check_message_reader(reader: MessageReader, messages: Sequence[Any]) -> None
             given = list(reader.read(message))
         except Exception as error:
             raise LawError(f"conforms: it raises {type(error).__name__}: {error}") from None
-        try:
+        with law("conforms"):
             return [checked_boxes_3d(entry, message, given).boxes if in_space else checked_boxes(entry, given)]
-        except McaptrackError as error:
-            raise LawError(f"conforms: {error}") from None
 
     with same_process(entry.name):
         kept = deepcopy(decoded)
@@ -223,10 +218,8 @@ def check_exporter(exporter: Exporter, log: PathLike) -> None:
     >>> check_exporter(Topics(), "log.mcap")
     """
     entry = _entry("exporter", exporter, "write")
-    try:
+    with law("declares"):
         by = exporter_for(entry, exporter)
-    except McaptrackError as error:
-        raise LawError(f"declares: {error}") from None
     source = as_path(log).absolute()
 
     def written(path: Path, file: Path) -> tuple[dict[str, int], Any]:
@@ -240,10 +233,8 @@ def check_exporter(exporter: Exporter, log: PathLike) -> None:
     with same_process(entry.name), TemporaryDirectory() as folder, collected():
         before = _content(source)
         places = [Path(folder, name, f"{name}{by.end}") for name in ("a", "other", "empty")]
-        try:
+        with law("conforms"):
             first, again = (written(source, place) for place in places[:2])
-        except McaptrackError as error:
-            raise LawError(f"conforms: {error}") from None
         if first != again:
             raise LawError("pure: the same log gives other bytes when it is written again, under another name")
         if _content(source) != before:
@@ -334,13 +325,6 @@ def _entry(kind: Kind, made: Any, method: str) -> Entry:
     if not callable(getattr(made, method, None)):
         raise LawError(f"declares: {cls.__name__} has no method {method}, so it is no {in_words(kind)}")
     return Entry(cls.__name__, kind, cls, cls.__module__, "", "")
-
-
-def _in_space(entry: Entry, made: Any) -> bool:
-    try:
-        return is_in_space(entry, made)
-    except McaptrackError as error:
-        raise LawError(f"declares: {error}") from None
 
 
 def _content(path: Path) -> Any:

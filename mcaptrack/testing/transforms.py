@@ -29,6 +29,15 @@ class LawError(AssertionError):
     """A transform, a predictor, a format or so on breaks a law; the message says which one, and where."""
 
 
+@contextmanager
+def law(name: str) -> Iterator[None]:
+    """A McaptrackError in this block is a LawError that names the law."""
+    try:
+        yield
+    except McaptrackError as error:
+        raise LawError(f"{name}: {error}") from None
+
+
 def check_transform(transform: Transform, frames: Sequence[Frame] | None = None, *, seed: int = 0) -> None:
     """Check a transform against the laws that hold for every transform.
 
@@ -65,8 +74,8 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     if not inputs:
         raise LawError("there are no frames to check the transform with")
     with same_process(type(transform).__name__):
-        for law in LAWS.values():
-            law(transform, [frame._replace(rows=frame.rows.copy()) for frame in inputs], seed)
+        for holds in LAWS.values():
+            holds(transform, [frame._replace(rows=frame.rows.copy()) for frame in inputs], seed)
 
 
 @contextmanager
@@ -263,11 +272,9 @@ def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
                 raise LawError(f"conforms: {_where(suffix, number, frame)} is not later than {before} ns before it")
     reads_and_writes = (transform.reads, transform.writes[""])
     kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker"}.get(reads_and_writes, "transform")
-    try:
+    with law("conforms"):
         for _ in guarded(_entry(transform, kind), transform, frames):
             pass
-    except McaptrackError as error:
-        raise LawError(f"conforms: {error}") from None
 
 
 def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:

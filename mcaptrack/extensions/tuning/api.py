@@ -252,8 +252,8 @@ def _tasks_of_files(inputs: Sequence[Path], truths: Sequence[Path], how: IngestO
         notes.say(note_on_pairs)
     tasks = []
     for name, path, truth in pairs:
-        detected = detections_and_ground_truth(path, truth, how)
-        tasks.append(Task(name, detected.detections, detected.ground_truth, {"ground_planes": detected.planes}))
+        detections, ground_truth, planes = detections_and_ground_truth(path, truth, how)
+        tasks.append(Task(name, detections, ground_truth, {"ground_planes": planes}))
     return tasks
 
 

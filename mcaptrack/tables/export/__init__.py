@@ -231,14 +231,10 @@ def _owner(file: Path, form: TableFormat) -> _Owner | None:
 def _first_row(file: Path, form: TableFormat) -> Mapping[str, Any]:
     try:
         with file.open(encoding="utf-8", newline="") as stream:
-            rows: Sequence[Mapping[str, Any]]
-            if form == "csv":
-                rows = [row for row, _ in zip(csv.DictReader(stream), range(1), strict=False)]
-            else:
-                rows = [json.loads(line) for line, _ in zip(stream, range(1), strict=False)]
+            row: Any = next(csv.DictReader(stream), {}) if form == "csv" else json.loads(next(stream, "{}"))
     except (OSError, ValueError, csv.Error):
         return {}
-    return rows[0] if rows and isinstance(rows[0], dict) else {}
+    return row if isinstance(row, dict) else {}
 
 
 def export(
@@ -456,18 +452,12 @@ class _Job:
     def known_topics(self) -> dict[str, MessagesPart]:
         """The channels of this log with tables of their own in the folder, and what these hold."""
         out = {}
-        for path in self._topic_files():
-            metadata = tables.file_metadata(path, self.form) or {}
+        for folder in self._topic_folders():
+            metadata = tables.file_metadata(folder / f"part-0.{self.form}", self.form) or {}
             if metadata.get("recording") == file_name(self.contents.opened.path) and "topic" in metadata:
                 blobs, columns, *span = json.loads(metadata.get("part", "[false, [], null, null]"))
                 out[metadata["topic"]] = MessagesPart(blobs, tuple(columns), *span)
         return out
-
-    def _topic_files(self) -> Iterator[Path]:
-        tail = (f"recording={self.contents.recording}", f"part-0.{self.form}")
-        folder = self.folder / TOPICS
-        members = sorted(folder.iterdir()) if folder.is_dir() else []
-        yield from (path for member in members if (path := member.joinpath(*tail)).is_file())
 
     def tidy(self) -> None:
         """Remove what processes that were killed have left: temporary files, and folders of channels without a file."""

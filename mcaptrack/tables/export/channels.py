@@ -7,7 +7,7 @@ come out, however many.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, nullcontext, suppress
 from itertools import islice
@@ -35,10 +35,6 @@ class ChannelFile:
         self.waiting, self.is_done = PendingRows(messages.schema, PIECE_BYTES), False
         self.is_open, self._stack = False, ExitStack()
         self._writing: Future[None] | None = None
-
-    def add(self, batch: Payloads) -> Iterator[Any]:
-        """Add messages; gives the pieces that are whole. Raises McaptrackError if none can be read."""
-        return self.waiting.add(self.messages.rows(batch))
 
     def write(self, piece: Any, threads: Executor | None) -> Future[None] | None:
         """Write a piece, behind those before it."""
@@ -142,7 +138,7 @@ class _Pass:
     def _add(self, topic: str, batch: Payloads, threads: Executor | None) -> None:
         def add(channel: ChannelFile) -> None:
             before = channel.waiting.nbytes
-            pieces = list(channel.add(batch))
+            pieces = list(channel.waiting.add(channel.messages.rows(batch)))
             self._waiting_bytes += channel.waiting.nbytes - before
             for piece in pieces:
                 self._write(channel, piece, threads)

@@ -24,13 +24,14 @@ from mcaptrack.log.messages import Payloads
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns, collect
-from mcaptrack.schema.framing import joined_parts
+from mcaptrack.schema.framing import unique_values
 from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes_3d
 from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of, payload_decoder
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
+from mcaptrack.tables.fields import SCORES
 
 #: Tables about the places of messages, or about the whole log.
 _OF_THE_WHOLE: Final = ("frames", "channels", "warnings", "recordings")
@@ -90,8 +91,6 @@ _BEST: Final = ("retracks", "retracks/online", "tracks")
 #: The rules by which they are scored, the first that gave a score.
 RULES: Final = (("metres", GATE_M), ("iou", 0.5))
 RULES_3D: Final = (("metres", GATE_3D_M), *RULES)
-#: The scores that are taken over.
-_SCORES: Final = ("MOTA", "IDF1", "HOTA", "IDSW")
 
 
 def location_of(path: Location) -> str:
@@ -140,7 +139,7 @@ def worst_score(topics: Sequence[str], scores: Sequence[Mapping[str, Any]]) -> d
     if not headlines:
         return {}
     worst = min(headlines, key=lambda row: row["IDF1"])
-    return {"scored": worst["topic"]} | {name: worst[name] for name in ("similarity", "gate", *_SCORES)}
+    return {"scored": worst["topic"]} | {name: worst[name] for name in ("similarity", "gate", *SCORES)}
 
 
 def _headline(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:
@@ -421,7 +420,7 @@ class LogTables:
         names = [*topics, *(file_name(part.path) for part in self.opened.parts)]
 
         def pieces() -> Iterator[Any]:
-            return (tables.frames_table({topic: self._pointers(topic)}, names) for topic in topics)
+            return (tables.frames_table(topic, self._pointers(topic), names) for topic in topics)
 
         return TablePieces(TABLES["frames"].arrow, sum(self.opened.channel(topic).messages for topic in topics), pieces)
 
@@ -592,21 +591,16 @@ class LogTables:
         """The columns that tell a log from thousands of others."""
         topics = self.topics("tracks")
         best = [topic for camera in cameras(self.opened) if (topic := best_tracks(camera, topics))]
+        track_ids = (unique_values(TRACKS, self._frames(topic), "track_id") for topic in best)
         versions = {how.version for topic in self.opened.channels if (how := provenance_of(self.opened, topic))}
         return {
             "location": location_of(self.opened.path),
             "cameras": len(cameras(self.opened)),
-            "tracks": sum(map(self._count_tracks, best)) if best else None,
+            "tracks": sum(map(len, track_ids)) if best else None,
             **worst_score(best, self._scores),
             **in_one_row(self._warnings),
             "versions": ", ".join(sorted(versions)) or None,
         }
-
-    def _count_tracks(self, topic: str) -> int:
-        ids: set[int] = set()
-        for _, _, joined in joined_parts(TRACKS, self._frames(topic)):
-            ids.update(np.unique(joined.rows["track_id"]).tolist())
-        return len(ids)
 
 
 def _origin_of_plane(row: np.void) -> str:
