@@ -170,7 +170,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "tables/export/__init__.py:_note_left_out:export": lambda s: s.says(
         "export", "LOG", "--topic", "/camera/video", "-o", "tables"
     ),
-    "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
+    "cli/running.py:next_commands:*": lambda s: s.says("run", "LOG", "--no-tables"),
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says(
         "evaluate", "LOG", "--set", "smoothed=true"
     ),

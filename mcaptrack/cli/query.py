@@ -84,11 +84,11 @@ class Query(Once[Any]):
         """Print the answer, or write it to a file."""
         output, json = self.values["output"], self.values["json"]
         if self.values["tables"]:
-            with common.printed_to(output, self.values["force"]):
+            with self.printed():
                 _print_tables(done, json)
         elif self._form == "table":
             limit = _SHOWN if sys.stdout.isatty() and output is None else 0
-            with common.printed_to(output, self.values["force"]):
+            with self.printed():
                 note = _print_answer(done, limit if self.values["rows"] is None else self.values["rows"])
             if note:
                 talk.say(note)
