@@ -88,11 +88,6 @@ class Option:
     is_set: bool = False
     help: str = ""
 
-    @property
-    def is_bounded(self) -> bool:
-        """Whether a number has a range."""
-        return self.least > -math.inf or self.most < math.inf
-
 
 @dataclass(frozen=True)
 class Argument:
@@ -192,7 +187,8 @@ def arguments_of(function: Callable[..., Any]) -> dict[str, Argument]:
 
 def options_of(function: Callable[..., Any]) -> list[Parameter]:
     """The parameters of a declared function that are options of its command, in order."""
-    doc, hints, flags = words_of(function), hints_of(function), flags_of(function)
+    doc, hints = words_of(function), hints_of(function)
+    flags = {name: _flag(name, hint) for name, hint in hints.items()}
     return [
         parameter_of(name, hints[name], parameter.default, with_dashes(doc.parameters.get(name, [""])[0], flags))
         for name, parameter in inspect.signature(function).parameters.items()
@@ -201,12 +197,8 @@ def options_of(function: Callable[..., Any]) -> list[Parameter]:
     ]
 
 
-def flags_of(function: Callable[..., Any]) -> dict[str, str]:
-    """The names of options by the names of the parameters of a function, with dashes."""
-    return {name: _flag(name, hint) for name, hint in hints_of(function).items()}
-
-
 def _flag(name: str, hint: Any) -> str:
+    """The name of an option on the command line, by that of the parameter."""
     return f"--{(option_of(hint).flag or name).replace('_', '-')}"
 
 
@@ -296,7 +288,8 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         for name in () if has_more else kwargs:
             if name not in signature.parameters:
-                raise TypeError(f"{function.__name__}() has no parameter {name}; {_others(name, signature.parameters)}")
+                why = missing_extension(name) or offer(name, signature.parameters, "there are")
+                raise TypeError(f"{function.__name__}() has no parameter {name}; {why}")
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if value is signature.parameters[name].default:
                 continue
@@ -426,12 +419,8 @@ def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
 def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     """The ranges that the annotations of a function declare."""
     options = {name: option_of(hint) for name, hint in hints_of(function).items()}
-    return {name: (option.least, option.most) for name, option in options.items() if option.is_bounded}
-
-
-def _others(name: str, every: Iterable[str]) -> str:
-    """The advice about a parameter that doesn't exist."""
-    return missing_extension(name) or offer(name, every, "there are")
+    ends = {name: (option.least, option.most) for name, option in options.items()}
+    return {name: pair for name, pair in ends.items() if pair != (-math.inf, math.inf)}
 
 
 def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:

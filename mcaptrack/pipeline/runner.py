@@ -311,9 +311,7 @@ def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> 
     gone: set[str] = set()
     for job in jobs:
         if job.kept() & {*results}:
-            empty = (
-                topic for topic in job.kept() if topic in opened.channels
-            )  # no rows, no tracks at the video's rate
+            empty = job.kept() & opened.channels.keys()  # no rows, no tracks at the video's rate
             gone |= {*superseded(opened, job), *(topic for topic in empty if may_replace(opened, topic, job.stage))}
     gone -= {*results}
     for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
