@@ -36,13 +36,7 @@ from mcaptrack.sources.own_rows import (
     schema_of_columns,
     time_of,
 )
-from mcaptrack.sources.own_schemas import (
-    columns_of_dtype,
-    columns_of_objects,
-    columns_of_type,
-    derived,
-    is_dataclass,
-)
+from mcaptrack.sources.own_schemas import columns_of_dtype, columns_of_objects, columns_of_type, derived, is_dataclass
 
 if TYPE_CHECKING:
     from supervision import Detections

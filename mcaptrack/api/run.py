@@ -192,11 +192,7 @@ def run(
     shared = {name: value for name, value in settings.items() if value is not None}
 
     def plan(
-        opened: logs.Log,
-        prefix: str,
-        say: Callable[[str], None],
-        changed: Collection[str],
-        renewed: Collection[str],
+        opened: logs.Log, prefix: str, say: Callable[[str], None], changed: Collection[str], renewed: Collection[str]
     ) -> list[Job]:
         others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
         kept = {stage: transform for stage, transform in transforms.items() if stage not in others}

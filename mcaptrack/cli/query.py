@@ -46,8 +46,7 @@ class Query(Once[Any]):
             Option(QUERY, short="f", shown=False, help="Read the query from this file; all arguments are logs."),
         ] = None
         form: Annotated[
-            Form | None,
-            Option(QUERY, flag="format", shown="table, or what -o ends with", help="Format of the answer."),
+            Form | None, Option(QUERY, flag="format", shown="table, or what -o ends with", help="Format of the answer.")
         ] = None
         rows: Annotated[
             int | None,

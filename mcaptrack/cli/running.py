@@ -163,10 +163,7 @@ class Run(RunsStages):
         order, place = "one log is done after the other", "ids go on in the logs themselves"
         refused: dict[str, tuple[object, str]] = {
             "--jobs": ((many.jobs or 1) > 1, order),
-            "--ledger": (
-                many.ledger,
-                "it judges each log by itself, and a second run does only what is missing",
-            ),
+            "--ledger": (many.ledger, "it judges each log by itself, and a second run does only what is missing"),
             "--output": (self.values["output"], place),
         }
         for name, (is_given, why) in refused.items():

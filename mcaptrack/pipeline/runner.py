@@ -445,12 +445,7 @@ def _recorded(stage: Stage, transform: Transform) -> dict[str, Any]:
 
 
 def _input(
-    state: RunState,
-    job: Job,
-    stamps: dict[str, list[int]],
-    progress: Progress,
-    boxes: BoxesRead,
-    watch: Stopwatch,
+    state: RunState, job: Job, stamps: dict[str, list[int]], progress: Progress, boxes: BoxesRead, watch: Stopwatch
 ) -> Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     opened, results = state.opened, state.results
