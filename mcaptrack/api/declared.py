@@ -288,8 +288,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         for name in () if has_more else kwargs:
             if name not in signature.parameters:
-                why = missing_extension(name) or offer(name, signature.parameters, "there are")
-                raise TypeError(f"{function.__name__}() has no parameter {name}; {why}")
+                raise TypeError(f"{function.__name__}() has no parameter {name}; {_others(name, signature.parameters)}")
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if value is signature.parameters[name].default:
                 continue
@@ -421,6 +420,11 @@ def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     options = {name: option_of(hint) for name, hint in hints_of(function).items()}
     ends = {name: (option.least, option.most) for name, option in options.items()}
     return {name: pair for name, pair in ends.items() if pair != (-math.inf, math.inf)}
+
+
+def _others(name: str, every: Iterable[str]) -> str:
+    """The advice about a parameter that doesn't exist."""
+    return missing_extension(name) or offer(name, every, "there are")
 
 
 def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:

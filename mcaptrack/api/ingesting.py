@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -88,6 +88,24 @@ class IngestResult:
     uses_camera: bool
     labels: Mapping[str, Mapping[str, Any]]
     changes: Mapping[str, Any] | None
+
+    @classmethod
+    def of(
+        cls, log: Path, report: IngestReport, warnings: Iterable[Notice], changes: Mapping[str, Any] | None
+    ) -> IngestResult:
+        """The result of making ``log``."""
+        return cls(
+            log=log,
+            messages=report.messages,
+            notes=tuple(report.remarks),
+            details=tuple(report.notes),
+            lost=tuple(report.lost),
+            warnings=tuple(dict.fromkeys(warnings)),
+            has_labels=report.has_labels,
+            uses_camera=report.uses_camera,
+            labels=report.facts,
+            changes=changes,
+        )
 
 
 @declared(
@@ -256,18 +274,7 @@ def ingest(
             target = as_path(into)
             report = _add_to(target, sidecar, partial(make, force=force))
         changes = _changes(target, report) if role == "corrections" else None
-    return IngestResult(
-        log=target,
-        messages=report.messages,
-        notes=tuple(report.remarks),
-        details=tuple(report.notes),
-        lost=tuple(report.lost),
-        warnings=tuple(dict.fromkeys(warnings)),
-        has_labels=report.has_labels,
-        uses_camera=report.uses_camera,
-        labels=report.facts,
-        changes=changes,
-    )
+    return IngestResult.of(target, report, warnings, changes)
 
 
 def _check_places(output: PathLike | None, into: PathLike | None, sidecar: bool | None) -> None:

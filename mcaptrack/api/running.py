@@ -389,20 +389,7 @@ def transform_of(stage: str | Stage, chosen: str | Transform | None, options: Ma
         if chosen and step.parameter:
             return step.make(**{step.parameter: chosen, **options})
         return step.make(chosen or "", **options)
-    if isinstance(chosen, type):
-        raise McaptrackError(f"{chosen.__name__} is a class; give an object of it: {chosen.__name__}()")
-    if not is_dataclass(chosen):
-        raise McaptrackError(
-            f"{chosen!r:.80} is no transform: it is no dataclass; give a name, or an object of a transform"
-        )
-    own = [f.name for f in fields(chosen) if not f.metadata.get("context")]
-    for name in options:
-        if name not in own:
-            raise McaptrackError(
-                f"{type(chosen).__name__} has no parameter {name}; {did_you_mean(name, own)}"
-                f"there are {', '.join(own) or 'none'}"
-            )
-    return replace(chosen, **options)
+    return _with_options(chosen, options)
 
 
 def transforms_of(stages: Mapping[str, str | Transform] | None) -> dict[str, Transform]:
@@ -411,6 +398,24 @@ def transforms_of(stages: Mapping[str, str | Transform] | None) -> dict[str, Tra
         if stage not in STAGES:
             raise McaptrackError(f"there is no stage {stage}; `stages=` has transforms of {', '.join(STAGES)}")
     return {stage: transform_of(stage, chosen, {}) for stage, chosen in (stages or {}).items()}
+
+
+def _with_options(base: Transform, options: Mapping[str, Value]) -> Transform:
+    """Return a transform with other values of some options. Raises McaptrackError for an unknown option."""
+    if isinstance(base, type):
+        raise McaptrackError(f"{base.__name__} is a class; give an object of it: {base.__name__}()")
+    if not is_dataclass(base):
+        raise McaptrackError(
+            f"{base!r:.80} is no transform: it is no dataclass; give a name, or an object of a transform"
+        )
+    own = [f.name for f in fields(base) if not f.metadata.get("context")]
+    for name in options:
+        if name not in own:
+            raise McaptrackError(
+                f"{type(base).__name__} has no parameter {name}; {did_you_mean(name, own)}"
+                f"there are {', '.join(own) or 'none'}"
+            )
+    return replace(base, **options)
 
 
 def run_stage(

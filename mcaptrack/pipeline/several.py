@@ -220,12 +220,17 @@ class EveryCamera:
         return chosen
 
     def run(self, chosen: ChosenCameras, steps: Steps) -> list[Done]:
-        """Run each camera, then scenes: those that are there or are named, or a new one."""
+        """Run each camera, then scenes."""
         for prefix in chosen.prefixes:
             steps.take(prefix, partial(self.run_at, prefix))
         if failed := [camera.name for camera in steps.done if camera.failure]:
             self.not_fused = f"{', '.join(failed)} failed"
-            return steps.done
+        else:
+            self._run_scenes(chosen, steps)
+        return steps.done
+
+    def _run_scenes(self, chosen: ChosenCameras, steps: Steps) -> None:
+        """Make the scenes again that are out of date, or a new one, and run them."""
         with steps.opened() as opened:
             off = self.joins.off
             scenes = chosen.scenes or (() if off else scenes_of(opened))
@@ -246,7 +251,6 @@ class EveryCamera:
             steps.say(f"no scene is made of the cameras: {self.not_fused}")
         for scene in scenes:
             steps.take(scene, partial(self.run_at, scene), is_scene=True)
-        return steps.done
 
     def _join(self, names: Sequence[str], progress: Progress) -> Act:
         def act(opened: logs.Log, output: Path | None, say: Say, _: BoxesRead) -> tuple[str, Report]:
