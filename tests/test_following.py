@@ -262,7 +262,3 @@ def test_a_lead_is_brought_to_other_planes():
     assert following._in_planes(lead, []) is rows
     alone = Frame(9, 4, rows[1:])
     assert following._in_planes(alone, [(0, one)]) is alone.rows
-    frames = [Frame(t_ns, t_ns + 10, rows) for t_ns in (1, 2, 3)]
-    both = following.led(frames[:1], frames[1:], TRACKS)
-    assert [(frame.t_ns, frame.index, len(frame.rows)) for frame in both] == [(1, 11, 2), (2, 12, 2), (3, 13, 2)]
-    assert (following.numbers_of(frames[1:]).tolist(), following.numbers_of([]).tolist()) == ([12], [])

@@ -170,7 +170,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "tables/export/__init__.py:_note_left_out:export": lambda s: s.says(
         "export", "LOG", "--topic", "/camera/video", "-o", "tables"
     ),
-    "cli/running.py:_next:*": lambda s: s.says("run", "LOG", "--no-tables"),
+    "cli/running.py:next_commands:*": lambda s: s.says("run", "LOG", "--no-tables"),
     "api/scoring.py:_smoothed:run": lambda s: s.without("/camera/predictions*").says(
         "evaluate", "LOG", "--set", "smoothed=true"
     ),
@@ -203,7 +203,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/checks.py:_lacks:ingest": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says(
         "run", "LOG"
     ),
-    "pipeline/events.py:make_events:run": lambda s: s.untracked().says("events", "LOG"),
+    "pipeline/events.py:make:run": lambda s: s.untracked().says("events", "LOG"),
     "pipeline/drawing.py:find_views:run": Scene.without_views,
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,

@@ -30,8 +30,7 @@ _CHUNK = 4096
 @declared(printed_by="mcaptrack.cli.models:Models")
 def models(
     name: Annotated[
-        str | None,
-        Argument("words", "get NAME", "`get` fetches the weights of NAME.", shown="a list", words=True),
+        str | None, Argument("words", "get NAME", "`get` fetches the weights of NAME.", shown="a list", words=True)
     ] = None,
 ) -> tuple[Model, ...]:
     """List the learned detectors, or fetch the weights of one.

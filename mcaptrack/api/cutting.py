@@ -162,18 +162,8 @@ def cut(
         span = _span(opened, start_s, end_s)
         topics = _chosen(opened, names_of(topic), names_of(exclude))
         done = write(opened, target, topics, span, progress)
-    return CutResult(
-        tuple(paths),
-        target,
-        done.messages,
-        done.topics,
-        done.earlier,
-        tuple(done.lost),
-        start_s,
-        end_s,
-        target.stat().st_size,
-        tuple(dict.fromkeys(warnings)),
-    )
+    size, notices = target.stat().st_size, tuple(dict.fromkeys(warnings))
+    return CutResult(tuple(paths), target, *done, start_s, end_s, size, notices)
 
 
 def _refuse_two_moments(around: int | None, start_s: float | None, end_s: float | None, logs: int) -> None:

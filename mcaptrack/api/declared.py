@@ -88,11 +88,6 @@ class Option:
     is_set: bool = False
     help: str = ""
 
-    @property
-    def is_bounded(self) -> bool:
-        """Whether a number has a range."""
-        return self.least > -math.inf or self.most < math.inf
-
 
 @dataclass(frozen=True)
 class Argument:
@@ -192,7 +187,8 @@ def arguments_of(function: Callable[..., Any]) -> dict[str, Argument]:
 
 def options_of(function: Callable[..., Any]) -> list[Parameter]:
     """The parameters of a declared function that are options of its command, in order."""
-    doc, hints, flags = words_of(function), hints_of(function), flags_of(function)
+    doc, hints = words_of(function), hints_of(function)
+    flags = {name: _flag(name, hint) for name, hint in hints.items()}
     return [
         parameter_of(name, hints[name], parameter.default, with_dashes(doc.parameters.get(name, [""])[0], flags))
         for name, parameter in inspect.signature(function).parameters.items()
@@ -201,12 +197,8 @@ def options_of(function: Callable[..., Any]) -> list[Parameter]:
     ]
 
 
-def flags_of(function: Callable[..., Any]) -> dict[str, str]:
-    """The names of options by the names of the parameters of a function, with dashes."""
-    return {name: _flag(name, hint) for name, hint in hints_of(function).items()}
-
-
 def _flag(name: str, hint: Any) -> str:
+    """The name of an option on the command line, by that of the parameter."""
     return f"--{(option_of(hint).flag or name).replace('_', '-')}"
 
 
@@ -426,7 +418,8 @@ def _kinds(function: Callable[..., object]) -> dict[str, tuple[Any, ...]]:
 def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     """The ranges that the annotations of a function declare."""
     options = {name: option_of(hint) for name, hint in hints_of(function).items()}
-    return {name: (option.least, option.most) for name, option in options.items() if option.is_bounded}
+    ends = {name: (option.least, option.most) for name, option in options.items()}
+    return {name: pair for name, pair in ends.items() if pair != (-math.inf, math.inf)}
 
 
 def _others(name: str, every: Iterable[str]) -> str:

@@ -77,10 +77,7 @@ Definitions = Annotated[
         "the distribution of ROS that they are from, such as humble.",
     ),
 ]
-Views = Annotated[
-    bool,
-    Option(FILES, help="Draw the results for viewers, too; `mcaptrack run` does so at its end."),
-]
+Views = Annotated[bool, Option(FILES, help="Draw the results for viewers, too; `mcaptrack run` does so at its end.")]
 Force = Annotated[bool, Option(FILES, help="Overwrite the output file if it exists.")]
 Reports = Annotated[Progress, PythonOnly("Called as ``progress(stage, done, total)``.")]
 GroundPlane = Annotated[
@@ -96,10 +93,7 @@ Value = float | int | bool | str | None
 def output(shown: str | None = None) -> Option:
     """The option of an output; ``shown`` is its default in the help."""
     return Option(
-        FILES,
-        short="o",
-        shown=shown,
-        help="Write to this file, of several logs to this folder; logs stay unchanged.",
+        FILES, short="o", shown=shown, help="Write to this file, of several logs to this folder; logs stay unchanged."
     )
 
 

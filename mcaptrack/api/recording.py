@@ -102,17 +102,8 @@ class Recording(LogReader):
         from mcaptrack.api.writing import write_rows
 
         with self._now():
-            return write_rows(
-                self._path_now(),
-                topic,
-                rows,
-                schema=schema,
-                classes=classes,
-                frame_id=frame_id,
-                by=by,
-                replace=replace,
-                sidecar=sidecar,
-            )
+            path = self._path_now()
+            return write_rows(path, topic, rows, schema, classes, frame_id, by, replace, sidecar)
 
 
 @checked

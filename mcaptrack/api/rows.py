@@ -36,13 +36,7 @@ from mcaptrack.sources.own_rows import (
     schema_of_columns,
     time_of,
 )
-from mcaptrack.sources.own_schemas import (
-    columns_of_dtype,
-    columns_of_objects,
-    columns_of_type,
-    derived,
-    is_dataclass,
-)
+from mcaptrack.sources.own_schemas import columns_of_dtype, columns_of_objects, columns_of_type, derived, is_dataclass
 
 if TYPE_CHECKING:
     from supervision import Detections
@@ -307,6 +301,10 @@ def schema_of(
     return derived(name, listed, units, doc)
 
 
+#: What tables of pyarrow, pandas, Polars and DuckDB have.
+_OF_ARROW: Final = ("__arrow_c_stream__", "__arrow_c_array__")
+
+
 def frames_of(rows: Any, schema: Schema | None, own_name: str) -> tuple[Schema, list[Frame], dict[int, str]]:
     """Return the schema and the frames, by time, of rows in any form that ``Recording.write`` takes; and the names of
     classes that these rows bring along, by number.
@@ -323,9 +321,7 @@ def frames_of(rows: Any, schema: Schema | None, own_name: str) -> tuple[Schema, 
             )
         columns, names = numbered_columns({name: rows[name] for name in rows.dtype.names})
         schema, frames = frames_of_columns(columns, schema, own_name)
-    elif hasattr(rows, "__arrow_c_stream__") or hasattr(
-        rows, "__arrow_c_array__"
-    ):  # of pyarrow, pandas, Polars, DuckDB
+    elif any(hasattr(rows, name) for name in _OF_ARROW):
         table = tables.as_arrow(rows)
         columns, names = numbered_columns(tables.columns_of(table))
         schema, frames = frames_of_columns(columns, schema, own_name, tables.columns_of_arrow(table.schema))

@@ -172,7 +172,7 @@ def run(
     True
 
     """
-    from mcaptrack.api.running import Fusing, Where, transform_of, transforms_of, work
+    from mcaptrack.api.running import Where, transform_of, transforms_of, work
     from mcaptrack.pipeline import PlaneChoice, Watch, plan_all
     from mcaptrack.pipeline.scenes import Scenes
     from mcaptrack.pipeline.several import unfitting
@@ -186,19 +186,13 @@ def run(
     chosen = {kind: choice for kind, choice in named.items() if choice is not None}
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
-
-    fuses = Fusing(names, Scenes(_FINISHERS.parts("scene", more)))
-
+    joins = Scenes(_FINISHERS.parts("scene", more))
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
     settings = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
     shared = {name: value for name, value in settings.items() if value is not None}
 
     def plan(
-        opened: logs.Log,
-        prefix: str,
-        say: Callable[[str], None],
-        changed: Collection[str],
-        renewed: Collection[str],
+        opened: logs.Log, prefix: str, say: Callable[[str], None], changed: Collection[str], renewed: Collection[str]
     ) -> list[Job]:
         others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
         kept = {stage: transform for stage, transform in transforms.items() if stage not in others}
@@ -211,8 +205,9 @@ def run(
     earlier = _log_before(as_location(log), follows)
     with definitions_of(definitions), choosing(topic, map, class_map):
         return work(
-            where, plan, progress, tables, finishing=finishing, views=True, plane=plane, fuses=fuses, follows=earlier
-        )
+            where, plan, progress, tables, finishing=finishing, views=True, plane=plane, cameras=names, joins=joins,
+            follows=earlier,
+        )  # fmt: skip
 
 
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:

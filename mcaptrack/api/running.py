@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,12 +19,21 @@ from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.api.products import Products, refuse_foreign_products, write_products
 from mcaptrack.choices import Mode
 from mcaptrack.errors import McaptrackError, call, did_you_mean
-from mcaptrack.files import refuse_overwrite
+from mcaptrack.files import publish, refuse_overwrite
 from mcaptrack.installed import missing_extension
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice
-from mcaptrack.pipeline.several import Act, CameraResult, Done, EveryCamera, Say, refuse_failed, together
+from mcaptrack.pipeline.several import (
+    Act,
+    CameraResult,
+    ChosenCameras,
+    Done,
+    EveryCamera,
+    Steps,
+    refuse_failed,
+    together,
+)
 from mcaptrack.registry import others
 from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.foreign.boxes import choosing
@@ -37,7 +46,7 @@ if TYPE_CHECKING:
     from mcaptrack.contracts import Finished
     from mcaptrack.pipeline import Summary
     from mcaptrack.pipeline.runner import Finish
-    from mcaptrack.pipeline.scenes import Scenes
+    from mcaptrack.pipeline.scenes import Say, Scenes
     from mcaptrack.pipeline.write import Made
 else:
     _OfFinishers = object
@@ -177,13 +186,6 @@ class Where:
         return path, output
 
 
-class Fusing(NamedTuple):
-    """The cameras to run, all without names, and what makes scenes of them."""
-
-    names: tuple[str, ...]
-    joins: Scenes
-
-
 def work(
     where: Where,
     plan: Plan,
@@ -193,14 +195,15 @@ def work(
     finishing: Sequence[Finish] = (),
     views: bool = False,
     plane: PlaneChoice = AS_BEFORE,
-    fuses: Fusing | None = None,
+    cameras: tuple[str, ...] = (),
+    joins: Scenes | None = None,
     follows: Location | None = None,
 ) -> RunResult:
     """Plan and run on one log. ``tables`` is None where a single stage runs, which neither exports nor summarises.
 
-    ``finishing`` is done at the end, and with ``views`` channels are drawn. With ``fuses`` all cameras are run, if none
-    is named, and a scene of several is made again if it is out of date. Ids go on from those of the log that this one
-    ``follows``.
+    ``finishing`` is done at the end, and with ``views`` channels are drawn. With ``joins``, which makes scenes, these
+    ``cameras`` are run, by default all, and a scene is made again if it is out of date. Ids go on from those of the log
+    that this one ``follows``.
     """
     continued: list[pipeline.Continued] = []
     topics = next((topics for step in finishing if (topics := getattr(step, "topics", ()))), ())
@@ -211,8 +214,8 @@ def work(
         def act(opened: logs.Log, output: Path | None, say: Say, boxes: BoxesRead) -> tuple[str, pipeline.Report]:
             at = prefix or pipeline.find_camera(opened, where.camera, where.topic or next(iter(topics), None))
             fused: Mapping[str, Made] = {}
-            if fuses is not None:
-                fused = fuses.joins.join_again(opened, at, where.force, not fuses.names, say, progress)
+            if joins is not None:
+                fused = joins.join_again(opened, at, where.force, not cameras, say, progress)
             run = partial(pipeline.run, opened, at, output=output, progress=progress, plane=plane, boxes=boxes)
             run = partial(run, finishing=finishing, views=views, fused=fused)
             if follows is None:
@@ -231,8 +234,8 @@ def work(
         return act
 
     each = None
-    if fuses is not None and where.topic is None and (where.camera is None or len(fuses.names) > 1):
-        each = EveryCamera(*fuses, run_at)
+    if joins is not None and where.topic is None and where.camera is None:
+        each = EveryCamera(cameras, joins, run_at)
     result = change(where, run_at("", progress), progress, tables, each, finishing)
     return replace(result, continued=pipeline.Continued.joined(continued)) if continued else result
 
@@ -249,11 +252,11 @@ def change(
 
     With ``each`` all its cameras are run, if it has several.
     """
-    began, work = monotonic(), _Change(where, *where.places())
+    began, work = monotonic(), _Change(where)
     with warnings_about(work.target) as warnings:
-        done, several = work.act(act, progress, each, bool(tables))
+        done, chosen = work.act(act, progress, each, bool(tables))
         report = together([camera.report for camera in done])
-        _say_stale(work.target, report, is_open=several is not None)
+        _say_stale(work.target, report, is_open=chosen is not None)
         with report.watch.part("tables") if tables else nullcontext():
             products = work.products(report, bool(tables), progress)
         refuse_failed(work.target, done)
@@ -281,8 +284,8 @@ def change(
         notes=tuple(work.notes),
         seconds=round(monotonic() - began, 3),
         seconds_by_part={name: round(seconds, 3) for name, seconds in report.watch.seconds.items()},
-        cameras={camera.name: CameraResult.of(camera, summaries[camera.name]) for camera in done if several},
-        left_out=dict(several.left_out if several else {}),
+        cameras={camera.name: CameraResult.of(camera, summaries[camera.name]) for camera in done if chosen},
+        left_out=dict(chosen.left_out if chosen else {}),
         not_fused=each.not_fused if each is not None else "",
         files=tuple(products.owed),
         written_tables=tuple(products.tables),
@@ -292,25 +295,28 @@ def change(
 class _Change:
     """A change of the log at ``path``, or of a copy at ``output``: what is said about it, and where it was written."""
 
-    def __init__(self, where: Where, path: Location, output: Path | None) -> None:
-        self.force, self.path, self.output = where.force, path, output
-        self.target: Location = output or path
+    def __init__(self, where: Where) -> None:
+        self.force, (self.path, self.output) = where.force, where.places()
+        self.target: Location = self.output or self.path
         self.written_to = self.target
         self.notes, self.boxes, self.place = Notes(), BoxesRead(), SidecarChoice(where.sidecar)
 
     def act(
         self, act: Act, progress: Progress, each: EveryCamera | None, has_tables: bool
-    ) -> tuple[list[Done], EveryCamera | None]:
-        """Change the log, or each of its cameras; return what was done, and ``each`` if it has several."""
+    ) -> tuple[list[Done], ChosenCameras | None]:
+        """Change the log, or each of its cameras; return what was done, and which of several were chosen."""
         with logs.read(self.path, sidecar=None if self.output else self.place) as opened:
             if self.output is None:
                 opened.lock()  # a second process is refused before it computes anything
             if has_tables and not self.force:
                 refuse_foreign_products(opened, self.target)
             self.written_to = self.output or opened.parts[-1].path
-            if each is None or not each.chooses(opened, self.notes.say):
+            chosen = each.choose(opened, self.notes.say) if each is not None else None
+            if each is None or chosen is None:
                 return [Done("", *act(opened, self.output, self.notes.say, self.boxes))], None
-        return each.run(self.path, self.output, self.place, self.notes.say, progress), each
+        # The log is written for each camera; a copy is published as a whole.
+        with publish(self.output) if self.output is not None else nullcontext() as part:
+            return each.run(chosen, Steps(self.path, part, self.output, self.place, self.notes.say, progress)), chosen
 
     def products(self, report: pipeline.Report, has_tables: bool, progress: Progress) -> Products:
         """Bring the files beside the log up to date."""

@@ -141,12 +141,7 @@ class Scores:
         return [result.to_json() for result in self.results]
 
     def score(
-        self,
-        name: str,
-        tracks: str = "",
-        similarity: str = "",
-        gate: float | None = None,
-        of_class: str | None = None,
+        self, name: str, tracks: str = "", similarity: str = "", gate: float | None = None, of_class: str | None = None
     ) -> float:
         """Return one score, of the only result that fits.
 

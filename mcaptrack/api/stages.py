@@ -93,20 +93,9 @@ def detect(
 
     chosen = transform_of("detect", detector, options)
     return run_stage(
-        "detect",
-        chosen,
-        log,
-        topic,
-        to,
-        camera,
-        output,
-        sidecar,
-        force,
-        stages,
-        progress,
-        views=views,
-        definitions=definitions,
-    )
+        "detect", chosen, log, topic, to, camera, output, sidecar, force, stages, progress,
+        views=views, definitions=definitions,
+    )  # fmt: skip
 
 
 @declared(most_used=("output", "topic", "to", "camera", "force"))
@@ -222,24 +211,9 @@ def track(
     chosen = None if tracker is None else transform_of("track", tracker, options)
     make = partial(transform_of, "track", options=options)
     return run_stage(
-        "track",
-        chosen,
-        log,
-        topic,
-        to,
-        camera,
-        output,
-        sidecar,
-        force,
-        stages,
-        progress,
-        frame=frame,
-        fields=map,
-        class_map=class_map,
-        make=make,
-        views=views,
-        definitions=definitions,
-    )
+        "track", chosen, log, topic, to, camera, output, sidecar, force, stages, progress,
+        frame=frame, fields=map, class_map=class_map, make=make, views=views, definitions=definitions,
+    )  # fmt: skip
 
 
 @declared(most_used=("rate_hz", "max_gap_s", "output", "topic", "to", "camera", "force"))

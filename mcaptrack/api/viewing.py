@@ -219,10 +219,7 @@ class LogServer:
         ]
         viewers = [
             {"name": name, "address": address, "about": about or f"{name} {offline}"}
-            for name, address, about in (
-                *((name, address, "") for name, address in self.links.items()),
-                *linked,
-            )
+            for name, address, about in (*((name, address, "") for name, address in self.links.items()), *linked)
         ]
         place = f"{self._server.path(_FOLDER).decode()}/"
         data = {
@@ -236,11 +233,7 @@ class LogServer:
             "pages": {name: f"{place}{name}.html" for name in contents.pages},
             "best": links.best_tracks(contents.events),
             "events": [
-                {
-                    "at_s": contents.seconds(event.t_ns),
-                    "topic": event.topic,
-                    "text": _WHEN.sub("", event.text, count=1),
-                }
+                {"at_s": contents.seconds(event.t_ns), "topic": event.topic, "text": _WHEN.sub("", event.text, count=1)}
                 for event in contents.events
             ],
         }

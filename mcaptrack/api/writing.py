@@ -51,7 +51,6 @@ def write_rows(
     path: Location,
     topic: str,
     rows: Any,
-    *,
     schema: Schema | None,
     classes: Mapping[int, str] | None,
     frame_id: str,
@@ -73,9 +72,8 @@ def write_rows(
         _refuse_to_replace(opened, name, schema, replace)
         detail(f"{name}: rows of {schema.name}, with {', '.join(map(_described, schema.columns))}")
         planes = pipeline.read_planes(opened, prefix) or ()
-        frames = _numbered(
-            opened, prefix, [_in_metres(frame, planes) if schema is TRACKS else frame for frame in frames]
-        )
+        frames = [_in_metres(frame, planes) for frame in frames] if schema is TRACKS else frames
+        frames = _numbered(opened, prefix, frames)
         own_frame = frame_id or (_FRAME if _is_in_space(schema, frames) else "")
         how = Provenance(INGEST, {WRITTEN_BY: program}, classes=names, frame_id=own_frame)
         channel = Made.of(schema, frames, how)

@@ -37,12 +37,7 @@ def _main(
     ] = False,
     config: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            envvar="MCAPTRACK_CONFIG",
-            show_envvar=False,
-            help="Read options from this file.",
-        ),
+        typer.Option(metavar="FILE", envvar="MCAPTRACK_CONFIG", show_envvar=False, help="Read options from this file."),
     ] = None,
     log_format: Annotated[
         Literal["text", "json"],

@@ -33,11 +33,6 @@ def has_flag(field: Field[Any]) -> bool:
     return bool(field.metadata.get("flag", True))
 
 
-def is_open(stage: Stage, values: Mapping[str, Any]) -> bool:
-    """Return whether the boxes of a log decide which tracker runs, because the user named none."""
-    return stage.kind == "tracker" and not values["tracker"]
-
-
 @dataclass(frozen=True)
 class Maker:
     """Makes the transform of a stage as the user wants it; other processes can do so, too.

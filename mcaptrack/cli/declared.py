@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Generic, TypeVar, get_type_hints
 
@@ -127,6 +128,11 @@ class Called(Generic[T]):
         """Call the function with its ``arguments``, and print what it returns."""
         raise NotImplementedError
 
+    def printed(self) -> AbstractContextManager[None]:
+        """Write to the file that is named for it, if there is one, what the block prints to stdout."""
+        file = self.values["output"] if issubclass(self.More, Printed) else None
+        return common.printed_to(file, self.values.get("force", False))
+
 
 class Once(Called[T]):
     """A command that calls its function once."""
@@ -152,10 +158,11 @@ class Once(Called[T]):
 
     def print_result(self, done: T, talk: common.Talk) -> None:
         """Print the result: for people, or as JSON."""
-        if self.values["json"]:
-            common.print_json(self.data(done))
-        else:
-            self.show(done, talk)
+        with self.printed():
+            if self.values["json"]:
+                common.print_json(self.data(done))
+            else:
+                self.show(done, talk)
 
 
 def command(

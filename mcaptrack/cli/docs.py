@@ -67,11 +67,6 @@ class Docs(Once[Pages]):
 
     More = Printed
 
-    def print_result(self, done: Pages, talk: common.Talk) -> None:
-        """Print the list, or the page."""
-        with common.printed_to(self.values["output"], self.values["force"]):
-            super().print_result(done, talk)
-
     def data(self, done: Pages) -> dict[str, Any]:
         """Return the list, or the page, as values of JSON."""
         titles = [{"name": name, "title": _title(path)} for name, path in done.items()]

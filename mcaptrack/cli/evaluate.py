@@ -94,8 +94,7 @@ class Evaluate(Once["Scores"]):
         """Print the scores, or write them to a file, and draw curves."""
         if self.values["curves"] is not None:
             done.draw_curves(self.values["curves"], self.values["force"])
-        with common.printed_to(self.values["output"], self.values["force"]):
-            super().print_result(done, talk)
+        super().print_result(done, talk)
 
     def show(self, done: Scores, talk: common.Talk) -> None:
         """Print a verdict and a table, or rows of CSV."""

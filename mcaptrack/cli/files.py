@@ -46,12 +46,11 @@ class Check(EachLog["LogCheck"]):
     def print_result(self, results: Sequence[LogCheck], totals: Mapping[str, Any]) -> None:
         """Print the findings in each file."""
         files = [file for checked in results for file in checked.files]
-        with common.printed_to(self.values["output"], self.values["force"]):
-            if self.values["json"]:
-                common.print_json({"results": [_as_json(file) for file in files], **totals})
-            else:
-                for file in files:
-                    _print_check(file, self.values["quiet"])
+        if self.values["json"]:
+            common.print_json({"results": [_as_json(file) for file in files], **totals})
+        else:
+            for file in files:
+                _print_check(file, self.values["quiet"])
 
     def code(self, results: Sequence[LogCheck]) -> int:
         """Return the exit code: 1 if there are errors."""

@@ -73,16 +73,12 @@ def write_page(formatter: Any, path: str, function: Callable[..., None], is_all:
     for parameter in about.parameters:
         panels.setdefault(parameter.option.panel or OPTIONS, []).append(_row(parameter, is_all))
     panels[LAST_PANELS[-1]] += SHOWN_BY.items()
-    shown = [panel for panel in panels if is_all or _is_first(panel, about.most_used)]
+    first = {FIRST_PANEL} if about.most_used else panels.keys() - LAST_PANELS[1:]
+    shown = [panel for panel in panels if is_all or panel in first]
     for panel in shown:
         write_section(formatter, panel, panels[panel])
     if others := dict.fromkeys(re.sub(r" \(.*", "", panel) for panel in panels if panel not in shown):
         write_paragraph(formatter, f"`{ALL}` shows all options, also: {', '.join(others)}.")
-
-
-def _is_first(panel: str, most_used: Sequence[str]) -> bool:
-    """Whether the options of a heading are in the short help."""
-    return panel == FIRST_PANEL if most_used else panel not in LAST_PANELS[1:]
 
 
 def write_paragraph(formatter: Any, text: str) -> None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from mcaptrack.api.declared import OneOfMany, Parameter, arguments_of, options_of
+from mcaptrack.api.declared import OneOfMany, arguments_of, options_of
 from mcaptrack.cli import common
 from mcaptrack.cli.declared import Called, OfAll, Once, Printed, parameters_of
 from mcaptrack.cli.many import EachLog
@@ -20,10 +20,7 @@ from mcaptrack.registry import blamed, find, load
 class Plain(Called[Any]):
     """A command that prints what its function returns."""
 
-    @classmethod
-    def options(cls) -> list[Parameter]:
-        """Return the options that the function has no use for: also where to print to."""
-        return [*parameters_of(Printed), *super().options()]
+    More = Printed
 
     def data(self, done: Any) -> dict[str, Any]:
         """Return a result as values of JSON."""
@@ -32,11 +29,6 @@ class Plain(Called[Any]):
 
 class PlainOnce(Plain, Once[Any]):
     """A command that calls its function once."""
-
-    def print_result(self, done: Any, talk: common.Talk) -> None:
-        """Print the result."""
-        with common.printed_to(self.values["output"], self.values["force"]):
-            super().print_result(done, talk)
 
     def show(self, done: Any, talk: common.Talk) -> None:
         """Print the result for people."""

@@ -149,12 +149,8 @@ class EachLog(Called[T]):
         return output if is_folder else None
 
     def run(self, names: Mapping[str, str]) -> None:
-        """Call the function with each log and its ``arguments``, and print what it returns; to a file, if one is named.
-
-        That is for commands that print their results: for others it is what the function writes.
-        """
-        file = self.values["output"] if self.prints_results else None
-        with common.printed_to(file, self.values.get("force", False)):
+        """Call the function with each log and its ``arguments``, and print what it returns."""
+        with self.printed():
             with common.Talk(self.values["quiet"], self.values["verbose"]).open() as talk:
                 self.inputs = self.logs()
                 arguments = self.arguments(names)

@@ -8,7 +8,7 @@ has, all that installed packages declare as entry points.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
@@ -63,18 +63,7 @@ def _of_words(stage: Stage, arguments: Sequence[str]) -> Iterator[tuple[str, typ
 
 
 def _of_settings(stage: Stage, files: Sequence[ConfigFile], commands: Mapping[str, Any]) -> dict[str, type[Transform]]:
-    """Return the plug-ins that environment and files name for a stage; the stage that uses it reports a missing one."""
-    out = {}
-    for name in _names_of_settings(stage, files, lambda: commands[stage.name].settings):
-        with suppress(McaptrackError):
-            out[name] = stage.choose(name)
-    return out
-
-
-def _names_of_settings(
-    stage: Stage, files: Sequence[ConfigFile], own_options: Callable[[], Collection[str]]
-) -> list[str]:
-    """Return the names of plug-ins that environment and files give for a stage.
+    """Return the plug-ins that environment and files name for a stage; the stage that uses it reports a missing one.
 
     A file in the working folder can't name modules.
     """
@@ -92,6 +81,11 @@ def _names_of_settings(
         options |= {key.replace("_", "-") for key in table} if isinstance(table, dict) else set()
     start = f"{PREFIX}{stage.name}_".upper()
     options |= {name.removeprefix(start).lower().replace("_", "-") for name in os.environ if name.startswith(start)}
-    if options and options - set(own_options()):
+    if options and options - set(commands[stage.name].settings):
         plugin_names += names(kind)
-    return [name for name in dict.fromkeys(plugin_names) if name and stage.split(name)[0] not in BUILT_IN[kind]]
+    out = {}
+    for name in dict.fromkeys(plugin_names):
+        if name and stage.split(name)[0] not in BUILT_IN[kind]:
+            with suppress(McaptrackError):
+                out[name] = stage.choose(name)
+    return out

@@ -46,8 +46,7 @@ class Query(Once[Any]):
             Option(QUERY, short="f", shown=False, help="Read the query from this file; all arguments are logs."),
         ] = None
         form: Annotated[
-            Form | None,
-            Option(QUERY, flag="format", shown="table, or what -o ends with", help="Format of the answer."),
+            Form | None, Option(QUERY, flag="format", shown="table, or what -o ends with", help="Format of the answer.")
         ] = None
         rows: Annotated[
             int | None,
@@ -84,11 +83,11 @@ class Query(Once[Any]):
         """Print the answer, or write it to a file."""
         output, json = self.values["output"], self.values["json"]
         if self.values["tables"]:
-            with common.printed_to(output, self.values["force"]):
+            with self.printed():
                 _print_tables(done, json)
         elif self._form == "table":
             limit = _SHOWN if sys.stdout.isatty() and output is None else 0
-            with common.printed_to(output, self.values["force"]):
+            with self.printed():
                 note = _print_answer(done, limit if self.values["rows"] is None else self.values["rows"])
             if note:
                 talk.say(note)

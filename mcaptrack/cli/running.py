@@ -35,11 +35,41 @@ class RunsStages(EachLog["RunResult"]):
 
     def show(self, log: Location, done: RunResult, talk: common.Talk) -> None:
         """Print what was made, and commands to run next."""
-        _print(done, self.shows_events, self.next_commands(done), talk)
+        for topic, count in done.frames.items():
+            talk.detail(f"{done.log}: {topic} {count} frames")
+        for topic, kinds in done.events.items():
+            text = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
+            (talk.say if self.shows_events else talk.detail)(f"{topic}: {text}")
+        if done.tables:
+            talk.detail(f"{done.log}: {', '.join(f'{name} {rows}' for name, rows in done.tables.items())}")
+        talk.say(f"{done.log}: {_did(done)}")
+        is_run = done.summary is not None or done.cameras
+        lines = [*_lines_of_run(done)] if is_run else [*_lines_of_stage(done)]
+        if done.stages and (slow := _slow_parts(done)):
+            lines.append(("time", slow))
+        if done.written_because and done.written_to:
+            lines.append(("written", f"results are in {done.written_to}: {done.written_because}"))
+        lines.append(("next", "    ".join(self.next_commands(done))))
+        width = max(len(name) for name, _ in lines)
+        for name, text in lines:
+            talk.say(f"  {name:<{width}}  {text}")
 
     def line(self, done: RunResult) -> str:
         """Return the result for one of many logs in one line."""
-        return _line_of(done, self.shows_events)
+        parts = [_did(done)]
+        if done.cameras:
+            parts.append(counted(sum(not camera.is_scene for camera in done.cameras.values()), "camera"))
+        if self.shows_events:
+            counts = Counter({kind: n for kinds in done.events.values() for kind, n in kinds.items() if n})
+            parts.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
+        summary = done.summary
+        if summary is not None and summary.tracks is not None:
+            parts.append(counted(summary.tracks, "track"))
+        if done.continued is not None:
+            parts.append(done.continued.words()[-1])
+        if codes := dict.fromkeys(notice.code for notice in done.warnings):
+            parts.append(f"warnings: {', '.join(codes)}")
+        return "; ".join(parts)
 
     def code(self, results: Sequence[RunResult]) -> int:
         """Return the exit code: 3 if no picture of a camera could be decoded."""
@@ -48,11 +78,43 @@ class RunsStages(EachLog["RunResult"]):
 
     def data(self, done: RunResult) -> dict[str, Any]:
         """Return the result of one log as values of JSON."""
-        return _as_json(done) | {"next": self.next_commands(done)}
+        data: dict[str, Any] = {
+            "log": str(done.log),
+            "stages": list(done.stages),
+            "frames": done.frames,
+            "events": done.events,
+            **{name: report.data for name, report in done.finished.items()},
+            "written_to": str(done.written_to) if done.written_to else None,
+            "written_there_because": with_flags(done.written_because) or None,
+        }
+        if done.cameras:
+            data |= {
+                "tables": done.tables,
+                "summary": None if done.summary is None else done.summary.to_json(),
+                "cameras": {name: _camera_as_json(camera) for name, camera in done.cameras.items()},
+            }
+        elif done.summary is not None:
+            data |= {"tables": done.tables, "summary": done.summary.to_json()}
+        else:
+            data |= {"rows": done.rows, "tracks": done.tracks}
+        data |= {"continued": done.continued.to_json()} if done.continued else {}
+        data |= {"seconds": done.seconds, "seconds_by_part": dict(done.seconds_by_part)}
+        if done.cameras or done.left_out:
+            data |= {"left_out": dict(done.left_out), "not_fused": with_flags(done.not_fused) or None}
+        return data | {"next": self.next_commands(done)}
 
     def next_commands(self, done: RunResult) -> list[str]:
         """Return commands to run next."""
-        return _next(done)
+        show = "view" if isinstance(done.log, Path) else "report"  # viewers open files
+        if done.summary is None and not done.cameras:
+            steps = [show] if done.stages == ("events",) else ["run"]
+        elif done.summary is None:
+            steps = [show if show == "view" else "info"]  # a report is on one camera
+        elif not done.summary.tracks:
+            steps = ["info"]
+        else:
+            steps = [show, "evaluate"] if done.summary.scores else [show]
+        return [command(step, done.log).strip("`") for step in steps]
 
 
 class Events(RunsStages):
@@ -101,10 +163,7 @@ class Run(RunsStages):
         order, place = "one log is done after the other", "ids go on in the logs themselves"
         refused: dict[str, tuple[object, str]] = {
             "--jobs": ((many.jobs or 1) > 1, order),
-            "--ledger": (
-                many.ledger,
-                "it judges each log by itself, and a second run does only what is missing",
-            ),
+            "--ledger": (many.ledger, "it judges each log by itself, and a second run does only what is missing"),
             "--output": (self.values["output"], place),
         }
         for name, (is_given, why) in refused.items():
@@ -115,73 +174,10 @@ class Run(RunsStages):
         return logs
 
 
-def _as_json(result: RunResult) -> dict[str, Any]:
-    """Return the result of one log as values of JSON."""
-    data: dict[str, Any] = {
-        "log": str(result.log),
-        "stages": list(result.stages),
-        "frames": result.frames,
-        "events": result.events,
-        **{name: report.data for name, report in result.finished.items()},
-        "written_to": str(result.written_to) if result.written_to else None,
-        "written_there_because": with_flags(result.written_because) or None,
-    }
-    if result.cameras:
-        data |= {
-            "tables": result.tables,
-            "summary": None if result.summary is None else result.summary.to_json(),
-            "cameras": {name: _camera_as_json(camera) for name, camera in result.cameras.items()},
-        }
-    elif result.summary is not None:
-        data |= {"tables": result.tables, "summary": result.summary.to_json()}
-    else:
-        data |= {"rows": result.rows, "tracks": result.tracks}
-    data |= {"continued": result.continued.to_json()} if result.continued else {}
-    data |= {"seconds": result.seconds, "seconds_by_part": dict(result.seconds_by_part)}
-    if result.cameras or result.left_out:
-        data |= {"left_out": dict(result.left_out), "not_fused": with_flags(result.not_fused) or None}
-    return data
-
-
 def _camera_as_json(camera: CameraResult) -> dict[str, Any]:
     """Return the result for one of several cameras as values of JSON."""
     counts = {"frames": camera.frames, "rows": camera.rows, "tracks": camera.tracks}
     return {"is_scene": camera.is_scene, "stages": list(camera.stages), **counts, "summary": camera.summary.to_json()}
-
-
-def _next(result: RunResult) -> list[str]:
-    """Return commands to run next."""
-    show = "view" if isinstance(result.log, Path) else "report"  # viewers open files
-    if result.summary is None and not result.cameras:
-        steps = [show] if result.stages == ("events",) else ["run"]
-    elif result.summary is None:
-        steps = [show if show == "view" else "info"]  # a report is on one camera
-    elif not result.summary.tracks:
-        steps = ["info"]
-    else:
-        steps = [show, "evaluate"] if result.summary.scores else [show]
-    return [command(step, result.log).strip("`") for step in steps]
-
-
-def _print(result: RunResult, shows_events: bool, commands: Sequence[str], talk: common.Talk) -> None:
-    for topic, count in result.frames.items():
-        talk.detail(f"{result.log}: {topic} {count} frames")
-    for topic, kinds in result.events.items():
-        text = ", ".join(f"{kind} {count}" for kind, count in kinds.items() if count) or "nothing happened"
-        (talk.say if shows_events else talk.detail)(f"{topic}: {text}")
-    if result.tables:
-        talk.detail(f"{result.log}: {', '.join(f'{name} {rows}' for name, rows in result.tables.items())}")
-    talk.say(f"{result.log}: {_did(result)}")
-    is_run = result.summary is not None or result.cameras
-    lines = [*_lines_of_run(result)] if is_run else [*_lines_of_stage(result)]
-    if result.stages and (slow := _slow_parts(result)):
-        lines.append(("time", slow))
-    if result.written_because and result.written_to:
-        lines.append(("written", f"results are in {result.written_to}: {result.written_because}"))
-    lines.append(("next", "    ".join(commands)))
-    width = max(len(name) for name, _ in lines)
-    for name, text in lines:
-        talk.say(f"  {name:<{width}}  {text}")
 
 
 def _did(result: RunResult) -> str:
@@ -198,24 +194,6 @@ def _slow_parts(result: RunResult) -> str:
         return ""
     slow = sorted(result.seconds_by_part.items(), key=lambda part: -part[1])
     return ", ".join(f"{name} {seconds:.1f} s" for name, seconds in slow if seconds >= _SLOW_SHARE * result.seconds)
-
-
-def _line_of(result: RunResult, shows_events: bool) -> str:
-    """Return the result for one of many logs in one line."""
-    parts = [_did(result)]
-    if result.cameras:
-        parts.append(counted(sum(not camera.is_scene for camera in result.cameras.values()), "camera"))
-    if shows_events:
-        counts = Counter({kind: n for kinds in result.events.values() for kind, n in kinds.items() if n})
-        parts.append(", ".join(f"{kind} {count}" for kind, count in counts.items()) or "nothing happened")
-    summary = result.summary
-    if summary is not None and summary.tracks is not None:
-        parts.append(counted(summary.tracks, "track"))
-    if result.continued is not None:
-        parts.append(result.continued.words()[-1])
-    if codes := dict.fromkeys(notice.code for notice in result.warnings):
-        parts.append(f"warnings: {', '.join(codes)}")
-    return "; ".join(parts)
 
 
 def _lines_of_run(result: RunResult) -> Iterator[tuple[str, str]]:

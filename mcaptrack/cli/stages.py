@@ -10,12 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
 from mcaptrack.api.options import PLUGIN
-from mcaptrack.cli.chosen import Maker, configured, has_flag, is_open, options_of, settable_of
+from mcaptrack.cli.chosen import Maker, configured, has_flag, options_of, settable_of
 from mcaptrack.cli.command import Set, is_on_command_line, listed, values_set
 from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
 from mcaptrack.cli.running import RunsStages
@@ -27,6 +27,12 @@ from mcaptrack.transforms.protocol import choices, member_type
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
+
+
+#: Arguments of ``run_stage`` that commands have as options.
+_WHERE: Final = (
+    "topic", "to", "frame", "class_map", "camera", "output", "definitions", "sidecar", "views", "force", "mode",
+)  # fmt: skip
 
 
 class StageCommand(RunsStages):
@@ -66,23 +72,11 @@ class StageCommand(RunsStages):
             wanted[option] = value
         make = Maker.of(stage, self.values, wanted, owners)
         with stdout_to_stderr():
-            self._transform = None if is_open(stage, self.values) else make()
+            is_open = stage.kind == "tracker" and not self.values["tracker"]  # the boxes of a log decide
+            self._transform = None if is_open else make()
             arguments: dict[str, Any] = {"stages": configured(), "make": make}
-        where = [
-            "topic",
-            "to",
-            "frame",
-            "class_map",
-            "camera",
-            "output",
-            "definitions",
-            "sidecar",
-            "views",
-            "force",
-            "mode",
-        ]
         arguments |= {"fields": self.values["map"]} if "map" in names else {}
-        return arguments | {name: self.values[name] for name in where if name in names}
+        return arguments | {name: self.values[name] for name in _WHERE if name in names}
 
     @classmethod
     def function_of(

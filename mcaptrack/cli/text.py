@@ -10,11 +10,11 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
 import typer
 
@@ -71,12 +71,7 @@ def say(line: str, level: Level = "info", event: str = "", **about: Any) -> None
     time = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     kind = event or (level if level in _BEGINNINGS else "note")
     whole = {"time": time, "level": level, "event": kind, "command": _JSON.get(), "message": text.strip(), **about}
-    print_line_of_json(whole, sys.stderr)
-
-
-def print_line_of_json(data: Mapping[str, Any], stream: TextIO) -> None:
-    """Print an object of JSON on one line, at once."""
-    print(json.dumps(data, allow_nan=False), file=stream, flush=True)
+    print(json.dumps(whole, allow_nan=False), file=sys.stderr, flush=True)
 
 
 def is_json() -> bool:

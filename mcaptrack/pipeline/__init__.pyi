@@ -1,9 +1,4 @@
 from mcaptrack.pipeline.checks import Job as Job
-from mcaptrack.pipeline.choice_of_cameras import SCENE as SCENE
-from mcaptrack.pipeline.choice_of_cameras import UNREAD as UNREAD
-from mcaptrack.pipeline.choice_of_cameras import ChosenCameras as ChosenCameras
-from mcaptrack.pipeline.choice_of_cameras import begins_with as begins_with
-from mcaptrack.pipeline.choice_of_cameras import choose_cameras as choose_cameras
 from mcaptrack.pipeline.drawing import RobotPath as RobotPath
 from mcaptrack.pipeline.drawing import find_views as find_views
 from mcaptrack.pipeline.drawing import robot_path as robot_path

@@ -58,7 +58,7 @@ class CutReport(NamedTuple):
     messages: int
     topics: tuple[str, ...]
     earlier: Mapping[str, int]
-    lost: Sequence[str]
+    lost: tuple[str, ...]
 
 
 #: A message from before the start: topic, number of the channel in the new log, message.
@@ -140,7 +140,7 @@ class _Cut:
         writer.close_chunks()
         lost = log.copy_messages(writer, [part for part in parts.values() if part.ids], self._span[1], progress)
         counts, topics = Counter(topic for topic, *_ in earlier), {key[0] for key in self._channels}
-        return CutReport(sum(writer.counts.values()), tuple(sorted(topics)), counts, self._lost + lost)
+        return CutReport(sum(writer.counts.values()), tuple(sorted(topics)), counts, (*self._lost, *lost))
 
     def _add_channels(self, writer: log.LogWriter, parts: Mapping[log.Log, log.Part]) -> list[_Held]:
         """Add the channels to the new log, and their numbers to the parts that they are copied from.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar, Final, NamedTuple, get_args
 
 from mcaptrack import foxglove, log
@@ -56,8 +56,29 @@ class Watch:
     name: ClassVar[str] = STAGE
 
     def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
-        """Find them (see ``make_events``)."""
-        return make_events(state, self)
+        """Find the events of tracks and the errors of forecasts that are missing or out of date.
+
+        Returns the channels that it makes by topic. A channel that can't be compared with the ground truth is left out,
+        with a warning. Raises McaptrackError for given topics that hold no tracks.
+        """
+        opened, prefix, *_ = state
+        out: dict[str, Made] = {}
+        topics = [opened.find(topic, prefix) for topic in self.topics] or _default_topics(state)
+        if self.again and not topics:
+            raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
+        truth = cache(partial(_read_truth, state))
+        for topic in topics:
+            options = self.options if self.again else _options_for(opened, topic, self.options)
+            has_same_options = _options_for(opened, topic, EventOptions()) == options
+            is_up_to_date = has_same_options and not is_outdated(state, outputs(topic))
+            if is_up_to_date and not (self.again or self.force):
+                continue
+            if may_add(opened, outputs(topic), STAGE, f"events of {topic}", bool(self.topics)):
+                out |= _events_of(state, topic, options, truth())
+        if not self.topics:
+            for name in FORECAST_INPUTS:
+                out |= _forecast_errors(state, name, self.again or self.force, truth)
+        return out
 
 
 def outputs(topic: str) -> tuple[str, ...]:
@@ -65,41 +86,10 @@ def outputs(topic: str) -> tuple[str, ...]:
     return topic + _EVENTS, topic + _EVENTS + SUFFIX, topic + _COUNTS
 
 
-def make_events(state: RunState, watch: Watch) -> dict[str, Made]:
-    """Find the events of tracks and the errors of forecasts that are missing or out of date.
-
-    Returns the channels that it makes by topic. A channel that can't be compared with the ground truth is left out,
-    with a warning. Raises McaptrackError for given topics that hold no tracks.
-    """
-    opened, prefix, *_ = state
-    out: dict[str, Made] = {}
-    topics = [opened.find(topic, prefix) for topic in watch.topics] or _default_topics(state)
-    if watch.again and not topics:
-        raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
-
-    @cache
-    def truth() -> _GroundTruth:
-        return _read_truth(state)
-
-    for topic in topics:
-        options = watch.options if watch.again else _options_for(opened, topic, watch.options)
-        has_same_options = _options_for(opened, topic, EventOptions()) == options
-        is_up_to_date = has_same_options and not is_outdated(state, outputs(topic))
-        if is_up_to_date and not (watch.again or watch.force):
-            continue
-        if may_add(opened, outputs(topic), STAGE, f"events of {topic}", bool(watch.topics)):
-            out |= _events_of(state, topic, options, truth())
-    if not watch.topics:
-        for name in FORECAST_INPUTS:
-            out |= _forecast_errors(state, name, watch.again or watch.force, truth)
-    return out
-
-
 def _events_of(state: RunState, topic: str, options: EventOptions, truth: _GroundTruth) -> dict[str, Made]:
     """Find the events of one channel of tracks, and count tracks and errors in its frames."""
     opened, classes = state.opened, (truth.classes, state.classes(topic))
-    tracks = state.results[topic].frames if topic in state.results else opened.frame_columns(topic, TRACKS)
-    frames = repaired_tracks(tracks, state.provenance(topic))
+    frames = repaired_tracks(state.frames(topic), state.provenance(topic))
     track_events = find_events(frames, truth.frames, options, opened.path.stem, topic, classes)
     for note in track_events.notes:
         warn(note, "not-compared")
@@ -123,7 +113,8 @@ def _forecast_errors(state: RunState, name: str, again: bool, truth: Callable[[]
         return {}
     later = later if state.holds(later, TRACKS) else tracks
     topics = (topic + _ERRORS, topic + _SCORES)
-    if not again and not is_outdated(state, topics) and later in _inputs_of(state.opened, topics[0]):
+    how = provenance_of(state.opened, topics[0])
+    if not again and not is_outdated(state, topics) and how and later in how.made_from():
         return {}
     if not may_add(state.opened, topics, STAGE, f"errors of {topic}"):
         return {}
@@ -196,9 +187,3 @@ def _options_for(opened: log.Log, topic: str, requested: EventOptions) -> EventO
 
 def _is_gate(value: Any) -> bool:
     return isinstance(value, float | int) and not isinstance(value, bool) and value > 0
-
-
-def _inputs_of(opened: log.Log, topic: str) -> dict[str, str]:
-    """Return the digests of a channel's inputs when it was made, by topic."""
-    provenance = provenance_of(opened, topic)
-    return provenance.made_from() if provenance else {}

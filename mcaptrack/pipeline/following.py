@@ -12,7 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain, takewhile
+from itertools import takewhile
 from typing import Any, Final
 
 import numpy as np
@@ -28,7 +28,7 @@ from mcaptrack.pipeline.checks import Job, read_named_frames
 from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
 from mcaptrack.schema import APPEARANCE, DECISIONS, DETECTIONS, PREDICTIONS, TRACKS, VIDEO, WORLDS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector
-from mcaptrack.schema.framing import frame_numbers, frame_times, unique_values
+from mcaptrack.schema.framing import frame_times, unique_values
 from mcaptrack.sources.cameras import camera_at, cameras, provenance_of
 from mcaptrack.sources.pictures import picture_size
 from mcaptrack.transforms import STAGES
@@ -173,10 +173,10 @@ class Before:
         is_new = provenance is not None and provenance.continued.get(AFTER) != digest_of(self._log, self.tracks)
         return {self.tracks} if is_new else set()
 
-    def lead(self, job: Job, numbers: Ints, planes: Planes) -> list[Frame]:
+    def lead(self, job: Job, own: Sequence[Frame], planes: Planes) -> list[Frame]:
         """The last frames of the input of a job in the log before, in metres of ``planes``.
 
-        Their numbers are those before ``numbers`` (N,), which are of the frames of this log.
+        Their numbers are those before the frames of this log, ``own``.
         """
         provenance = provenance_of(self._log, job.target)
         source = provenance.input if provenance and provenance.transform == job.stage else job.source
@@ -188,8 +188,7 @@ class Before:
         if job.transform.reads is TRACKS and _differ(read_planes(self._log, self._prefix), planes):
             frames = [frame._replace(rows=_in_planes(frame, planes)) for frame in frames]
         missing = round(self.result.gap_s * NS_PER_S / self._period_ns) if self._period_ns else 1
-        first = int(numbers[0]) if len(numbers) else 0
-        shift = first - max(missing, 1) - (frames[-1].index if frames else 0)
+        shift = (own[0].index if own else 0) - max(missing, 1) - (frames[-1].index if frames else 0)
         return [frame._replace(index=frame.index + shift) for frame in frames]
 
     def own(self, job: Job, outputs: Sequence[Sequence[Frame]]) -> tuple[list[Sequence[Frame]], dict[str, str]]:
@@ -308,19 +307,6 @@ def warn_unfollowed(opened: log.Log, job: Job) -> None:
             "`follows=` to go on again",
             "other-settings",
         )
-
-
-def led(lead: Sequence[Frame], frames: Sequence[Frame], schema: Schema) -> Sequence[Frame]:
-    """Return the frames of a lead, followed by ``frames``."""
-    collector = FrameCollector(schema)
-    for frame in chain(lead, frames):
-        collector.append(frame)
-    return collector.done()
-
-
-def numbers_of(frames: Sequence[Frame]) -> Ints:
-    """Return the number of the first frame, (1,); (0,) without frames."""
-    return frame_numbers(frames[:1])
 
 
 def _renumbered(ids: Ints, same: Mapping[int, int], last_id: int) -> Ints:

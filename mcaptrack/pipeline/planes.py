@@ -104,9 +104,7 @@ def is_plane_due(opened: log.Log, prefix: str, source: str, choice: PlaneChoice)
 
 def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
     """Warn of choices that change nothing, because the plane is given, or the camera isn't calibrated."""
-    topic = camera_at(opened, prefix).ground_plane
-    provenance = provenance_of(opened, topic)
-    is_given = topic in opened.channels and (provenance is None or provenance.transform not in _MADE)
+    is_given = _is_given(opened, camera_at(opened, prefix).ground_plane)
     if choice.estimate and is_given:
         warn("a ground plane is given, so that none is estimated", "option-not-used")
     if choice.ground_frame and (is_given or not _is_calibrated(opened)):
@@ -116,6 +114,11 @@ def warn_unused(opened: log.Log, prefix: str, choice: PlaneChoice) -> None:
 
 #: The parameter of a plane that says why it doesn't follow from a calibration that the log has.
 _UNCALIBRATED: Final = "uncalibrated"
+
+
+def _is_given(opened: log.Log, topic: str) -> bool:
+    provenance = provenance_of(opened, topic)
+    return topic in opened.channels and (provenance is None or provenance.transform not in _MADE)
 
 
 def _is_calibrated(opened: log.Log) -> bool:
@@ -139,10 +142,9 @@ def calibrated_planes(opened: log.Log, prefix: str, choice: PlaneChoice) -> tupl
     """
     camera = camera_at(opened, prefix)
     before = provenance_of(opened, camera.ground_plane)
-    is_given = camera.ground_plane in opened.channels and (before is None or before.transform not in _MADE)
     is_made = before is not None and before.transform == _CALIBRATE and not choice.is_another(before)
     is_made = is_made and not _is_recalibrated(opened, camera.prefix, before)
-    if is_given or is_made or not _is_calibrated(opened):
+    if _is_given(opened, camera.ground_plane) or is_made or not _is_calibrated(opened):
         return None, None, ""
     frame, ground_frame = choice.frames(before)
     try:
@@ -168,9 +170,10 @@ def make_plane(
     ``source`` is the topic of the boxes and the digest of its messages. ``uncalibrated`` says why the plane doesn't
     follow from a calibration. Both results are None if no frame has boxes in pixels.
     """
-    chain = _chain(state, source[0])
+    made_by = {name: made.provenance for name, made in state.results.items()}
+    chain = list(lineage(state.opened, source[0], made_by))
     frames = thinned(frames, _MOST_BOXES)
-    seen = _Boxes(*_boxes(frames, [how.classes for _, how in chain if how]))
+    seen = _Boxes.of(frames, [how.classes for _, how in chain if how])
     if not len(seen.xywh):
         return None, None  # without boxes in pixels there is nothing to convert to metres
     camera = camera_at(state.opened, state.prefix)
@@ -214,6 +217,24 @@ class _Boxes(NamedTuple):
     number: Ints
     score: Floats
     are_people: Bools
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame], classes: Sequence[Mapping[str, str]]) -> _Boxes:
+        """Return the boxes of rows in pixels.
+
+        ``classes`` are the names of classes by number, where channels name them: the first that do count. Boxes of
+        unknown classes are of people if no box is said to be.
+        """
+        names = next(filter(None, classes), {})
+        rows: Rows = np.concatenate([frame.rows[_BOX_COLUMNS] for frame in frames]) if frames else DETECTIONS.empty()
+        number = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
+        kept = np.isfinite(columns_to_boxes(rows)).all(axis=1)
+        rows, number = rows[kept], number[kept]
+        wanted = [int(kind) for kind, name in names.items() if is_person(name) and kind.isdecimal()] or [PERSON]
+        are_people = np.isin(rows["class_id"], wanted)
+        if not are_people.any():
+            are_people = rows["class_id"] == UNKNOWN
+        return cls(columns_to_boxes(rows), number, rows["score"].astype(np.float64), are_people)
 
     def fit(self, frames: int, size: tuple[int, int], person_m: float) -> PlaneFit:
         """Estimate a plane from people in some of the frames. Raises McaptrackError if they don't give one."""
@@ -276,11 +297,6 @@ def _why_not(state: RunState, chain: Sequence[tuple[str, Provenance | None]]) ->
     if any(motion.detects_motion(provenance) for _, provenance in chain):
         return _BY_MOTION
     return "the camera moves" if motion.moves(state) else ""
-
-
-def _chain(state: RunState, topic: str) -> list[tuple[str, Provenance | None]]:
-    """Return a channel, its input, the input of that and so on, each with its provenance, also of this run."""
-    return list(lineage(state.opened, topic, {name: made.provenance for name, made in state.results.items()}))
 
 
 # Leave out interpolated and coasting rows of people who are outside of the picture.
@@ -362,24 +378,6 @@ def _find_unseen(
 def _keys(joined: JoinedFrames) -> Iterator[tuple[int, int]]:
     """The time and the id of each row."""
     return zip(joined.row_ns.tolist(), joined.rows["track_id"].tolist(), strict=True)
-
-
-def _boxes(frames: Sequence[Frame], classes: Sequence[Mapping[str, str]]) -> tuple[Floats, Ints, Floats, Bools]:
-    """Return the boxes of rows in pixels, the number of the frame of each, their scores, and which are of people.
-
-    ``classes`` are the names of classes by number, where channels name them: the first that do count. Boxes of unknown
-    classes are of people if no box is said to be.
-    """
-    names = next(filter(None, classes), {})
-    rows: Rows = np.concatenate([frame.rows[_BOX_COLUMNS] for frame in frames]) if frames else DETECTIONS.empty()
-    number = np.repeat(np.arange(len(frames)), [len(frame.rows) for frame in frames])
-    kept = np.isfinite(columns_to_boxes(rows)).all(axis=1)
-    rows, number = rows[kept], number[kept]
-    wanted = [int(kind) for kind, name in names.items() if is_person(name) and kind.isdecimal()] or [PERSON]
-    are_people = np.isin(rows["class_id"], wanted)
-    if not are_people.any():
-        are_people = rows["class_id"] == UNKNOWN
-    return columns_to_boxes(rows), number, rows["score"].astype(np.float64), are_people
 
 
 def fit_of(provenance: Provenance | None) -> dict[str, float] | None:

@@ -311,9 +311,7 @@ def _gone(opened: log.Log, jobs: Sequence[Job], results: Mapping[str, Made]) -> 
     gone: set[str] = set()
     for job in jobs:
         if job.kept() & {*results}:
-            empty = (
-                topic for topic in job.kept() if topic in opened.channels
-            )  # no rows, no tracks at the video's rate
+            empty = job.kept() & opened.channels.keys()  # no rows, no tracks at the video's rate
             gone |= {*superseded(opened, job), *(topic for topic in empty if may_replace(opened, topic, job.stage))}
     gone -= {*results}
     for topic in sorted(opened.channels, key=len):  # what is made of a channel has a longer topic
@@ -447,12 +445,7 @@ def _recorded(stage: Stage, transform: Transform) -> dict[str, Any]:
 
 
 def _input(
-    state: RunState,
-    job: Job,
-    stamps: dict[str, list[int]],
-    progress: Progress,
-    boxes: BoxesRead,
-    watch: Stopwatch,
+    state: RunState, job: Job, stamps: dict[str, list[int]], progress: Progress, boxes: BoxesRead, watch: Stopwatch
 ) -> Input:
     """Return the input of a job; the capture times of pictures in ns are appended to ``stamps``, by topic."""
     opened, results = state.opened, state.results

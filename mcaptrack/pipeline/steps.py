@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -22,7 +23,7 @@ from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
 from mcaptrack.geometry.ragged import find_rows
 from mcaptrack.notices import Code, Notice, warn
 from mcaptrack.pipeline.checks import Job
-from mcaptrack.pipeline.following import Before, led, numbers_of, warn_unfollowed
+from mcaptrack.pipeline.following import Before, warn_unfollowed
 from mcaptrack.pipeline.motion import SideInput, boxes_input, motion_input, path_with
 from mcaptrack.pipeline.pictures import with_descriptors
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_poor, planes_for, without_unseen
@@ -238,10 +239,10 @@ def _after_log_before(work: Work) -> None:
     if before is None:
         warn_unfollowed(work.state.opened, work.job)
         return
-    lead = before.lead(work.job, numbers_of(frames), work.planes or ()) if work.path is None else ()
+    lead = before.lead(work.job, frames, work.planes or ()) if work.path is None else ()
     if lead:
         work.is_led = True
-        work.source = work.source.with_frames(led(lead, frames, work.transform.reads))
+        work.source = work.source.with_frames(collect(work.transform.reads, chain(lead, frames)))
 
 
 def _with_likelihoods(work: Work) -> None:

@@ -17,7 +17,7 @@ from mcaptrack.geometry.plane import origin_of
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.planes import fit_of
 from mcaptrack.pipeline.staleness import read_planes
-from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.camera_motion import rows_to_verdict
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns
@@ -112,7 +112,7 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
     camera = camera_at(opened, prefix)
     names = ("detect", "track", "sample", "predict", "retrack")
     boxes, tracks, samples, predictions, retracks = (f"{prefix}/{STAGES[name].output_topic}" for name in names)
-    motion = _rows(opened, motion_topic(prefix), CAMERA_MOTION)
+    motion = _frames(opened, motion_topic(prefix), CAMERA_MOTION)
     tracked, repaired = _sources(opened, tracks), _sources(opened, retracks)
     corrected = _corrected(opened, prefix, tracks, samples)
     compared = tracked
@@ -137,7 +137,7 @@ def summarise(opened: log.Log, prefix: str, boxes_read: BoxesRead | None = None)
         scores=scores,
         ground_plane=None if planes is None else origin_of(planes),
         plane_fit=fit_of(provenance_of(opened, camera.ground_plane)),
-        camera_motion=None if motion is None else rows_to_verdict(motion).name.lower(),
+        camera_motion=None if motion is None else rows_to_verdict(motion.rows()).name.lower(),
         corrected=corrected,
         frame_id=_frame_id(opened, tracks),
         appearance=_appearance(provenance_of(opened, retracks)),
@@ -176,11 +176,6 @@ def _frames(opened: log.Log, topic: str, schema: Schema) -> FrameColumns | None:
     """Return all rows of a channel; None if it is missing or has another schema."""
     channel = opened.channels.get(topic)
     return opened.frame_columns(topic, schema) if channel and channel.schema_name == schema.name else None
-
-
-def _rows(opened: log.Log, topic: str, schema: Schema) -> Rows | None:
-    frames = _frames(opened, topic, schema)
-    return None if frames is None else frames.rows()
 
 
 def _sources(opened: log.Log, topic: str) -> Ints | None:

@@ -55,6 +55,7 @@ from mcaptrack.schema import (
     SCHEMAS,
     TRACKS,
     Frame,
+    Rows,
     Schema,
 )
 from mcaptrack.schema.classes import class_names
@@ -329,6 +330,11 @@ class _Current:
         """Yield the frames of channels, by the ends of their topics."""
         return (self.frames(f"{self.state.prefix}/{name}", schema) for name in names)
 
+    def _rows_of_tracks(self) -> Iterator[Rows]:
+        """Yield rows of each channel of tracks, about as many as say where they are; the best channel first."""
+        for frames in self._each(TRACKS, "retracks", "tracks", "truth", "samples"):
+            yield join_frames(TRACKS, thinned(frames, _MOST_ROWS)).rows
+
     def is_truth_known(self) -> bool:
         """Return whether any forecast is compared with the ground truth."""
         scores = self._each(FORECAST_SCORES, "retracks/predictions/scores", "predictions/scores")
@@ -336,8 +342,7 @@ class _Current:
 
     def positions(self) -> NDArray[np.float64]:
         """Return positions of people, (N, 2) in m, from the first channel of tracks that has any."""
-        for frames in self._each(TRACKS, "retracks", "tracks", "truth", "samples"):
-            rows = join_frames(TRACKS, thinned(frames, _MOST_ROWS)).rows
+        for rows in self._rows_of_tracks():
             xy_m = np.stack([rows["x_m"], rows["y_m"]], axis=-1)
             if np.isfinite(xy_m).all(axis=1).any():
                 return xy_m
@@ -355,8 +360,7 @@ class _Current:
 
     def floor_m(self) -> float:
         """Return the usual height of the bottoms of 3D boxes; 0 if there are none."""
-        for frames in self._each(TRACKS, "retracks", "tracks", "truth", "samples"):
-            rows = join_frames(TRACKS, thinned(frames, _MOST_ROWS)).rows
+        for rows in self._rows_of_tracks():
             base_m = rows["z_m"] - rows["height_m"] / 2
             if np.isfinite(base_m).any():
                 return round(float(np.nanmedian(base_m)), 1)

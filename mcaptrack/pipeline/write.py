@@ -167,7 +167,7 @@ def write(state: RunState, output: Path | None, views: Views | None = None) -> b
     Without ``views`` those of earlier rows are dropped. Returns whether there was anything to write.
     """
     opened, _, results, gone = state
-    if not results and output is None and not (views and views.topics):
+    if not (results or gone) and output is None and not (views and views.topics):
         return False
     replaced = {*gone} | ({*views.outdated} if views else _outdated_views(state))
     drawn = views or Views()

@@ -37,14 +37,13 @@ from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace
 from mcaptrack.pipeline.staleness import digest_of
-from mcaptrack.pipeline.write import Made
+from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import GROUND_PLANE, Frame
 from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import Camera, camera_at, corrected_plane, given_plane, provenance_of, scenes_of
 from mcaptrack.sources.cameras import cameras as cameras_of
-from mcaptrack.sources.sidecar import check_topics, encoding_for
 
 #: Cameras are compared by at most so many frames.
 _COMPARED: Final = 200
@@ -583,18 +582,9 @@ def _plane_below(opened: log.Log, base: str, plane: GroundPlane, parameters: dic
 
 def write_changes(opened: log.Log, changes: CorrectedPlanes, output: Path | None) -> bool:
     """Write corrected planes into the log, or into a copy, and drop those that no longer hold; return if it changed."""
-    is_changed = bool(changes.new or changes.dropped)
-    if is_changed or output is not None:
-        outlines = {plane.provenance.input + views.SCENE_SUFFIX for plane in changes.new.values()}
-        drop = {*changes.new, *changes.dropped, *(outline for outline in outlines if outline in opened.channels)}
-        encoding = encoding_for(opened)
-        check_topics({*changes.new}, encoding)
-        with log.extend(opened, output, drop=drop) as writer:
-            for topic, plane in changes.new.items():
-                channel = writer.add_channel(topic, plane.record_in(encoding), encoding, plane.provenance.to_metadata())
-                for message in plane.messages_in(encoding):
-                    writer.add_message(channel, *message)
-    return is_changed
+    outlines = {plane.provenance.input + views.SCENE_SUFFIX for plane in changes.new.values()} & opened.channels.keys()
+    write(RunState(opened, "", dict(changes.new), outlines | {*changes.dropped}), output)
+    return bool(changes.new or changes.dropped)
 
 
 def _is_there(opened: log.Log, topic: str, channel: Made) -> bool:

@@ -24,8 +24,8 @@ from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.location import Location
 from mcaptrack.notices import collected, warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace, read_named_frames
-from mcaptrack.pipeline.choice_of_cameras import split_by_lack
 from mcaptrack.pipeline.rebuild import plugins_of
+from mcaptrack.pipeline.several import split_by_lack
 from mcaptrack.pipeline.staleness import digest_of, is_stale, read_planes
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import DETECTIONS, SIGHTINGS, Frame, Rows, Schema

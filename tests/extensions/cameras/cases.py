@@ -81,8 +81,8 @@ DEEP = {
     "cameras": (
         "it writes a scene as the channels of a stage are written, and finds fusers as transforms are found",
         "api.running cli.flags cli.many cli.running foxglove.views.people geometry.assignment geometry.neighbours "
-        "geometry.pinhole pipeline.checks pipeline.choice_of_cameras pipeline.pictures pipeline.rebuild "
+        "geometry.pinhole pipeline.checks pipeline.pictures pipeline.rebuild "
         "pipeline.several pipeline.staleness pipeline.write schema.frame_columns schema.ground_plane "
-        "sources.fixed_frame sources.sidecar transforms.guarded transforms.protocol",
+        "sources.fixed_frame transforms.guarded transforms.protocol",
     )
 }

@@ -20,6 +20,7 @@ from mcaptrack.extensions.cameras.on_pictures import SceneCamera, SceneOnPicture
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.pictures import PictureClock
+from mcaptrack.pipeline.several import choose_cameras
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import DETECTIONS, EVENTS, SIGHTINGS, TRACKS, EventKind, Frame
 from mcaptrack.schema.provenance import Provenance
@@ -184,7 +185,7 @@ def test_the_demonstration_of_three_cameras_draws_and_ingests_all(
         names = {"/world/truth", *(f"/{name}/{part}" for name in SCENES for part in ("video", "ground_plane"))}
         assert names <= opened.channels.keys()
         assert opened.channels["/left/video"].messages == 4
-        chosen = pipeline.choose_cameras(opened)
+        chosen = choose_cameras(opened)
     assert chosen is not None
     assert (chosen.prefixes, dict(chosen.left_out)) == (("/back", "/left", "/right"), {})
 
