@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
 
 from mcaptrack import foxglove, log
-from mcaptrack.choices import ImageFormat, InputRole, LengthUnit, Point, Role
+from mcaptrack.choices import InputRole, LengthUnit, Point, Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
 from mcaptrack.geometry.arrays import Floats, Ints
@@ -65,20 +64,15 @@ _WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "fra
 
 
 @dataclass(frozen=True, kw_only=True)
-class IngestOptions:
+class IngestOptions(VideoOptions):
     """The parameters of ``mcaptrack.ingest``, which explains them, as values: paths, fractions, names of columns.
 
-    ``labels`` are label files by role; ``frame_id`` is its ``frame``, and ``frame_ranges`` its ``frames`` if these are
+    Those of ``VideoOptions`` are among them. ``labels`` are label files by role; ``frame_id`` is its ``frame``, and ``frame_ranges`` its ``frames`` if these are
     no number.
     """
 
     camera: str = "camera"
-    fps: Fraction | None = None
     start_ns: int | None = None
-    image_format: ImageFormat = "auto"
-    quality: int | None = None
-    keyframe_interval_s: float | None = None
-    stream: int | None = None
     ground_plane: Path | None = None
     calibration: tuple[Path, ...] = ()
     calibration_name: str | None = None
@@ -97,17 +91,6 @@ class IngestOptions:
     class_map: ClassMap | None = None
     frame_id: str | None = None
     scene: str | None = None
-
-    @property
-    def video_options(self) -> VideoOptions:
-        """Options of storing pictures. Raises McaptrackError for options that contradict each other."""
-        return VideoOptions(
-            image_format=self.image_format,
-            quality=self.quality,
-            keyframe_interval_s=self.keyframe_interval_s,
-            fps=self.fps,
-            stream=self.stream,
-        )
 
     def first_of(self, role: Role | None) -> int | None:
         """The number of the first picture in files with this role; None if it wasn't given."""
