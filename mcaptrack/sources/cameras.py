@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, offer
@@ -245,14 +244,10 @@ def is_made_by_stage(channel: log.Channel) -> bool:
     return provenance is not None and provenance.transform in STAGES
 
 
-_CACHE: Final[WeakKeyDictionary[log.Log, list[Camera]]] = WeakKeyDictionary()
-
-
+@log.kept
 def cameras(opened: log.Log) -> list[Camera]:
     """Return all cameras of a log, sorted by name."""
-    if opened not in _CACHE:
-        _CACHE[opened] = _Channels(opened).cameras()
-    return _CACHE[opened]
+    return _Channels(opened).cameras()
 
 
 def has_own_rows(channel: log.Channel) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeVar
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from mcap.well_known import MessageEncoding
@@ -43,10 +42,6 @@ _OF_PROTOBUF: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
 
 
-#: The definitions of open logs that were found by their messages, by topic.
-_DEFINED: Final[WeakKeyDictionary[log.Log, dict[str, MessageType]]] = WeakKeyDictionary()
-
-
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
     """The message type of a channel of a log; a warning says which definition fits if the log has none."""
     channel = opened.channel(topic)
@@ -54,17 +49,15 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     kind = MessageType(*fields, channel.message_encoding)
-    if is_defined(kind):
-        return kind
-    kinds = _DEFINED.setdefault(opened, {})
-    if topic not in kinds:
-        payloads = (message.payload for message in opened.messages(topic))
-        kinds[topic], origin, doubts = defined(kind, payloads)
-        warn(
-            f"{opened.path}: {topic} does not say what {kind.name} is; {doubts or f'its definition is {origin}'}",
-            "definitions",
-        )
-    return kinds[topic]
+    return kind if is_defined(kind) else _defined_by_messages(opened, topic, kind)
+
+
+@log.kept
+def _defined_by_messages(opened: log.Log, topic: str, kind: MessageType) -> MessageType:
+    kind, origin, doubts = defined(kind, (message.payload for message in opened.messages(topic)))
+    text = f"{opened.path}: {topic} does not say what {kind.name} is"
+    warn(f"{text}; {doubts or f'its definition is {origin}'}", "definitions")
+    return kind
 
 
 def frame_of(opened: log.Log, topic: str) -> str:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -144,22 +143,6 @@ class SharedFacts:
     notes: list[str] = field(default_factory=list)
 
 
-_FACTS: Final[WeakKeyDictionary[log.Log, dict[str, SharedFacts]]] = WeakKeyDictionary()
-#: The stamps of pictures of open logs, by topic.
-_STAMPS: Final[WeakKeyDictionary[log.Log, dict[str, Ints]]] = WeakKeyDictionary()
-
-
-def facts_of(opened: log.Log, topic: str) -> SharedFacts:
-    """The facts that all pictures of a channel share; they are kept as long as the log is open.
-
-    Raises McaptrackError if messages of this type are not supported.
-    """
-    kept = _FACTS.setdefault(opened, {})
-    if topic not in kept:
-        kept[topic] = _shared_facts(opened, topic)
-    return kept[topic]
-
-
 def depth_of(opened: log.Log, topic: str) -> str:
     """The format of the depths in a channel, "" for pictures, and for messages that can't be read."""
     try:
@@ -183,15 +166,18 @@ def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Pictu
     return message_reader(opened, topic, lambda kind: picture_decoder(kind, facts))
 
 
+@log.kept
 def stamps(opened: log.Log, topic: str) -> Ints:
     """The stamps of a channel's pictures in log time order, (M,) ns; they are kept as long as the log is open."""
-    kept = _STAMPS.setdefault(opened, {})
-    if topic not in kept:
-        kept[topic] = np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
-    return kept[topic]
+    return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
 
 
-def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
+@log.kept
+def facts_of(opened: log.Log, topic: str) -> SharedFacts:
+    """The facts that all pictures of a channel share; they are kept as long as the log is open.
+
+    Raises McaptrackError if messages of this type are not supported.
+    """
     from mcaptrack.sources.video import Recogniser, measured_span
 
     facts = SharedFacts(Recogniser())

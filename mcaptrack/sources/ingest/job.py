@@ -67,8 +67,8 @@ _WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "fra
 class IngestOptions(VideoOptions):
     """The parameters of ``mcaptrack.ingest``, which explains them, as values: paths, fractions, names of columns.
 
-    Those of ``VideoOptions`` are among them. ``labels`` are label files by role; ``frame_id`` is its ``frame``, and ``frame_ranges`` its ``frames`` if these are
-    no number.
+    Those of ``VideoOptions`` are among them. ``labels`` are label files by role; ``frame_id`` is its ``frame``, and
+    ``frame_ranges`` its ``frames`` if these are no number.
     """
 
     camera: str = "camera"
@@ -248,6 +248,15 @@ class IngestJob:
         if labels.role == "detections" and labels.boxes_px is None:
             raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
         return labels
+
+    def add(self, path: Path, labels: BoxTable, is_first: bool = False) -> None:
+        """Take the labels of a file. Raises McaptrackError if there are others of their role."""
+        role = labels.role
+        if role in self.labels:
+            raise McaptrackError(
+                f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
+            )
+        self.labels = {role: labels, **self.labels} if is_first else {**self.labels, role: labels}
 
     @property
     def has_ground_given(self) -> bool:

@@ -116,7 +116,7 @@ class LabelJob(IngestJob):
     ) -> None:
         super().__init__(inputs[0][1], options, into)
         for role, path in reversed(inputs):
-            self._add(role, path)
+            self.add(path, self.read(path, role), is_first=True)
         if name := options.given(*FOR_VIDEOS):
             raise McaptrackError(f"{self.source} is a label file; {name} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
@@ -155,15 +155,6 @@ class LabelJob(IngestJob):
         if not is_stated and options.size and options.calibration:
             size, is_stated = options.size, True
         self.ground = self.plane(*size, is_stated) or self._measured_plane()
-
-    def _add(self, role: Role | None, path: Path) -> None:
-        labels = self.read(path, role)
-        role = labels.role
-        if role in self.labels:
-            raise McaptrackError(
-                f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
-            )
-        self.labels = {role: labels, **self.labels}
 
     def _boxes_extent(self) -> tuple[int, int]:
         """The image size that contains all boxes, (width, height) in pixels."""
@@ -436,14 +427,9 @@ class Boxes3DJob(IngestJob):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
             rows = options.read(path, stated, options.classes)
-            role = rows.role
             if not rows.in_space:
                 raise McaptrackError(f"{path} holds boxes in pictures, and {self.source} holds 3D boxes")
-            if role in self.labels:
-                raise McaptrackError(
-                    f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
-                )
-            self.labels[role] = rows
+            self.add(path, rows)
         self._topic = boxes_topic(into, options.camera) if into else ""
         if self._topic and options.camera == DEFAULT_CAMERA:
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
