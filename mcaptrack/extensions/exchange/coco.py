@@ -287,16 +287,14 @@ class CocoFile(BoxFile):
         name = boxes.topic.strip("/")
         yield b'{"info": ' + _bytes({"description": f"boxes of {name}", "frames": "frame_id counts pictures from 0"})
         yield b', "videos": ' + _bytes([{"id": _VIDEO, "name": name, **size}])
-        yield b', "categories": ' + _bytes([_category(number, name) for number, name in boxes.classes.items()])
+        names = {number: "unknown" if number == UNKNOWN else name for number, name in boxes.classes.items()}
+        categories = [{"id": number, "name": name, "supercategory": ""} for number, name in names.items()]
+        yield b', "categories": ' + _bytes(categories)
         yield b', "images": [\n'
         yield from _list(_images(boxes, size))
         yield b'\n], "annotations": [\n'
         yield from _list(_entries(boxes))
         yield b"\n]}\n"
-
-
-def _category(number: int, name: str) -> dict[str, Any]:
-    return {"id": number, "name": "unknown" if number == UNKNOWN else name, "supercategory": ""}
 
 
 def _images(boxes: ExportedBoxes, size: dict[str, int]) -> Iterator[dict[str, Any]]:

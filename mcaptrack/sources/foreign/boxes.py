@@ -202,7 +202,7 @@ def _reading(opened: log.Log, topic: str, choice: BoxesChoice) -> Reading | None
     if NO_THINGS.fullmatch(name) and not choice.fields:
         return None
     try:
-        shape = shape_of_type(kind) or _shape_of(_samples(opened, channel.topic))
+        shape = shape_of_type(kind) or shape_of_message(_samples(opened, channel.topic))._replace(count=None)
         reader = fields_reader(name, shape, choice.fields)
     except McaptrackError as error:
         if choice.fields:
@@ -233,11 +233,6 @@ def _of_drawings(special: Reading, messages: Sequence[Seen3d], words: Sequence[s
 def _single(read: Callable[[Things], Any]) -> Callable[[Any], Any]:
     """A function that reads one decoded message."""
     return lambda message: read(Things([message]))
-
-
-def _shape_of(messages: Sequence[Any]) -> FieldShape:
-    """The fields of messages in JSON, of all together."""
-    return shape_of_message(list(messages))._replace(count=None)
 
 
 def _samples(

@@ -393,13 +393,6 @@ def box_times(opened: log.Log, topic: str) -> Ints:
         return frame_times(named_detections(opened, topic).frames)
 
 
-def root_frame(opened: log.Log) -> str:
-    """The only root of the transforms of a log; "" if it has none, or several."""
-    tree = transforms_of(opened)
-    roots = tree.roots() if tree is not None else []
-    return roots[0] if len(roots) == 1 else ""
-
-
 def warn_of_frame(opened: log.Log, frame_id: str, labels: Path) -> None:
     """Warn if a log has frames of reference, and not the one of labels."""
     tree = transforms_of(opened)
@@ -442,7 +435,9 @@ class Boxes3DJob(IngestJob):
             if self.into:
                 warn_of_frame(self.into, self.options.frame_id, rows.path)
             return replace(rows, facts=replace(rows.facts, frame_id=self.options.frame_id))
-        root, stated = root_frame(self.into) if self.into else "", rows.facts.frame_id
+        tree, stated = transforms_of(self.into) if self.into else None, rows.facts.frame_id
+        roots = tree.roots() if tree is not None else []
+        root = roots[0] if len(roots) == 1 else ""
         frame_id = stated or root or FRAME
         reason = "by its format" if stated else "the root of the log's transforms" if root else "assumed"
         text = f": boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"

@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.decompression import opened
-from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, refuse
 
 #: Line numbers and lines, without empty lines and comments.
 Lines = Iterator[tuple[int, str]]
@@ -231,10 +231,7 @@ def headings(quaternions: Floats, path: Path, at: Callable[[int], str]) -> tuple
     Raises McaptrackError if they are no rotations, or if z of most boxes isn't up.
     """
     length = np.linalg.norm(quaternions, axis=1)
-    wrong = ~(np.abs(length - 1) < 0.1)
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise McaptrackError(f"{at(row)}: a quaternion of length {length[row]:g} is no rotation")
+    refuse(at, ~(np.abs(length - 1) < 0.1), lambda row: f"a quaternion of length {length[row]:g} is no rotation")
     w, x, y, z = (quaternions / length[:, None]).T
     tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
     if len(tilt) and np.median(tilt) > np.pi / 4:
