@@ -121,21 +121,6 @@ def payload_decoder(opened: log.Log, topic: str, make: Callable[[MessageType], T
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
 
 
-def message_reader(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
-) -> Callable[[log.Message], Any]:
-    """A function that decodes messages of a channel by what ``make`` makes for their type; errors name the place."""
-    decode = payload_decoder(opened, topic, make)
-
-    def read(message: log.Message) -> Any:
-        try:
-            return decode(message.payload)
-        except McaptrackError as error:
-            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
-
-    return read
-
-
 def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
     """A function that decodes the messages of a channel: a view is a ROS message in a recording of ROS 2.
 
@@ -174,11 +159,10 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Any]]:
 
 
 def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
+    """As ``unpacker``, but with dicts of JSON, and messages of Foxglove by their definition in the log."""
     if kind.encoding == MessageEncoding.JSON:
         return json.loads
-    if kind.encoding == MessageEncoding.Protobuf:
-        return protobuf_class(kind).FromString  # type: ignore[no-any-return]
-    return unpacker(kind)
+    return protobuf_class(kind).FromString if kind.encoding == MessageEncoding.Protobuf else unpacker(kind)
 
 
 def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:

@@ -22,7 +22,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.definitions import MessageType
-from mcaptrack.sources.foreign.flatten import frame_of, message_reader
+from mcaptrack.sources.foreign.flatten import frame_of, payload_decoder
 
 if TYPE_CHECKING:
     from mcaptrack.sources.video import EncodedPicture, PixelLayout, Recogniser, Samples, Span
@@ -162,8 +162,19 @@ def pictures(opened: log.Log, topic: str) -> Iterator[tuple[log.Message, Picture
 
 def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Picture]:
     """A function that decodes messages of a channel to pictures; both raise errors as ``pictures`` does."""
-    facts = facts_of(opened, topic)
-    return message_reader(opened, topic, lambda kind: picture_decoder(kind, facts))
+    return _reader(opened, topic, facts_of(opened, topic))
+
+
+def _reader(opened: log.Log, topic: str, facts: SharedFacts) -> Callable[[log.Message], Picture]:
+    decode = payload_decoder(opened, topic, lambda kind: picture_decoder(kind, facts))
+
+    def read(message: log.Message) -> Picture:
+        try:
+            return decode(message.payload)
+        except McaptrackError as error:
+            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
+
+    return read
 
 
 @log.kept
@@ -181,7 +192,7 @@ def facts_of(opened: log.Log, topic: str) -> SharedFacts:
     from mcaptrack.sources.video import Recogniser, measured_span
 
     facts = SharedFacts(Recogniser())
-    read = message_reader(opened, topic, lambda kind: picture_decoder(kind, facts))
+    read = _reader(opened, topic, facts)
     first: Picture | None = None
     for message in islice(opened.messages(topic), _SEARCHED):
         try:

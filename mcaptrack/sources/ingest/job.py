@@ -315,7 +315,6 @@ class IngestJob:
         for role, labels in self.labels.items():
             path = labels.path
             self.report_table(role, labels)
-            self.report.facts[role] = labels.facts.to_json()
             if labels.step > 1:
                 text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{text}; the frames in between are left out")
@@ -326,6 +325,7 @@ class IngestJob:
 
     def report_table(self, role: Role, labels: BoxTable) -> None:
         """Report how a label file was understood, and what of it is left out."""
+        self.report.facts[role] = labels.facts.to_json()
         self.report.remarks += labels.remarks
         for text, code in labels.doubts:
             warn(text, code)

@@ -511,7 +511,6 @@ class Boxes3DJob(IngestJob):
         """Report how the boxes were understood, and what of them is left out."""
         for role, rows in self.labels.items():
             self.report_table(role, rows)
-            self.report.facts[role] = rows.facts.to_json()
             text = describe_classes(*rows.extent.classes, rows.classes)
             self.report.remarks.append(f"{rows.path}: class_id is {text}")
 
