@@ -20,7 +20,6 @@ from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
 from mcaptrack.schema.names import shared_parts
 from mcaptrack.schema.provenance import FUSE, REFINE, Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import STAGES
 
 __all__ = [
@@ -356,7 +355,7 @@ class _Channels:
     def _space_topics(self, names: list[str]) -> list[str]:
         """Return the topics of detections in space that no stage made."""
         return self._select(
-            names, lambda channel: holds_boxes_3d(self._opened, channel.topic) or _is_ours(channel, True)
+            names, lambda channel: foreign.holds_boxes(self._opened, channel.topic, True) or _is_ours(channel, True)
         )
 
     def _result_topics(self, names: list[str]) -> list[str]:

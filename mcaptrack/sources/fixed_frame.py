@@ -571,11 +571,6 @@ def edges_of(message: Any) -> tuple[tuple[str, str], ...]:
     return tuple(sorted(zip(read.parent, read.child, strict=True)))
 
 
-def holds_boxes_3d(opened: log.Log, topic: str) -> bool:
-    """Whether a channel has boxes of other software in space, as ``foreign.holds_boxes`` says."""
-    return foreign.holds_boxes(opened, topic, in_space=True)
-
-
 def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:
     """The boxes of other software as rows of detections, with the names of classes and of their frame.
 

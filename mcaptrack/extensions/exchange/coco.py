@@ -25,9 +25,8 @@ from mcaptrack.schema.classes import UNKNOWN
 from mcaptrack.sources.box_files import BoxFile, ExportedBoxes
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, is_count
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_NAMES, FrameNames, is_count
 
-_MAX_CLASSES: Final = 65536
 #: The largest number of other files beside results in which their images are looked up.
 _MAX_BESIDE: Final = 16
 #: Keys of the track id of an annotation, of the frame of an image, and of its video; the first ones are written.
@@ -255,8 +254,8 @@ def _categories(path: Path, categories: Any) -> dict[int, str] | None:
     """Class names by number; None if there are none."""
     if not isinstance(categories, list) or not categories:
         return None
-    if len(categories) > _MAX_CLASSES:
-        raise McaptrackError(f"{path} has {len(categories)} categories; at most {_MAX_CLASSES} are read")
+    if len(categories) > MAX_NAMES:
+        raise McaptrackError(f"{path} has {len(categories)} categories; at most {MAX_NAMES} are read")
     out: dict[int, str] = {}
     for number, entry in enumerate(categories):
         key, name = (_whole_of_text(entry.get("id")), entry.get("name")) if isinstance(entry, dict) else (None, None)

@@ -29,8 +29,8 @@ from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import DEFAULT_CAMERA, camera_at
 from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
-from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
-from mcaptrack.sources.foreign import holds_pictures
+from mcaptrack.sources.fixed_frame import named_detections, transforms_of
+from mcaptrack.sources.foreign import holds_boxes, holds_pictures
 from mcaptrack.sources.foreign.flatten import frame_of
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, described, share_numbers
@@ -380,7 +380,7 @@ def boxes_topic(opened: log.Log, camera: str) -> str:
 def _holds_boxes(opened: log.Log, channel: log.Channel) -> bool:
     provenance = Provenance.from_metadata(channel.metadata)
     if provenance is None:
-        return holds_boxes_3d(opened, channel.topic)
+        return holds_boxes(opened, channel.topic, in_space=True)
     is_ingested = provenance.transform == INGEST and channel.schema_name in (DETECTIONS.name, TRACKS.name)
     return is_ingested and bool(provenance.frame_id) and not channel.topic.endswith(f"/{_TRUTH}")
 

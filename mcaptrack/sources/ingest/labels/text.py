@@ -31,7 +31,7 @@ _UTF16: Final = (BOM_UTF16_LE, BOM_UTF16_BE)
 #: The number of characters of a line that errors show.
 _LINE_SHOWN: Final = 60
 #: The number of class names of a file, at most: there are data sets with 21,841 classes.
-_MAX_NAMES: Final = 65_536
+MAX_NAMES: Final = 65_536
 MAX_NAME: Final = 256
 
 
@@ -148,8 +148,8 @@ class ClassNames:
         name = " ".join(name.split())[:MAX_NAME]
         if not name:
             return NO_CLASS
-        if name not in self._numbers and len(self._numbers) == _MAX_NAMES:
-            raise ValueError(f"the column of classes has more than {_MAX_NAMES:,} names")
+        if name not in self._numbers and len(self._numbers) == MAX_NAMES:
+            raise ValueError(f"the column of classes has more than {MAX_NAMES:,} names")
         return self._numbers.setdefault(name, len(self._numbers))
 
 
