@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.calibration.content import CameraFile, read_cameras
+from mcaptrack.sources.ingest.calibration import CameraFile, read_cameras
 
 K = [900.0, 0, 960, 0, 890, 540, 0, 0, 1]
 #: A quarter turn about the third axis, and a place.

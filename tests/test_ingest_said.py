@@ -133,7 +133,7 @@ def test_a_number_of_frames_has_bounds(tmp_path, frames, is_taken):
 
 def test_options_of_videos_and_roles_are_refused_by_name(tmp_path):
     labels = write(tmp_path / "a.txt", "1,1,1,1,2,2\n")
-    given = {"image_format": "jpeg", "quality": 3, "keyframe_interval_s": 2.0}
+    given = {"image_format": "h264", "quality": 3, "keyframe_interval_s": 2.0}
     for at, (name, value) in enumerate(given.items()):
         with pytest.raises(McaptrackError) as error:
             made(labels, fps=Fraction(1), **{name: value})

@@ -215,8 +215,8 @@ def test_a_column_of_classes_has_a_limit_of_names(tmp_path, monkeypatch):
     path = written(tmp_path / "a.txt", "\n".join(rows))
     labels = read_labels(path, role="detections")
     assert sorted(labels.classes) == list(range(7, 263))
-    assert texts._MAX_NAMES >= 21_841
-    monkeypatch.setattr(texts, "_MAX_NAMES", 256)
+    assert texts.MAX_NAMES >= 21_841
+    monkeypatch.setattr(texts, "MAX_NAMES", 256)
     assert len(read_labels(path, role="detections").classes) == 256
     with pytest.raises(McaptrackError, match=r":261: .*the column of classes has more than 256 names"):
         read_labels(written(path, "\n".join([*rows, '1 1 1 2 2 0 0 0 0 "another"'])), role="detections")

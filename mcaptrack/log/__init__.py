@@ -23,7 +23,7 @@ from mcaptrack.log.chunks import message_head, open_chunk
 from mcaptrack.log.cut import Part, copy_messages, private_records
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded
 from mcaptrack.log.messages import Message
-from mcaptrack.log.reader import Channel, Log, find_topic
+from mcaptrack.log.reader import Channel, Log, find_topic, kept
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, listing_of, refuse_non_mcap, results_path, update_listing
 from mcaptrack.log.records import MAGIC, Bytes, Record, walk
 from mcaptrack.log.recover import recover

@@ -9,9 +9,11 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final, NamedTuple, Self, TypeVar
+from typing import Concatenate, Final, NamedTuple, ParamSpec, Self, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from mcap.records import Channel as ChannelRecord
@@ -42,6 +44,7 @@ from mcaptrack.schema.framing import split_rows
 from mcaptrack.schema.own import schema_of_channel
 
 T = TypeVar("T")
+P = ParamSpec("P")
 
 
 class Channel(NamedTuple):
@@ -694,3 +697,17 @@ class Log:
 
 def _are_equal(locations: MessageLocations, other: MessageLocations) -> bool:
     return all(map(np.array_equal, locations, other))
+
+
+def kept(compute: Callable[Concatenate[Log, P], T]) -> Callable[Concatenate[Log, P], T]:
+    """Let a function of an open log compute what it returns once for the same arguments, as long as the log is used."""
+    results: WeakKeyDictionary[Log, dict[tuple[object, ...], T]] = WeakKeyDictionary()
+
+    @wraps(compute)
+    def look_up(opened: Log, /, *args: P.args, **named: P.kwargs) -> T:
+        of_log, key = results.setdefault(opened, {}), (args, *named.items())
+        if key not in of_log:
+            of_log[key] = compute(opened, *args, **named)
+        return of_log[key]
+
+    return look_up

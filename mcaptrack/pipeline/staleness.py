@@ -7,7 +7,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
-from weakref import WeakKeyDictionary
 
 from mcaptrack import log
 from mcaptrack.geometry.plane import Planes
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
 OFF: Final = "off"
 #: Of more ground planes than this, a channel holds the digest.
 _MOST_RECORDED: Final = 100
-_READ: Final[WeakKeyDictionary[log.Log, dict[str, Planes | None]]] = WeakKeyDictionary()
 
 
 def is_stale(opened: log.Log, topic: str) -> bool:
@@ -98,13 +96,11 @@ def is_motion_new(opened: log.Log, prefix: str, provenance: Provenance) -> bool:
     return bool(provenance.parameters.get("camera_motion", usual) != OFF)
 
 
+@log.kept
 def read_planes(opened: log.Log, prefix: str) -> Planes | None:
     """Return the ground planes of a camera, each with its start time in ns; None if the log has none."""
     topic = camera_at(opened, prefix).ground_plane
-    planes_by_topic = _READ.setdefault(opened, {})
-    if topic not in planes_by_topic:
-        planes_by_topic[topic] = (planes_in(opened, topic) if topic in opened.channels else []) or None
-    return planes_by_topic[topic]
+    return (planes_in(opened, topic) if topic in opened.channels else []) or None
 
 
 def planes_to_json(planes: Planes) -> list[Any]:

@@ -44,7 +44,9 @@ _RECTIFIED: Final = re.compile(r"(?<![a-z])(image)?rect(ified)?(?![a-z])", re.IG
 #: A camera's frame is no optical one if its z axis points up: z of a unit vector is more than this.
 _LOOKS_UP: Final = 0.7
 #: Pictures were resized, not cropped, if their ratio of width to height differs by less than this share.
-_SHAPE: Final = 0.02
+SHAPE: Final = 0.02
+#: The plane of a picture in which no point is known to be on the ground.
+_NOWHERE: Final = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0)
 
 
 class Calibration(NamedTuple):
@@ -135,10 +137,7 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
     if not sources or not any(map(holds_calibrations, opened.channels.values())):
         return None
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
-    topic = find_calibration(opened, sources[0], frame_id)
-    size = picture_size(opened, camera.pictures)
-    calibrations = read_calibrations(opened, topic, is_rectified_topic(sources[0]))
-    fitted = [(since_ns, _fitted(calibration, size, topic)) for since_ns, calibration in calibrations]
+    topic, fitted = _fitting(opened, sources[0], frame_id, camera.pictures)
     eye = fitted[0][1].frame_id or frame_id
     tree = transforms_of(opened)
     if tree is None:
@@ -166,10 +165,7 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
     from mcaptrack.foxglove.views import MovingCamera
 
     log_ns, stamp_ns, frame_id = _headers(opened, [topic])
-    source = find_calibration(opened, topic, frame_id)
-    calibrations = read_calibrations(opened, source, is_rectified_topic(topic))
-    size = picture_size(opened, topic)
-    fitted = [(since_ns, _fitted(calibration, size, source)) for since_ns, calibration in calibrations]
+    _, fitted = _fitting(opened, topic, frame_id, topic)
     first = fitted[0][1]
     poses = poses_at(opened, topic, first.frame_id or frame_id, frame, stamp_ns, log_ns)
     if not poses.is_known.any():
@@ -182,6 +178,15 @@ def moving_camera(opened: log.Log, topic: str, frame: str) -> MovingCamera:
         turn @ poses.rotation, (turn @ poses.translation[..., None])[..., 0],
         [calibration.lens for _, calibration in fitted], which, first.width_px, first.height_px,
     )  # fmt: skip
+
+
+def _fitting(
+    opened: log.Log, source: str, frame_id: str, pictures: str | None
+) -> tuple[str, list[tuple[int, Calibration]]]:
+    """Return the topic of the calibration for a topic and its frame, and the calibrations scaled to the pictures."""
+    topic, size = find_calibration(opened, source, frame_id), picture_size(opened, pictures)
+    calibrations = read_calibrations(opened, topic, is_rectified_topic(source))
+    return topic, [(since_ns, _fitted(calibration, size, topic)) for since_ns, calibration in calibrations]
 
 
 def is_rectified_topic(topic: str) -> bool:
@@ -207,7 +212,8 @@ def _planes(
     below = 0
     for number, t_ns in enumerate(log_ns.tolist()):
         calibration = calibrations[which[number]][1]
-        plane = _nowhere(calibration)
+        size = calibration.width_px, calibration.height_px
+        plane = GroundPlane(_NOWHERE, *size, lens=calibration.lens)
         if is_known[number]:
             back = calibration.turn @ poses.rotation[number].T
             metres = np.eye(3)
@@ -215,7 +221,7 @@ def _planes(
                 metres[:2] = np.column_stack([floor.rotation[number][:2, :2], floor.translation[number][:2]])
             try:
                 homography = ground_homography(calibration.lens, back, -back @ poses.translation[number], metres)
-                plane = GroundPlane(homography, calibration.width_px, calibration.height_px, lens=calibration.lens)
+                plane = GroundPlane(homography, *size, lens=calibration.lens)
             except McaptrackError:
                 below += 1
         if out and out[-1][0] == t_ns:
@@ -227,12 +233,6 @@ def _planes(
             f"{below:,} of {len(log_ns):,} pictures have no ground plane: the camera is below the ground", "transforms"
         )
     return out
-
-
-def _nowhere(calibration: Calibration) -> GroundPlane:
-    """Return the plane of a picture in which no point is known to be on the ground."""
-    numbers = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0)
-    return GroundPlane(numbers, calibration.width_px, calibration.height_px, lens=calibration.lens)
 
 
 def _ground_frame(tree: TransformTree, frame: str, eye: str, stamps_ns: Ints) -> str:
@@ -321,7 +321,7 @@ def _fitted(calibration: Calibration, size: tuple[int, int] | None, topic: str) 
     if not calibration.width_px or not calibration.height_px:
         return calibration._replace(width_px=size[0], height_px=size[1])
     across, down = size[0] / calibration.width_px, size[1] / calibration.height_px
-    if abs(across / down - 1) > _SHAPE:
+    if abs(across / down - 1) > SHAPE:
         was = f"{calibration.width_px} x {calibration.height_px}"
         raise McaptrackError(f"{topic} is for pictures of {was} pixels, and these are {size[0]} x {size[1]}")
     return calibration._replace(lens=calibration.lens.scaled(across, down), width_px=size[0], height_px=size[1])

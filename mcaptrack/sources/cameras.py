@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, offer
@@ -21,7 +20,6 @@ from mcaptrack.schema.framing import JoinedFrames, has_any, mapped_rows
 from mcaptrack.schema.names import shared_parts
 from mcaptrack.schema.provenance import FUSE, REFINE, Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
-from mcaptrack.sources.fixed_frame import holds_boxes_3d
 from mcaptrack.transforms import STAGES
 
 __all__ = [
@@ -245,14 +243,10 @@ def is_made_by_stage(channel: log.Channel) -> bool:
     return provenance is not None and provenance.transform in STAGES
 
 
-_CACHE: Final[WeakKeyDictionary[log.Log, list[Camera]]] = WeakKeyDictionary()
-
-
+@log.kept
 def cameras(opened: log.Log) -> list[Camera]:
     """Return all cameras of a log, sorted by name."""
-    if opened not in _CACHE:
-        _CACHE[opened] = _Channels(opened).cameras()
-    return _CACHE[opened]
+    return _Channels(opened).cameras()
 
 
 def has_own_rows(channel: log.Channel) -> bool:
@@ -308,7 +302,9 @@ class _Channels:
         pictures.
         """
         labels = {
-            name for name, topics in self._topics.items() if all(_is_label(self._source[topic]) for topic in topics)
+            name
+            for name, topics in self._topics.items()
+            if {self._source[topic].rpartition("/")[2] for topic in topics} <= {TRUTH, GROUND_PLANE}
         }
         joined = {name: [name] for name in self._topics}
         for name in sorted(set(self._topics) - self._with_pictures - self._in_space):
@@ -347,13 +343,8 @@ class _Channels:
     def _default_pictures(self, names: list[str]) -> str | None:
         """Return the topic of the video, or of the pictures that detections were made from; None if there is none."""
         topics = [f"{name}/{VIDEO}" for name in names]
-        topics += [
-            origin.input
-            for name in names
-            if (origin := self._provenance.get(f"{name}/{STAGES['detect'].output_topic}"))
-        ]
-        channels = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
-        return next((channel.topic for channel in channels if foreign.holds_pictures(channel)), None)
+        topics += [how.input for name in names if (how := self._provenance.get(detections_topic(name)))]
+        return self._first(topics, foreign.holds_pictures)
 
     def _detection_topics(self, names: list[str]) -> list[str]:
         """Return the topics of detections in pictures that no stage made."""
@@ -364,7 +355,7 @@ class _Channels:
     def _space_topics(self, names: list[str]) -> list[str]:
         """Return the topics of detections in space that no stage made."""
         return self._select(
-            names, lambda channel: holds_boxes_3d(self._opened, channel.topic) or _is_ours(channel, True)
+            names, lambda channel: foreign.holds_boxes(self._opened, channel.topic, True) or _is_ours(channel, True)
         )
 
     def _result_topics(self, names: list[str]) -> list[str]:
@@ -382,9 +373,7 @@ class _Channels:
 
     def _label_topic(self, names: list[str], label: str) -> str | None:
         """Return the first topic below one of the names for a label, unless a stage made it; None if there is none."""
-        topics = [f"{name}/{label}" for name in names]
-        channels = [self._opened.channels[topic] for topic in topics if topic in self._opened.channels]
-        return next((channel.topic for channel in channels if not is_made_by_stage(channel)), None)
+        return self._first([f"{name}/{label}" for name in names], lambda channel: not is_made_by_stage(channel))
 
     def _corrected(self, plane: str) -> str:
         """Return the topic of the correction of a ground plane if the log has it, otherwise the plane itself."""
@@ -395,6 +384,10 @@ class _Channels:
         is_same = before is None or not before.digest or before.digest == after.input_digest
         return topic if is_same else plane
 
+    def _first(self, topics: list[str], wanted: Callable[[log.Channel], bool]) -> str | None:
+        channels = self._opened.channels
+        return next((topic for topic in topics if topic in channels and wanted(channels[topic])), None)
+
     def _select(self, names: list[str], wanted: Callable[[log.Channel], bool]) -> list[str]:
         topics = sorted(topic for name in names for topic in self._topics.get(name, ()))
         return [topic for topic in topics if wanted(self._opened.channels[topic])]
@@ -404,10 +397,6 @@ def _is_ours(channel: log.Channel, is_in_space: bool) -> bool:
     """Return whether a channel has rows of detections that no stage made, in space or in pictures."""
     is_recorded = channel.schema_name == DETECTIONS.name and not is_made_by_stage(channel)
     return is_recorded and bool(frame_id_of(channel.metadata)) == is_in_space
-
-
-def _is_label(topic: str) -> bool:
-    return topic.rpartition("/")[2] in (TRUTH, GROUND_PLANE)
 
 
 def _only(topics: list[str]) -> str | None:

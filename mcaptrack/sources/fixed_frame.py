@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -174,6 +173,12 @@ def _nearest(some: Ints, others: Ints, centre_m: Floats, class_id: Ints) -> Floa
     return np.asarray(np.where(is_other, away, np.inf).min(axis=1, initial=np.inf))
 
 
+#: Columns of boxes that are as in messages (``Boxes3d``).
+_AS_IN_MESSAGES: Final = (
+    *("message", "stamp_ns", "centre", "orientation", "size", "velocity", "has_heading", "score"),
+)
+
+
 @dataclass(frozen=True)
 class Recorded3d:
     """The boxes of a channel.
@@ -223,8 +228,8 @@ class Recorded3d:
 
     def select(self, kept: Bools) -> Recorded3d:
         """The boxes of a mask (N,); messages stay."""
-        names = ("frame", "message", "stamp_ns", "log_ns", "centre", "orientation", "size", "velocity", "has_heading")
-        return replace(self, **{name: getattr(self, name)[kept] for name in (*names, "score", "class_id", "source_id")})
+        names = (*_AS_IN_MESSAGES, "frame", "log_ns", "class_id", "source_id")
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def times(self) -> tuple[Ints, int]:
         """When each box was measured (N,), in ns: its stamp, or the log time; and the number of log times."""
@@ -367,25 +372,11 @@ def recorded(
     place = {name: names.index(own) for name, own in plain.items()}
     of_boxes = classes(boxes.class_name)
     out = Recorded3d(
-        names,
-        np.array([place[name] for name in boxes.frame_id], np.int64),
-        boxes.message,
-        boxes.stamp_ns,
-        log_ns[boxes.message],
-        boxes.centre,
-        boxes.orientation,
-        boxes.size,
-        boxes.velocity,
-        boxes.has_heading,
-        boxes.score,
-        of_boxes.ids,
-        _ids(boxes.source_id),
-        of_boxes,
-        log_ns,
-        stamp_ns,
-        is_measured,
-        dict(remarks),
-    )
+        names=names, frame=np.array([place[name] for name in boxes.frame_id], np.int64), log_ns=log_ns[boxes.message],
+        class_id=of_boxes.ids, source_id=_ids(boxes.source_id), classes=of_boxes, message_ns=log_ns,
+        message_stamp_ns=stamp_ns, is_measured=is_measured, remarks=dict(remarks),
+        **{name: getattr(boxes, name) for name in _AS_IN_MESSAGES},
+    )  # fmt: skip
     return _checked(out)
 
 
@@ -482,9 +473,6 @@ class FramesRead(NamedTuple):
     unread: tuple[str, ...]
 
 
-_FRAMES_CACHE: Final[WeakKeyDictionary[log.Log, FramesRead]] = WeakKeyDictionary()
-
-
 def holds_transforms(channel: log.Channel) -> bool:
     """Return whether a channel has recorded transforms; those of views of mcaptrack are none."""
     is_recorded = Provenance.from_metadata(channel.metadata) is None
@@ -494,13 +482,6 @@ def holds_transforms(channel: log.Channel) -> bool:
 def transforms_of(opened: log.Log) -> TransformTree | None:
     """Return the transforms of a log as a tree over time; None if it has none. See ``read_frames``."""
     return read_frames(opened).tree
-
-
-def read_frames(opened: log.Log) -> FramesRead:
-    """Read all transforms of a log. Messages that can't be read are left out, and counted in ``unread``."""
-    if opened not in _FRAMES_CACHE:
-        _FRAMES_CACHE[opened] = _read(opened)
-    return _FRAMES_CACHE[opened]
 
 
 def warn_of_remarks(opened: log.Log, tree: TransformTree | None, target: str, source: str) -> None:
@@ -537,7 +518,9 @@ def poses_at(
     return poses
 
 
-def _read(opened: log.Log) -> FramesRead:
+@log.kept
+def read_frames(opened: log.Log) -> FramesRead:
+    """Read all transforms of a log. Messages that can't be read are left out, and counted in ``unread``."""
     edges: dict[tuple[str, str, bool], int] = {}
     of_edge, samples = list[int](), list[PoseSamples]()
     topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
@@ -586,11 +569,6 @@ def edges_of(message: Any) -> tuple[tuple[str, str], ...]:
     """The frames that the transforms of a decoded message lead from and to, sorted."""
     read = _transforms(Things([message]))
     return tuple(sorted(zip(read.parent, read.child, strict=True)))
-
-
-def holds_boxes_3d(opened: log.Log, topic: str) -> bool:
-    """Whether a channel has boxes of other software in space, as ``foreign.holds_boxes`` says."""
-    return foreign.holds_boxes(opened, topic, in_space=True)
 
 
 def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign.NamedFrames:

@@ -131,14 +131,9 @@ def schema_of_columns(name: str, columns: Sequence[ColumnOfUser]) -> Schema:
 def _fits(schema: Schema, names: set[str]) -> bool:
     """Whether a schema has all of these columns, and they are all that rows of it need."""
     needed = {column.name for column in schema.columns if not column.optional and not column.since}
-    is_placed = schema not in (DETECTIONS, TRACKS) or _is_placed(names)
+    is_placed = schema not in (DETECTIONS, TRACKS) or any(names.issuperset(group) for group in (BOX_PX, PLACE_M))
     own = {column.name for column in schema.columns}
     return is_placed and needed - set(_DEFAULTS.get(schema, ())) <= names <= own
-
-
-def _is_placed(names: set[str]) -> bool:
-    """Whether rows have a box or a position."""
-    return any(names.issuperset(group) for group in (BOX_PX, PLACE_M))
 
 
 def frames_of_columns(

@@ -56,8 +56,6 @@ def _read(path: Path) -> BoxTable:
     def at(row: int) -> str:
         return f"{path}: row {row + 1}"
 
-    if not tracks:
-        raise McaptrackError(f"{path} holds no boxes")
     t_ns, place, quaternions = table.times(), table.floats(_PLACE), table.floats(_QUATERNION)
     headings(quaternions, path, at)  # boxes that don't stand upright are refused
     poses, frame_id = path.with_name(POSES), VEHICLE

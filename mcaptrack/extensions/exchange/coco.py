@@ -25,9 +25,8 @@ from mcaptrack.schema.classes import UNKNOWN
 from mcaptrack.sources.box_files import BoxFile, ExportedBoxes
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, NOTHING, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_NAME, FrameNames, is_count
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_NAMES, FrameNames, is_count
 
-_MAX_CLASSES: Final = 65536
 #: The largest number of other files beside results in which their images are looked up.
 _MAX_BESIDE: Final = 16
 #: Keys of the track id of an annotation, of the frame of an image, and of its video; the first ones are written.
@@ -255,8 +254,8 @@ def _categories(path: Path, categories: Any) -> dict[int, str] | None:
     """Class names by number; None if there are none."""
     if not isinstance(categories, list) or not categories:
         return None
-    if len(categories) > _MAX_CLASSES:
-        raise McaptrackError(f"{path} has {len(categories)} categories; at most {_MAX_CLASSES} are read")
+    if len(categories) > MAX_NAMES:
+        raise McaptrackError(f"{path} has {len(categories)} categories; at most {MAX_NAMES} are read")
     out: dict[int, str] = {}
     for number, entry in enumerate(categories):
         key, name = (_whole_of_text(entry.get("id")), entry.get("name")) if isinstance(entry, dict) else (None, None)
@@ -287,16 +286,14 @@ class CocoFile(BoxFile):
         name = boxes.topic.strip("/")
         yield b'{"info": ' + _bytes({"description": f"boxes of {name}", "frames": "frame_id counts pictures from 0"})
         yield b', "videos": ' + _bytes([{"id": _VIDEO, "name": name, **size}])
-        yield b', "categories": ' + _bytes([_category(number, name) for number, name in boxes.classes.items()])
+        names = {number: "unknown" if number == UNKNOWN else name for number, name in boxes.classes.items()}
+        categories = [{"id": number, "name": name, "supercategory": ""} for number, name in names.items()]
+        yield b', "categories": ' + _bytes(categories)
         yield b', "images": [\n'
         yield from _list(_images(boxes, size))
         yield b'\n], "annotations": [\n'
         yield from _list(_entries(boxes))
         yield b"\n]}\n"
-
-
-def _category(number: int, name: str) -> dict[str, Any]:
-    return {"id": number, "name": "unknown" if number == UNKNOWN else name, "supercategory": ""}
 
 
 def _images(boxes: ExportedBoxes, size: dict[str, int]) -> Iterator[dict[str, Any]]:

@@ -32,11 +32,10 @@ from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.sources.box_files import BoxFile, ExportedBoxes
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import ClassNames, is_count
+from mcaptrack.sources.ingest.labels.text import MAX_ROWS, ClassNames, is_count
 from mcaptrack.sources.ingest.plain_yaml import XmlReader
 
 _MAX_BYTES: Final = 512 * 2**20
-_MAX_ROWS: Final = 10_000_000
 #: Frames in one file, also those that are interpolated.
 _MAX_FRAMES: Final = 10_000_000
 #: Files of CVAT have a depth of 8.
@@ -203,8 +202,8 @@ class _Parser(XmlReader):
             self._take_id(text[:40])
         elif name == _TRACK and self._track is not None:
             self.tracks.append(self._track)
-            if len(self.tracks) > _MAX_ROWS:
-                self.fail(f"more than {_MAX_ROWS} tracks; give it in parts")
+            if len(self.tracks) > MAX_ROWS:
+                self.fail(f"more than {MAX_ROWS} tracks; give it in parts")
             self._track = None
         elif name == "image":
             self._image = None
@@ -261,8 +260,8 @@ class _Parser(XmlReader):
         left, top, right, bottom = corners
         line = self.line
         self.values.extend((frame, left, top, right - left, bottom - top, track, label, is_occluded, line))
-        if len(self.values) > _MAX_ROWS * _COLUMNS:
-            self.fail(f"more than {_MAX_ROWS} boxes, interpolated ones among them; give it in parts")
+        if len(self.values) > MAX_ROWS * _COLUMNS:
+            self.fail(f"more than {MAX_ROWS} boxes, interpolated ones among them; give it in parts")
 
     def _add_to_track(self, track: _Track, attributes: dict[str, str]) -> None:
         """Add a box, and those between it and the one before."""

@@ -19,10 +19,10 @@ from mcaptrack.extensions.exchange.gathered import GatheredRows, frame_numbers
 from mcaptrack.files import visible
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NOTHING, REGION, Asked, BoxTable, LabelFacts
+from mcaptrack.sources.ingest.labels.text import MAX_NAME
 from mcaptrack.sources.video.image_folder import natural_order
 
 _MAX_PICTURES: Final = 1_000_000
-_MAX_NAME: Final = 256
 #: The name of regions in which boxes don't count.
 _REGION: Final = "dontcare"
 _BY: Final = {"names": "the numbers in their names", "order": "their order"}
@@ -92,7 +92,7 @@ class PictureFormat(Format):
                     aside = REGION if name is not None and name.lower() == _REGION else NOTHING
                     score = None if shape.score is None else float(shape.score)
                     left, top, width, height = (float(number) for number in shape.box)
-                    box, place = (left, top, width, height), self.where or picture.name[:_MAX_NAME]
+                    box, place = (left, top, width, height), self.where or picture.name[:MAX_NAME]
                     rows.add(place, len(pictures), box, _track(shape.id), name, score, aside=aside)
                 other.update(picture.other)
                 picture.shapes = []

@@ -16,7 +16,6 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 from typing import Any, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -127,17 +126,18 @@ def is_chosen_otherwise(opened: log.Log, topic: str) -> bool:
     return any((facts.get("map", ""), facts.get("class_map", "")) != choice for facts in _facts_before(opened, topic))
 
 
-_FACTS: Final[WeakKeyDictionary[log.Log, dict[str, list[Mapping[str, str]]]]] = WeakKeyDictionary()
-
-
 def _facts_before(opened: log.Log, topic: str) -> list[Mapping[str, str]]:
     """The record of how a channel was read, by each channel that was made of it."""
-    if opened not in _FACTS:
-        _FACTS[opened] = {}
-        for channel in opened.channels.values():
-            if source := input_of(channel.metadata):
-                _FACTS[opened].setdefault(source, []).append(boxes_of(channel.metadata))
-    return _FACTS[opened].get(topic, [])
+    return _facts_by_source(opened).get(topic, [])
+
+
+@log.kept
+def _facts_by_source(opened: log.Log) -> dict[str, list[Mapping[str, str]]]:
+    out: dict[str, list[Mapping[str, str]]] = {}
+    for channel in opened.channels.values():
+        if source := input_of(channel.metadata):
+            out.setdefault(source, []).append(boxes_of(channel.metadata))
+    return out
 
 
 # How a channel is read
@@ -173,23 +173,18 @@ class Reading(NamedTuple):
     known: Known | None = None
 
 
-_READINGS: Final[WeakKeyDictionary[log.Log, dict[tuple[str, BoxesChoice], Reading | None]]] = WeakKeyDictionary()
-
-
 def reading_of(opened: log.Log, topic: str) -> Reading | None:
     """The way a channel is read; None if its messages hold neither boxes nor positions.
 
     A warning names a package with its reader that can't be imported. Raises McaptrackError for paths of a user that its
     type doesn't have.
     """
-    choice = choice_for(opened, topic)
-    kept = _READINGS.setdefault(opened, {})
-    if (topic, choice) not in kept:
-        kept[topic, choice] = _reading(opened, opened.channel(topic), choice)
-    return kept[topic, choice]
+    return _reading(opened, topic, choice_for(opened, topic))
 
 
-def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Reading | None:
+@log.kept
+def _reading(opened: log.Log, topic: str, choice: BoxesChoice) -> Reading | None:
+    channel = opened.channel(topic)
     is_ours = channel.schema is not None or Provenance.from_metadata(channel.metadata)  # views are drawings, too
     if not channel.schema_name or is_ours:
         return None
@@ -207,7 +202,7 @@ def _reading(opened: log.Log, channel: log.Channel, choice: BoxesChoice) -> Read
     if NO_THINGS.fullmatch(name) and not choice.fields:
         return None
     try:
-        shape = shape_of_type(kind) or _shape_of(_samples(opened, channel.topic))
+        shape = shape_of_type(kind) or shape_of_message(_samples(opened, channel.topic))._replace(count=None)
         reader = fields_reader(name, shape, choice.fields)
     except McaptrackError as error:
         if choice.fields:
@@ -238,11 +233,6 @@ def _of_drawings(special: Reading, messages: Sequence[Seen3d], words: Sequence[s
 def _single(read: Callable[[Things], Any]) -> Callable[[Any], Any]:
     """A function that reads one decoded message."""
     return lambda message: read(Things([message]))
-
-
-def _shape_of(messages: Sequence[Any]) -> FieldShape:
-    """The fields of messages in JSON, of all together."""
-    return shape_of_message(list(messages))._replace(count=None)
 
 
 def _samples(

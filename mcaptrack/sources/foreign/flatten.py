@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, TypeVar
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from mcap.well_known import MessageEncoding
@@ -43,10 +42,6 @@ _OF_PROTOBUF: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
 TIMES: Final = ({"secs", "nsecs"}, {"sec", "nsec"}, {"sec", "nanosec"}, {"seconds", "nanos"})
 
 
-#: The definitions of open logs that were found by their messages, by topic.
-_DEFINED: Final[WeakKeyDictionary[log.Log, dict[str, MessageType]]] = WeakKeyDictionary()
-
-
 def message_type_of(opened: log.Log, topic: str) -> MessageType:
     """The message type of a channel of a log; a warning says which definition fits if the log has none."""
     channel = opened.channel(topic)
@@ -54,17 +49,15 @@ def message_type_of(opened: log.Log, topic: str) -> MessageType:
     schema = index.schemas.get(index.channels[channel.id].schema_id)
     fields = (schema.name, schema.encoding, bytes(schema.data)) if schema else ("", "", b"")
     kind = MessageType(*fields, channel.message_encoding)
-    if is_defined(kind):
-        return kind
-    kinds = _DEFINED.setdefault(opened, {})
-    if topic not in kinds:
-        payloads = (message.payload for message in opened.messages(topic))
-        kinds[topic], origin, doubts = defined(kind, payloads)
-        warn(
-            f"{opened.path}: {topic} does not say what {kind.name} is; {doubts or f'its definition is {origin}'}",
-            "definitions",
-        )
-    return kinds[topic]
+    return kind if is_defined(kind) else _defined_by_messages(opened, topic, kind)
+
+
+@log.kept
+def _defined_by_messages(opened: log.Log, topic: str, kind: MessageType) -> MessageType:
+    kind, origin, doubts = defined(kind, (message.payload for message in opened.messages(topic)))
+    text = f"{opened.path}: {topic} does not say what {kind.name} is"
+    warn(f"{text}; {doubts or f'its definition is {origin}'}", "definitions")
+    return kind
 
 
 def frame_of(opened: log.Log, topic: str) -> str:
@@ -128,21 +121,6 @@ def payload_decoder(opened: log.Log, topic: str, make: Callable[[MessageType], T
         raise McaptrackError(f"{opened.path}: {topic}: {error}") from None
 
 
-def message_reader(
-    opened: log.Log, topic: str, make: Callable[[MessageType], Callable[[bytes], Any]]
-) -> Callable[[log.Message], Any]:
-    """A function that decodes messages of a channel by what ``make`` makes for their type; errors name the place."""
-    decode = payload_decoder(opened, topic, make)
-
-    def read(message: log.Message) -> Any:
-        try:
-            return decode(message.payload)
-        except McaptrackError as error:
-            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
-
-    return read
-
-
 def message_decoder(opened: log.Log, topic: str) -> Callable[[bytes], Any]:
     """A function that decodes the messages of a channel: a view is a ROS message in a recording of ROS 2.
 
@@ -181,11 +159,10 @@ def flattener(kind: MessageType) -> Callable[[bytes], dict[Path, Any]]:
 
 
 def _unpacker(kind: MessageType) -> Callable[[bytes], Any]:
+    """As ``unpacker``, but with dicts of JSON, and messages of Foxglove by their definition in the log."""
     if kind.encoding == MessageEncoding.JSON:
         return json.loads
-    if kind.encoding == MessageEncoding.Protobuf:
-        return protobuf_class(kind).FromString  # type: ignore[no-any-return]
-    return unpacker(kind)
+    return protobuf_class(kind).FromString if kind.encoding == MessageEncoding.Protobuf else unpacker(kind)
 
 
 def _walk(value: Any, path: Path) -> Iterator[tuple[Path, Any]]:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources.foreign.decoding import decoder_with_errors, integer, stamp_of, text, to_bytes
 from mcaptrack.sources.foreign.definitions import MessageType
-from mcaptrack.sources.foreign.flatten import frame_of, message_reader
+from mcaptrack.sources.foreign.flatten import frame_of, payload_decoder
 
 if TYPE_CHECKING:
     from mcaptrack.sources.video import EncodedPicture, PixelLayout, Recogniser, Samples, Span
@@ -144,22 +143,6 @@ class SharedFacts:
     notes: list[str] = field(default_factory=list)
 
 
-_FACTS: Final[WeakKeyDictionary[log.Log, dict[str, SharedFacts]]] = WeakKeyDictionary()
-#: The stamps of pictures of open logs, by topic.
-_STAMPS: Final[WeakKeyDictionary[log.Log, dict[str, Ints]]] = WeakKeyDictionary()
-
-
-def facts_of(opened: log.Log, topic: str) -> SharedFacts:
-    """The facts that all pictures of a channel share; they are kept as long as the log is open.
-
-    Raises McaptrackError if messages of this type are not supported.
-    """
-    kept = _FACTS.setdefault(opened, {})
-    if topic not in kept:
-        kept[topic] = _shared_facts(opened, topic)
-    return kept[topic]
-
-
 def depth_of(opened: log.Log, topic: str) -> str:
     """The format of the depths in a channel, "" for pictures, and for messages that can't be read."""
     try:
@@ -179,23 +162,37 @@ def pictures(opened: log.Log, topic: str) -> Iterator[tuple[log.Message, Picture
 
 def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Picture]:
     """A function that decodes messages of a channel to pictures; both raise errors as ``pictures`` does."""
-    facts = facts_of(opened, topic)
-    return message_reader(opened, topic, lambda kind: picture_decoder(kind, facts))
+    return _reader(opened, topic, facts_of(opened, topic))
 
 
+def _reader(opened: log.Log, topic: str, facts: SharedFacts) -> Callable[[log.Message], Picture]:
+    decode = payload_decoder(opened, topic, lambda kind: picture_decoder(kind, facts))
+
+    def read(message: log.Message) -> Picture:
+        try:
+            return decode(message.payload)
+        except McaptrackError as error:
+            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
+
+    return read
+
+
+@log.kept
 def stamps(opened: log.Log, topic: str) -> Ints:
     """The stamps of a channel's pictures in log time order, (M,) ns; they are kept as long as the log is open."""
-    kept = _STAMPS.setdefault(opened, {})
-    if topic not in kept:
-        kept[topic] = np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
-    return kept[topic]
+    return np.array([picture.stamp_ns for _, picture in pictures(opened, topic)], np.int64)
 
 
-def _shared_facts(opened: log.Log, topic: str) -> SharedFacts:
+@log.kept
+def facts_of(opened: log.Log, topic: str) -> SharedFacts:
+    """The facts that all pictures of a channel share; they are kept as long as the log is open.
+
+    Raises McaptrackError if messages of this type are not supported.
+    """
     from mcaptrack.sources.video import Recogniser, measured_span
 
     facts = SharedFacts(Recogniser())
-    read = message_reader(opened, topic, lambda kind: picture_decoder(kind, facts))
+    read = _reader(opened, topic, facts)
     first: Picture | None = None
     for message in islice(opened.messages(topic), _SEARCHED):
         try:

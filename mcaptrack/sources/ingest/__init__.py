@@ -89,7 +89,7 @@ class VideoJob(IngestJob):
             raise McaptrackError(f"{source} is not a label file; `role=` applies to those")
         if options.frames is not None:
             raise McaptrackError(f"{source} is not a label file; `frames=` applies to labels without pictures")
-        self.video: Video = open_video(source, options.video_options)
+        self.video: Video = open_video(source, options)
         if self.video.images and not (options.fps or self.video.fps):
             raise McaptrackError(f"{source}: a folder of images has no clock; give the frames per second with `fps=`")
         self.fit_to_pictures(lambda: (self.video.width_px, self.video.height_px))
@@ -104,10 +104,10 @@ class VideoJob(IngestJob):
 
     def write(self, writer: log.LogWriter, has_clock: bool) -> None:
         """Write the pictures, then the labels at the times of their pictures."""
-        options, video, keep = self.options, self.video, self.options.video_options
+        options, video = self.options, self.video
         start_ns = video.start_ns if options.start_ns is None else options.start_ns
         start_ns = 0 if start_ns is None else start_ns
-        schema_name = foxglove.IMAGE if keep.is_still else foxglove.VIDEO
+        schema_name = foxglove.IMAGE if options.is_still else foxglove.VIDEO
         parameters: dict[str, str | int | float] = {"file": video.path.name, "image_format": video.format}
         if options.fps is not None:
             parameters["fps"] = str(options.fps)
@@ -121,13 +121,13 @@ class VideoJob(IngestJob):
             parameters["every"] = video.every
         if video.why_transcode:
             parameters |= {"encoded_again_because": video.why_transcode}
-            parameters |= {"crf": keep.crf, "keyframe_interval_s": keep.key_every_s}
+            parameters |= {"crf": options.crf, "keyframe_interval_s": options.key_every_s}
             self.report.remarks.append(f"{video.path} is encoded again, as H.264 for viewers: {video.why_transcode}")
         elif video.format in _FOXGLOVE_ALONE:
             kept = f"{video.path} is kept as {_FOXGLOVE_ALONE[video.format]}, which Foxglove plays"
             self.report.remarks.append(f"{kept} and Lichtblick does not (`image_format='h264'` is for both)")
         elif video.format == "jpeg":
-            parameters["quality"] = keep.jpeg_quality
+            parameters["quality"] = options.jpeg_quality
         channel = writer.add_channel(
             self.pictures,
             foxglove.record_in(schema_name, self.encoding),

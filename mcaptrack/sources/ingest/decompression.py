@@ -77,10 +77,8 @@ def _unpacked(data: bytes, is_zstd: bool, most: int) -> bytes:
     """Decompress all parts of gzip or zstd that follow each other, to at most ``most`` bytes; or NotUnpackedError."""
     import zstandard
 
-    def unpackers() -> Any:
-        return zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES).decompressobj()
-
-    new = unpackers if is_zstd else partial(zlib.decompressobj, zlib.MAX_WBITS + 16)
+    of_zstd = zstandard.ZstdDecompressor(max_window_size=WINDOW_BYTES)
+    new: Any = of_zstd.decompressobj if is_zstd else partial(zlib.decompressobj, zlib.MAX_WBITS + 16)
     parts, size, unpacker = list[bytes](), 0, new()
     try:
         for at in range(0, len(data), _FED_BYTES):

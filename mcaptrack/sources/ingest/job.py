@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
 
 from mcaptrack import foxglove, log
-from mcaptrack.choices import ImageFormat, InputRole, LengthUnit, Point, Role
+from mcaptrack.choices import InputRole, LengthUnit, Point, Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.affine import IDENTITY, compose, scale_of
 from mcaptrack.geometry.arrays import Floats, Ints
@@ -65,20 +64,15 @@ _WRITTEN: Final[Mapping[str, str]] = {"start_ns": "start_time", "frame_id": "fra
 
 
 @dataclass(frozen=True, kw_only=True)
-class IngestOptions:
+class IngestOptions(VideoOptions):
     """The parameters of ``mcaptrack.ingest``, which explains them, as values: paths, fractions, names of columns.
 
-    ``labels`` are label files by role; ``frame_id`` is its ``frame``, and ``frame_ranges`` its ``frames`` if these are
-    no number.
+    Those of ``VideoOptions`` are among them. ``labels`` are label files by role; ``frame_id`` is its ``frame``, and
+    ``frame_ranges`` its ``frames`` if these are no number.
     """
 
     camera: str = "camera"
-    fps: Fraction | None = None
     start_ns: int | None = None
-    image_format: ImageFormat = "auto"
-    quality: int | None = None
-    keyframe_interval_s: float | None = None
-    stream: int | None = None
     ground_plane: Path | None = None
     calibration: tuple[Path, ...] = ()
     calibration_name: str | None = None
@@ -97,17 +91,6 @@ class IngestOptions:
     class_map: ClassMap | None = None
     frame_id: str | None = None
     scene: str | None = None
-
-    @property
-    def video_options(self) -> VideoOptions:
-        """Options of storing pictures. Raises McaptrackError for options that contradict each other."""
-        return VideoOptions(
-            image_format=self.image_format,
-            quality=self.quality,
-            keyframe_interval_s=self.keyframe_interval_s,
-            fps=self.fps,
-            stream=self.stream,
-        )
 
     def first_of(self, role: Role | None) -> int | None:
         """The number of the first picture in files with this role; None if it wasn't given."""
@@ -266,6 +249,15 @@ class IngestJob:
             raise McaptrackError(f"{labels.path} holds positions, not boxes; detections are boxes")
         return labels
 
+    def add(self, path: Path, labels: BoxTable, is_first: bool = False) -> None:
+        """Take the labels of a file. Raises McaptrackError if there are others of their role."""
+        role = labels.role
+        if role in self.labels:
+            raise McaptrackError(
+                f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
+            )
+        self.labels = {role: labels, **self.labels} if is_first else {**self.labels, role: labels}
+
     @property
     def has_ground_given(self) -> bool:
         """Whether a homography or a calibration was given."""
@@ -323,7 +315,6 @@ class IngestJob:
         for role, labels in self.labels.items():
             path = labels.path
             self.report_table(role, labels)
-            self.report.facts[role] = labels.facts.to_json()
             if labels.step > 1:
                 text = f"{path} has labels every {labels.step} frames, from {labels.labelled[0]} on"
                 self.report.remarks.append(f"{text}; the frames in between are left out")
@@ -334,6 +325,7 @@ class IngestJob:
 
     def report_table(self, role: Role, labels: BoxTable) -> None:
         """Report how a label file was understood, and what of it is left out."""
+        self.report.facts[role] = labels.facts.to_json()
         self.report.remarks += labels.remarks
         for text, code in labels.doubts:
             warn(text, code)

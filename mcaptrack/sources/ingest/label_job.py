@@ -29,8 +29,8 @@ from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import DEFAULT_CAMERA, camera_at
 from mcaptrack.sources.corrections import CORRECTED, CORRECTED_FROM
-from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections, transforms_of
-from mcaptrack.sources.foreign import holds_pictures
+from mcaptrack.sources.fixed_frame import named_detections, transforms_of
+from mcaptrack.sources.foreign import holds_boxes, holds_pictures
 from mcaptrack.sources.foreign.flatten import frame_of
 from mcaptrack.sources.ingest.job import FOR_VIDEOS, SCHEMA_OF, IngestJob, IngestOptions
 from mcaptrack.sources.ingest.labels.frames import MAX_FRAMES, Numbered, described, share_numbers
@@ -116,7 +116,7 @@ class LabelJob(IngestJob):
     ) -> None:
         super().__init__(inputs[0][1], options, into)
         for role, path in reversed(inputs):
-            self._add(role, path)
+            self.add(path, self.read(path, role), is_first=True)
         if name := options.given(*FOR_VIDEOS):
             raise McaptrackError(f"{self.source} is a label file; {name} is for videos")
         if options.frames is not None and not 0 < options.frames <= MAX_FRAMES:
@@ -155,15 +155,6 @@ class LabelJob(IngestJob):
         if not is_stated and options.size and options.calibration:
             size, is_stated = options.size, True
         self.ground = self.plane(*size, is_stated) or self._measured_plane()
-
-    def _add(self, role: Role | None, path: Path) -> None:
-        labels = self.read(path, role)
-        role = labels.role
-        if role in self.labels:
-            raise McaptrackError(
-                f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
-            )
-        self.labels = {role: labels, **self.labels}
 
     def _boxes_extent(self) -> tuple[int, int]:
         """The image size that contains all boxes, (width, height) in pixels."""
@@ -389,7 +380,7 @@ def boxes_topic(opened: log.Log, camera: str) -> str:
 def _holds_boxes(opened: log.Log, channel: log.Channel) -> bool:
     provenance = Provenance.from_metadata(channel.metadata)
     if provenance is None:
-        return holds_boxes_3d(opened, channel.topic)
+        return holds_boxes(opened, channel.topic, in_space=True)
     is_ingested = provenance.transform == INGEST and channel.schema_name in (DETECTIONS.name, TRACKS.name)
     return is_ingested and bool(provenance.frame_id) and not channel.topic.endswith(f"/{_TRUTH}")
 
@@ -400,13 +391,6 @@ def box_times(opened: log.Log, topic: str) -> Ints:
         return np.asarray(opened.times(topic), np.int64)
     with collected():  # the command that tracks the boxes says it
         return frame_times(named_detections(opened, topic).frames)
-
-
-def root_frame(opened: log.Log) -> str:
-    """The only root of the transforms of a log; "" if it has none, or several."""
-    tree = transforms_of(opened)
-    roots = tree.roots() if tree is not None else []
-    return roots[0] if len(roots) == 1 else ""
 
 
 def warn_of_frame(opened: log.Log, frame_id: str, labels: Path) -> None:
@@ -436,14 +420,9 @@ class Boxes3DJob(IngestJob):
             if stated == "corrections":
                 raise McaptrackError(f"{path} holds 3D boxes; corrections are boxes in pictures")
             rows = options.read(path, stated, options.classes)
-            role = rows.role
             if not rows.in_space:
                 raise McaptrackError(f"{path} holds boxes in pictures, and {self.source} holds 3D boxes")
-            if role in self.labels:
-                raise McaptrackError(
-                    f"{path} and {self.labels[role].path} are both {role}; give the role of {path} with `role=`"
-                )
-            self.labels[role] = rows
+            self.add(path, rows)
         self._topic = boxes_topic(into, options.camera) if into else ""
         if self._topic and options.camera == DEFAULT_CAMERA:
             self.prefix = self._topic.rpartition("/")[0] or self.prefix
@@ -456,7 +435,9 @@ class Boxes3DJob(IngestJob):
             if self.into:
                 warn_of_frame(self.into, self.options.frame_id, rows.path)
             return replace(rows, facts=replace(rows.facts, frame_id=self.options.frame_id))
-        root, stated = root_frame(self.into) if self.into else "", rows.facts.frame_id
+        tree, stated = transforms_of(self.into) if self.into else None, rows.facts.frame_id
+        roots = tree.roots() if tree is not None else []
+        root = roots[0] if len(roots) == 1 else ""
         frame_id = stated or root or FRAME
         reason = "by its format" if stated else "the root of the log's transforms" if root else "assumed"
         text = f": boxes are taken as those of the frame {frame_id!r} ({reason}); `frame=` names another"
@@ -530,7 +511,6 @@ class Boxes3DJob(IngestJob):
         """Report how the boxes were understood, and what of them is left out."""
         for role, rows in self.labels.items():
             self.report_table(role, rows)
-            self.report.facts[role] = rows.facts.to_json()
             text = describe_classes(*rows.extent.classes, rows.classes)
             self.report.remarks.append(f"{rows.path}: class_id is {text}")
 

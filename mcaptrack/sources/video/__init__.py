@@ -20,35 +20,3 @@ from mcaptrack.sources.video.pixels import (
 )
 from mcaptrack.sources.video.reader import PictureMessage, Video, open_video
 from mcaptrack.sources.video.recognise import WORDS, Recogniser
-
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "PIXEL_FORMATS",
-    "SEQINFO",
-    "WORDS",
-    "EncodedPicture",
-    "H264Encoder",
-    "PictureMessage",
-    "PixelFormat",
-    "PixelLayout",
-    "Recogniser",
-    "Samples",
-    "SeqInfo",
-    "Span",
-    "Video",
-    "VideoOptions",
-    "decode_bgr",
-    "decode_gray",
-    "encode_image",
-    "find_seqinfo",
-    "is_mosaic",
-    "is_video_codec",
-    "measured",
-    "measured_span",
-    "open_video",
-    "pixel_format",
-    "read_head",
-    "wide_samples",
-    "write_clip",
-    "write_mp4",
-]

@@ -53,8 +53,8 @@ class Bits:
 
     @classmethod
     def of_nal(cls, nal: bytes) -> Bits:
-        """The bits of a NAL unit, without emulation prevention bytes."""
-        return cls(nal.replace(b"\x00\x00\x03", b"\x00\x00"))
+        """The bits of a NAL unit, without its first byte and emulation prevention bytes."""
+        return cls(nal[1:].replace(b"\x00\x00\x03", b"\x00\x00"))
 
     def take(self, count: int) -> int:
         """The next bits, as a number."""
@@ -150,7 +150,7 @@ def _inspect_h264(data: bytes) -> AccessUnit:
         if kind in _H264.sets:
             sets[nal] = kind
         elif kind in _H264.pictures:
-            bits = Bits.of_nal(nal[1:])
+            bits = Bits.of_nal(nal)
             pictures += bits.golomb() == 0  # first_mb_in_slice
             has_b |= bits.golomb() % 5 == _B  # slice_type
             is_key |= kind == _IDR
@@ -192,7 +192,7 @@ class FrameNumbers:
     def of(self, data: bytes) -> FrameNumber | None:
         """The number of an access unit in Annex B format; None if it isn't known."""
         for kind, nal in _H264.units(data):
-            bits = Bits.of_nal(nal[1:])
+            bits = Bits.of_nal(nal)
             if kind == _SPS:
                 sps = _parse_sps(nal)
                 self._sps[sps.name] = sps
@@ -224,7 +224,7 @@ class _Sps(NamedTuple):
 
 
 def _parse_sps(nal: bytes) -> _Sps:
-    bits = Bits.of_nal(nal[1:])
+    bits = Bits.of_nal(nal)
     profile = bits.take(8)
     bits.take(16)  # constraints, level
     name, has_planes = bits.golomb(), False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Iterator
 from fractions import Fraction
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -69,8 +70,10 @@ def decode_gray(
     wanted: Container[int] | None = None,
     damaged: list[int] | None = None,
     unreadable: list[McaptrackError] | None = None,
+    *,
+    is_grey: bool = True,
 ) -> Iterator[Frame]:
-    """Decode pictures to gray.
+    """Decode pictures to gray, or to BGR.
 
     Parameters
     ----------
@@ -82,37 +85,19 @@ def decode_gray(
         Indexes of damaged pictures of videos are added: what can't be decoded there is taken from other pictures.
     unreadable : list of McaptrackError, optional
         The errors of images, each of which stands for itself, that can't be decoded are added, and these left out.
+    is_grey : bool
+        Gray, which is quicker; otherwise BGR.
 
     Yields
     ------
     Frame
-        ``rows`` is the picture, (height, width) uint8 from 0 to 255.
+        ``rows`` is the picture, (height, width) uint8 from 0 to 255, or (height, width, 3): blue, green, red.
 
     Raises
     ------
     McaptrackError
         For a format that can't be decoded, and for damaged pictures; with ``unreadable`` if no image can be decoded.
     """
-    return _decoded(pictures, wanted, damaged, unreadable, is_grey=True)
-
-
-def decode_bgr(
-    pictures: Iterable[EncodedPicture],
-    wanted: Container[int] | None = None,
-    damaged: list[int] | None = None,
-    unreadable: list[McaptrackError] | None = None,
-) -> Iterator[Frame]:
-    """Decode pictures to BGR: as ``decode_gray``, but ``rows`` is (height, width, 3) uint8 (blue, green, red)."""
-    return _decoded(pictures, wanted, damaged, unreadable, is_grey=False)
-
-
-def _decoded(
-    pictures: Iterable[EncodedPicture],
-    wanted: Container[int] | None,
-    damaged: list[int] | None,
-    unreadable: list[McaptrackError] | None,
-    is_grey: bool,
-) -> Iterator[Frame]:
     of_frame = _luma if is_grey else _bgr_of_frame()
     decoder: _VideoDecoder | None = None
     is_any_readable = False
@@ -142,6 +127,10 @@ def _decoded(
         yield from decoder.flush()
     elif unreadable and not is_any_readable:
         raise unreadable[0]
+
+
+#: Decode pictures to BGR, as ``decode_gray`` does to gray.
+decode_bgr: Final = partial(decode_gray, is_grey=False)
 
 
 def _raw(picture: EncodedPicture, is_grey: bool) -> Image:

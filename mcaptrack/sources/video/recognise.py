@@ -136,7 +136,8 @@ def _video(data: bytes) -> Recognised | None:
     """Recognise the beginning of a video; None for anything that isn't sure to be one."""
     if record := _record(data):
         return record
-    if data.startswith((START_CODE, START_CODE[1:])) and (name := _codec_of(_with_start_codes(data))):
+    starts = nal_starts(data) if data.startswith((START_CODE, START_CODE[1:])) else ()
+    if name := _codec_of([data[at : at + 2] for at in starts if at < len(data)]):
         return Recognised(name)
     for length_bytes in _LENGTHS:
         units = _with_lengths(data, length_bytes)
@@ -154,11 +155,6 @@ def _codec_of(units: Sequence[bytes]) -> str:
     if any(unit[0] & 0x9F == 7 and unit[0] & 0x60 for unit in units):
         return "h264"
     return "h265" if any(unit[:2] in (b"\x40\x01", b"\x42\x01") for unit in units) else ""
-
-
-def _with_start_codes(data: bytes) -> list[bytes]:
-    """The first bytes of NAL units after start codes."""
-    return [data[at : at + 2] for at in nal_starts(data) if at < len(data)]
 
 
 def _with_lengths(data: bytes, length_bytes: int) -> list[bytes] | None:

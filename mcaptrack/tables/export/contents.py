@@ -28,7 +28,7 @@ from mcaptrack.schema.framing import unique_values
 from mcaptrack.schema.provenance import Provenance, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, provenance_of
-from mcaptrack.sources.fixed_frame import BoxesRead, holds_boxes_3d
+from mcaptrack.sources.fixed_frame import BoxesRead
 from mcaptrack.sources.foreign.flatten import column_reader, flattener, message_type_of, payload_decoder
 from mcaptrack.tables import TABLES, Pointers, TablePieces, TrackNames
 from mcaptrack.tables.fields import SCORES
@@ -482,7 +482,8 @@ class LogTables:
         file = file_name(self.opened.part(topic).path)
         frame, rows = np.arange(len(places.t_ns)), np.full(len(places.t_ns), -1)
         # Rows of 3D boxes are at their stamps: several messages may be one frame.
-        has_rows = not foreign.holds_pictures(self.opened.channel(topic)) and not holds_boxes_3d(self.opened, topic)
+        is_read = foreign.holds_pictures(self.opened.channel(topic)) or foreign.holds_boxes(self.opened, topic, True)
+        has_rows = not is_read
         if has_rows:
             frames = self._frames(topic)
             frame, rows = frames.numbers, np.diff(frames.ends)

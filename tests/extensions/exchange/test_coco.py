@@ -156,7 +156,7 @@ def test_results_have_the_frames_sizes_and_names_of_the_annotations_beside_them(
 
 def test_files_have_no_more_boxes_and_classes_than_the_limits(tmp_path, monkeypatch):
     monkeypatch.setattr(gathered, "MAX_ROWS", 2)
-    monkeypatch.setattr(coco_format, "_MAX_CLASSES", 2)
+    monkeypatch.setattr(coco_format, "MAX_NAMES", 2)
     kinds = [{"id": number, "name": f"n{number}"} for number in range(5, 8)]
     for make in (lambda count: coco([0], [box(0)] * count), lambda count: [box(0)] * count):
         assert len(read(tmp_path, make(2)).frame) == 2

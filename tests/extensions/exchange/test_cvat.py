@@ -60,12 +60,12 @@ def refused(read, words: str, *parts: str, **options: str) -> None:
 
 def test_sizes_of_files_have_limits(read, monkeypatch, tmp_path):
     three = [track(box(0), more=f'id="{n}"') for n in range(3)]
-    monkeypatch.setattr(cvat, "_MAX_ROWS", 3)
+    monkeypatch.setattr(cvat, "MAX_ROWS", 3)
     assert len(read(*three).id) == 3
     refused(read, "more than 3 boxes, interpolated ones among them; give it in parts", *three, track(box(0)))
     refused(read, "more than 3 boxes, interpolated ones among them", track(box(0), box(3)))
     assert read(track(box(0), box(2))).frame.tolist() == [0, 1, 2]
-    monkeypatch.setattr(cvat, "_MAX_ROWS", 2)
+    monkeypatch.setattr(cvat, "MAX_ROWS", 2)
     refused(read, "more than 2 tracks; give it in parts", *[track() for _ in range(3)])
     size = len((tmp_path / "a.xml").read_bytes())
     monkeypatch.setattr(cvat, "_MAX_BYTES", size)
@@ -79,7 +79,7 @@ def test_frames_and_classes_have_limits(read, monkeypatch):
     assert len(read(track(box(0), box(5))).id) == 6
     refused(read, "5 boxes would be interpolated; at most 5 are", track(box(0), box(6)))
     assert len(read(track(box(0, more='outside="1"'), box(60))).id) == 1
-    monkeypatch.setattr(texts, "_MAX_NAMES", 2)
+    monkeypatch.setattr(texts, "MAX_NAMES", 2)
     named = read(*(track(box(0), label=label) for label in ("a", " b  c ", "b c")))
     assert named.classes == {2: "a", 3: "b c"}
     refused(read, "more than 2 names", *[track(box(0), label=name) for name in "abc"])

@@ -31,7 +31,7 @@ from mcaptrack.schema.provenance import frame_id_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import moving_camera
 from mcaptrack.sources.cameras import Camera
-from mcaptrack.sources.fixed_frame import holds_boxes_3d, named_detections
+from mcaptrack.sources.fixed_frame import named_detections
 
 #: Detections count for this many pictures before and after their own.
 _NEAR_PICTURES: Final = 2.5
@@ -327,7 +327,7 @@ def _read(opened: log.Log, topic: str) -> tuple[Pieces, Ints, str] | None:
         if not frame_id:
             return None
         frames, names = opened.frame_columns(topic, schema), class_names(channel.metadata)
-    elif holds_boxes_3d(opened, topic):
+    elif foreign.holds_boxes(opened, topic, in_space=True):
         named = named_detections(opened, topic)
         schema, frames, frame_id, names = DETECTIONS, named.frames, named.frame_id, named.classes
     else:

@@ -29,6 +29,8 @@ _EITHER: Final = ("mot", "csv")
 #: The number of frames of a log, at most: more than three days at 30 frames a second. Numbers have so many digits.
 MAX_FRAMES: Final = 10_000_000
 _DIGITS: Final = 10
+#: The number of the first frame, at most.
+_LAST_FIRST: Final = 10**12
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class Frames(NamedTuple):
         )
 
 
-def parse_first_frames(value: int | str | Mapping[str, int] | None, most: int = 10**12) -> int | dict[str, int] | None:
+def parse_first_frames(value: int | str | Mapping[str, int] | None) -> int | dict[str, int] | None:
     """Read the number of the first picture: of all files, or by their roles as in "tracks=0,truth=1".
 
     Raises McaptrackError.
@@ -86,12 +88,12 @@ def parse_first_frames(value: int | str | Mapping[str, int] | None, most: int = 
     if [*entries.values()] == [""]:  # a number alone
         entries = {"": next(iter(entries))}
     roles = ("", "detections", "tracks", "truth", "corrections")
-    if all(name in roles and is_count(number, 13) and int(number) <= most for name, number in entries.items()):
+    if all(name in roles and is_count(number, 13) and int(number) <= _LAST_FIRST for name, number in entries.items()):
         numbers = {name: int(number) for name, number in entries.items()}
         return numbers.get("", numbers)
     raise McaptrackError(
-        f"`first_frame=` is a whole number from 0 to {most}, or one for each kind of file as in tracks=0,truth=1, not "
-        f"{value!r:.40}"
+        f"`first_frame=` is a whole number from 0 to {_LAST_FIRST}, or one for each kind of file as in "
+        f"tracks=0,truth=1, not {value!r:.40}"
     )
 
 

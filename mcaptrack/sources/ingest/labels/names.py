@@ -11,11 +11,10 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import visible
 from mcaptrack.sources.ingest import plain_yaml
 from mcaptrack.sources.ingest.labels.table import BoxTable
-from mcaptrack.sources.ingest.labels.text import MAX_NAME, is_count, lines_of
+from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_NAMES, is_count, lines_of
 
 LISTS: Final = ("labels.txt", "classes.txt", "obj.names", "_classes.txt")
 _YAML: Final = ("data.yaml", "data.yml", "dataset.yaml")
-_MAX_CLASSES: Final = 65536
 #: A line of a list that states its number: `2: person`, `2 person`, `2,person`.
 _NUMBERED: Final = re.compile(r"([0-9]{1,9})(?: ?[:=,] ?| )(\D.*)")
 
@@ -46,7 +45,7 @@ def _of_list(path: Path, first: int) -> dict[int, str]:
     numbered = [match for match in map(_NUMBERED.fullmatch, lines) if match]
     if len(numbered) == len(lines) == len({int(match[1]) for match in numbered}):
         return {int(match[1]): match[2] for match in numbered}
-    return dict(enumerate(lines[:_MAX_CLASSES], start=first))
+    return dict(enumerate(lines[:MAX_NAMES], start=first))
 
 
 def _of_yaml(path: Path) -> dict[int, str]:

@@ -168,21 +168,18 @@ def format_named(name: str) -> Format:
     Raises McaptrackError if there is none, or if it can't be used.
     """
     entry = find(_KIND, name)
-    if not entry.is_built_in:
-        return _made(entry)
-    made: Format = entry.cls()
+    return _of_class(name, entry.cls) if entry.is_built_in else _made(entry)
+
+
+def _of_class(name: str, cls: type[Format]) -> Format:
+    made = cls()
     made.name = name
     return made
 
 
 def own_formats() -> list[Format]:
     """The formats of mcaptrack, of the core and of extensions, in the order in which they are asked about a file."""
-    formats = []
-    for name, cls in _own_classes(tuple(own(_KIND).items())):
-        made = cls()
-        made.name = name
-        formats.append(made)
-    return formats
+    return [_of_class(name, cls) for name, cls in _own_classes(tuple(own(_KIND).items()))]
 
 
 @lru_cache(maxsize=4)

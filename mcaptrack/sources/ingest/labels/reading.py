@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
@@ -190,7 +190,7 @@ def read_homography(path: Path) -> tuple[float, ...]:
 def _read_in_parts(file: LabelFile, made: Format, asked: Asked) -> BoxTable | None:
     """Read a label file in parts; None if it isn't sorted by frame, or if parts aren't understood alike."""
     lines, spilled, stored = lines_of(file.path), SpillFile(), list[Mapping[str, Stored]]()
-    tables, extent = list[BoxTable](), Extent.of_none()
+    tables, extents = list[BoxTable](), list[Extent]()
     rest: BoxTable | None = None  # the last frame, which may go on
     assert asked.role is not None
     while (line := next(lines, None)) is not None:
@@ -201,7 +201,7 @@ def _read_in_parts(file: LabelFile, made: Format, asked: Asked) -> BoxTable | No
             return None
         if rest is not None and raw.frame.min() < rest.frame[0]:
             return None
-        extent = extent.joined(part.extent)
+        extents.append(part.extent)
         tables.append(part.take(slice(0)))
         part = part if rest is None else replace(part, **_joined(rest, part))
         part = part.take(np.argsort(part.frame, kind="stable"))
@@ -220,7 +220,7 @@ def _read_in_parts(file: LabelFile, made: Format, asked: Asked) -> BoxTable | No
     out = replace(
         tables[0],
         stored=(),
-        stored_extent=extent,
+        stored_extent=reduce(Extent.joined, extents),
         left_out=_summed([part.left_out for part in tables if part.left_out]),
         findings=[finding for part in tables for finding in part.findings],
     )

@@ -65,13 +65,20 @@ def _of_arrow(file: LabelFile) -> Opened:
             schema, batches = stream.schema, iter(stream)
     except (pa.ArrowException, OSError, ValueError) as error:
         raise McaptrackError(f"{path} is no table that can be read: {str(error).splitlines()[0][:200]}") from None
-    names = [field.name for field in _flattened(pa.Table.from_batches([], schema)).schema if _is_text(field.type)]
+
+    def flattened(table: pa.Table) -> pa.Table:
+        """A table with the fields of structures as columns of their own, named with a dot."""
+        return table.flatten() if any(map(pa.types.is_struct, table.schema.types)) else table
+
+    others = (pa.types.is_binary, pa.types.is_large_binary, pa.types.is_struct)  # which can't be read as texts
+    fields = flattened(pa.Table.from_batches([], schema)).schema
+    names = [field.name for field in fields if not any(is_other(field.type) for is_other in others)]
 
     def lines() -> Iterator[tuple[int, str]]:
         number = 0
         try:
             for batch in batches:
-                part = _flattened(pa.Table.from_batches([batch])).select(names)
+                part = flattened(pa.Table.from_batches([batch])).select(names)
                 for row in zip(*map(_texts, part.columns), strict=True):
                     number += 1
                     yield number, SEPARATOR.join(row)
@@ -79,20 +86,6 @@ def _of_arrow(file: LabelFile) -> Opened:
             raise McaptrackError(f"{path}: after row {number}: {str(error).splitlines()[0][:200]}") from None
 
     return with_lists(Opened(path, 1, names, lines(), lambda line: line.split(SEPARATOR)))
-
-
-def _flattened(table: pa.Table) -> pa.Table:
-    """A table with the fields of structures as columns of their own, named with a dot."""
-    import pyarrow as pa
-
-    return table.flatten() if any(map(pa.types.is_struct, table.schema.types)) else table
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    """Whether values of a type can be read as texts: neither bytes nor structures."""
-    import pyarrow as pa
-
-    return not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind) or pa.types.is_struct(kind))
 
 
 def _texts(column: pa.ChunkedArray) -> Iterable[str]:

@@ -197,13 +197,6 @@ class Extent(NamedTuple):
     low: Floats
     high: Floats
 
-    @classmethod
-    def of_none(cls) -> Extent:
-        """That of no rows."""
-        none = np.empty(0, np.int64)
-        counts = (none, none)
-        return cls(counts, (none.astype(np.uint32), none), False, np.full(2, np.inf), np.full(2, -np.inf))
-
     def joined(self, other: Extent) -> Extent:
         """That of the rows of both."""
         return Extent(

@@ -19,7 +19,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import unreadable
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.decompression import opened
-from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID
+from mcaptrack.sources.ingest.labels.table import NO_CLASS, NO_ID, refuse
 
 #: Line numbers and lines, without empty lines and comments.
 Lines = Iterator[tuple[int, str]]
@@ -31,7 +31,7 @@ _UTF16: Final = (BOM_UTF16_LE, BOM_UTF16_BE)
 #: The number of characters of a line that errors show.
 _LINE_SHOWN: Final = 60
 #: The number of class names of a file, at most: there are data sets with 21,841 classes.
-_MAX_NAMES: Final = 65_536
+MAX_NAMES: Final = 65_536
 MAX_NAME: Final = 256
 
 
@@ -148,8 +148,8 @@ class ClassNames:
         name = " ".join(name.split())[:MAX_NAME]
         if not name:
             return NO_CLASS
-        if name not in self._numbers and len(self._numbers) == _MAX_NAMES:
-            raise ValueError(f"the column of classes has more than {_MAX_NAMES:,} names")
+        if name not in self._numbers and len(self._numbers) == MAX_NAMES:
+            raise ValueError(f"the column of classes has more than {MAX_NAMES:,} names")
         return self._numbers.setdefault(name, len(self._numbers))
 
 
@@ -231,10 +231,7 @@ def headings(quaternions: Floats, path: Path, at: Callable[[int], str]) -> tuple
     Raises McaptrackError if they are no rotations, or if z of most boxes isn't up.
     """
     length = np.linalg.norm(quaternions, axis=1)
-    wrong = ~(np.abs(length - 1) < 0.1)
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise McaptrackError(f"{at(row)}: a quaternion of length {length[row]:g} is no rotation")
+    refuse(at, ~(np.abs(length - 1) < 0.1), lambda row: f"a quaternion of length {length[row]:g} is no rotation")
     w, x, y, z = (quaternions / length[:, None]).T
     tilt = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
     if len(tilt) and np.median(tilt) > np.pi / 4:

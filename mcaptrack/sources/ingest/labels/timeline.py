@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Final, NamedTuple, Self, get_args
 
 import numpy as np
@@ -351,7 +351,7 @@ def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera
     is named.
     """
     prefix = "/" + camera.strip("/")
-    for at in (prefix, *_above(prefix)):
+    for at in (prefix, *map(str, list(PurePosixPath(prefix).parents)[:-1])):
         if at in topics:
             return CameraTopics(camera_prefix(at) if at == prefix else prefix, at)
         fitting = sorted(topic for topic in topics if camera_prefix(topic) == at)
@@ -373,12 +373,6 @@ def choose_camera(where: object, camera: str, topics: Collection[str]) -> Camera
         )
     (topic,) = topics
     return CameraTopics(camera_prefix(topic), topic)
-
-
-def _above(prefix: str) -> Iterator[str]:
-    while "/" in prefix[1:]:
-        prefix = prefix.rpartition("/")[0]
-        yield prefix
 
 
 def camera_prefix(topic: str) -> str:

@@ -23,7 +23,7 @@ from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import warn
-from mcaptrack.sources.calibrations import calibration_of
+from mcaptrack.sources.calibrations import SHAPE, calibration_of
 from mcaptrack.sources.ingest.plain_yaml import UnsupportedYamlError, XmlReader, load
 
 #: Names of values in files of OpenCV, in small letters and without "_", "-" and blanks.
@@ -233,7 +233,8 @@ def _of_kalibr(path: Path, name: str, fields: Mapping[str, Any]) -> CameraFile:
     width, height = sizes if isinstance(sizes, list) and len(sizes) == 2 else (None, None)
     poses = [key for key in ("T_cam_imu", "T_cn_cnm1") if key in fields]
     for key in poses:
-        _rigid(where, key, _matrix(where, key, fields[key], (4, 4)))
+        pose = _matrix(where, key, fields[key], (4, 4))
+        _check_rigid(where, key, pose[:3, :3], pose[3])
     relative = {"T_cam_imu": "the IMU", "T_cn_cnm1": "the camera before it"}
     return CameraFile(
         path, name,
@@ -285,8 +286,8 @@ def _pose(path: Path, fields: Mapping[str, Any]) -> tuple[Floats | None, Floats 
         numbers = _numbers(path, name, value)
         if len(numbers) not in (12, 16):
             raise McaptrackError(f"{path}: {name} has {len(numbers)} numbers; a pose is a matrix of 3 x 4 or 4 x 4")
-        pose = np.vstack([np.reshape(numbers, (-1, 4))[:3], [0, 0, 0, 1.0]])
-        _rigid(path, name, pose)
+        pose = np.reshape(numbers, (-1, 4))
+        _check_rigid(path, name, pose[:3, :3])
         return pose[:3, :3], pose[:3, 3]
     if rvec is None and turn is None and tvec is None:
         return None, None
@@ -307,15 +308,14 @@ def _pose(path: Path, fields: Mapping[str, Any]) -> tuple[Floats | None, Floats 
 
         return np.asarray(cv2.Rodrigues(np.array(numbers))[0], np.float64), translation
     rotation = np.reshape(numbers, (3, 3))
-    _rigid(path, stated[0], np.vstack([np.column_stack([rotation, translation]), [0, 0, 0, 1.0]]))
+    _check_rigid(path, stated[0], rotation)
     return rotation, translation
 
 
-def _rigid(where: object, name: str, pose: Floats) -> None:
-    """Raise McaptrackError unless a matrix (4, 4) is a rotation and a translation."""
-    turn = pose[:3, :3]
+def _check_rigid(where: object, name: str, turn: Floats, last: Sequence[float] | Floats = (0, 0, 0, 1)) -> None:
+    """Raise McaptrackError unless a matrix (3, 3) is a rotation, and the last row (4,) of a pose is as it has to be."""
     is_one = np.abs(turn @ turn.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(turn) > 0
-    if not is_one or np.abs(pose[3] - [0, 0, 0, 1]).max() > 0:
+    if not is_one or np.abs(np.subtract(last, [0, 0, 0, 1])).max() > 0:
         raise McaptrackError(f"{where}: {name} is not a rotation and a translation")
 
 
@@ -430,8 +430,6 @@ def _is_cropped(roi: Any) -> bool:
 _METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 #: Heights of a camera, as numbers, that are taken for metres (up to), centimetres and millimetres (between).
 _IN_M, _IN_CM, _IN_MM = 30.0, (30.0, 1500.0), (3000.0, 30_000.0)
-#: Pictures were resized, not cropped, if their ratio of width to height differs by less than this share.
-_SHAPE: Final = 0.02
 #: A centre that is farther from the middle than this share of the picture's size is named.
 _OFF_CENTRE: Final = 0.2
 #: A centre that is farther away is outside of the picture.
@@ -610,7 +608,7 @@ def _fitted(camera: CameraFile, final: tuple[int, int]) -> tuple[CameraFile, tup
         width, height = camera.size
         across, down = final[0] / width, final[1] / height
         was = f"{camera.path} is for pictures of {width} x {height}, and these are {final[0]} x {final[1]}"
-        if abs(across / down - 1) > _SHAPE:
+        if abs(across / down - 1) > SHAPE:
             raise McaptrackError(f"{was}: they are of another shape, so that they show another part; calibrate these")
         scale = np.array([[across, 0, 0.5 * across - 0.5], [0, down, 0.5 * down - 0.5], [0, 0, 1.0]])
         matrix, projection = scale @ matrix, None if projection is None else scale @ projection
