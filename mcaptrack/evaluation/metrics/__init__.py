@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.evaluation.metrics.matchup import Matchup, RowPairs, SparseTables, distances, metres_to_similarity
-from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.geometry.arrays import Bools, Floats, Indices, taken
 from mcaptrack.geometry.assignment import assign, assign_pairs_by_gain, solve
 
 __all__ = [
@@ -123,8 +123,8 @@ def matches(matchup: Matchup, rules: Rules = "trackeval") -> RowPairs:
     pairs, by_devkit = matchup.pairs, rules == "trackeval"
     near = pairs.similarity >= matchup.threshold - _CLEAR_EPS if by_devkit else pairs.similarity >= matchup.threshold
     memory = _LastTracks(matchup)
-    assigned = matchup.assigned(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
-    return assigned.where(np.lexsort((assigned.frame, assigned.person)))
+    assigned = matchup.assigned(taken(pairs, near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
+    return taken(assigned, np.lexsort((assigned.frame, assigned.person)))
 
 
 def is_switch(pairs: RowPairs) -> NDArray[np.bool_]:
