@@ -94,7 +94,7 @@ def _most_inside(seven: Any) -> list[list[Any]]:
 QUERIES = {("docs/extensions/zones.md", "zone_visits"): _visits, ("docs/zones.md", "zone_counts"): _most_inside}
 TOPICS = {"zones": ("tracks", _of_topic)}
 PROPOSALS = {
-    "extensions/zones/counting.py:make_zones:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
+    "extensions/zones/counting.py:make:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
         "zones", "LOG", "--zones", str(zones_file(Path()))
     ),
     "extensions/zones/counting.py:finished:zones": lambda s: s.says(
