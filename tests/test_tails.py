@@ -313,7 +313,7 @@ def forecast(count: int, steps: int = 3) -> Forecast:
 
 def test_mixtures_by_hand(monkeypatch: pytest.MonkeyPatch):
     """A standing car, a moving bus, a person, and a car whose speed is unknown; steps at 0.75, 1.5 and 2.25 s."""
-    monkeypatch.setattr(vehicle_tails, "_tables", lambda: TABLES)
+    monkeypatch.setattr(vehicle_tails, "tables_in", lambda path: TABLES)
     given = forecast(4)
     names, speed = ["car", "bus", "person", "car"], np.array([0.4, 0.5, 9.0, np.nan])
     made, shapes = vehicle_tails.calibrated("red", given, 0.75, names, speed)
@@ -391,7 +391,7 @@ def axis_m(rows: Rows) -> float:
 def as_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ellipses as predictors make them: otherwise they follow the log, and those of vehicles are mixtures."""
     monkeypatch.setattr(TailCalibration, "of", lambda *_: None)
-    monkeypatch.setattr(vehicle_tails, "_tables", dict)
+    monkeypatch.setattr(vehicle_tails, "tables_in", lambda path: {})
 
 
 @pytest.mark.usefixtures("as_predicted")
