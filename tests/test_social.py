@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.special import expit, softmax
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.geometry.arrays import taken
 from mcaptrack.predictors import NAMES, Forecast, PeopleSeen, make, predict_among, predict_together, social
 from mcaptrack.predictors.weights import SHIPPED, Weights, load
 from mcaptrack.schema import Frame
@@ -207,7 +208,7 @@ class TestSocial:
             others = [j for j in range(6) if j != i]
             views, scores = [], [layer("alone", own)]
             for j in others:
-                one, two = seen.chosen(np.array([i])), seen.chosen(np.array([j]))
+                one, two = taken(seen, np.array([i])), taken(seen, np.array([j]))
                 pair = np.tanh(layer("pair", social.pair_features(one, two, 0.4)[0]))
                 views.append(np.tanh(layer("both", pair) + get["both.own"] @ own))
                 scores.append(layer("attention", views[-1]))

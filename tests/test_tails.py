@@ -11,6 +11,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from mcaptrack.evaluation.metrics.displacement import ellipse_levels
+from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.mixtures import Tails, mass_within, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
@@ -312,7 +313,7 @@ def forecast(count: int, steps: int = 3) -> Forecast:
 
 def test_mixtures_by_hand(monkeypatch: pytest.MonkeyPatch):
     """A standing car, a moving bus, a person, and a car whose speed is unknown; steps at 0.75, 1.5 and 2.25 s."""
-    monkeypatch.setattr(vehicle_tails, "_tables", lambda: TABLES)
+    monkeypatch.setattr(vehicle_tails, "tables_in", lambda path: TABLES)
     given = forecast(4)
     names, speed = ["car", "bus", "person", "car"], np.array([0.4, 0.5, 9.0, np.nan])
     made, shapes = vehicle_tails.calibrated("red", given, 0.75, names, speed)
@@ -390,7 +391,7 @@ def axis_m(rows: Rows) -> float:
 def as_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ellipses as predictors make them: otherwise they follow the log, and those of vehicles are mixtures."""
     monkeypatch.setattr(TailCalibration, "of", lambda *_: None)
-    monkeypatch.setattr(vehicle_tails, "_tables", dict)
+    monkeypatch.setattr(vehicle_tails, "tables_in", lambda path: {})
 
 
 @pytest.mark.usefixtures("as_predicted")
@@ -430,7 +431,7 @@ def held(size: float, count: int) -> tuple[Tails, np.ndarray]:
     scale = size * np.where(rng.random((AHEAD, count)) < 0.3, 5.0, 0.5)
     half = scale * rng.exponential(size=(AHEAD, count))
     step = np.repeat(np.arange(AHEAD), count)
-    counts = level_counts(step, half.ravel(), SHAPE.chosen(step), AHEAD)
+    counts = level_counts(step, half.ravel(), taken(SHAPE, step), AHEAD)
     return Tails(*(part[0] for part in correct(AT_ONE_TIME, counts[None]))), half
 
 
@@ -468,7 +469,7 @@ class TestLevels:
 
     def test_steps_with_errors_of_their_own_are_corrected_more(self):
         step, half = np.repeat(np.arange(AHEAD), 30), np.tile(np.geomspace(0.2, 20, 30), AHEAD)
-        counts = level_counts(step, half, SHAPE.chosen(step), AHEAD) * np.array([[0.0], [0.0], [1.0]])
+        counts = level_counts(step, half, taken(SHAPE, step), AHEAD) * np.array([[0.0], [0.0], [1.0]])
         (found,) = correct(AT_ONE_TIME, counts[None]).narrow_scale
         assert found[2] > found[0] > 0.5
 
@@ -476,7 +477,7 @@ class TestLevels:
         step = np.repeat(np.arange(AHEAD), 200)
         rng = np.random.default_rng(4)
         counts = np.stack([
-            level_counts(step, size * rng.exponential(size=len(step)), SHAPE.chosen(step), AHEAD) for size in (0.3, 2)
+            level_counts(step, size * rng.exponential(size=len(step)), taken(SHAPE, step), AHEAD) for size in (0.3, 2)
         ])  # fmt: skip
         together = correct(Tails(*(np.tile(part, (2, 1)) for part in SHAPE)), counts)
         for number, one in enumerate(counts):

@@ -100,7 +100,7 @@ def main() -> None:
     given = parser.parse_args()
     if not given.check:  # forecasts without the tables that are made
         shipped.TABLES.write_text('{"predictors": {}}')
-        shipped._tables.cache_clear()
+        shipped.tables_in.cache_clear()
     parts: dict[tuple[str, str, str], list] = {}
     first = given.seed + 1000 * given.check
     for seed in range(first, first + given.scenes):

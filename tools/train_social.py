@@ -28,6 +28,7 @@ from torch import nn
 
 from mcaptrack import __version__
 from mcaptrack.extensions.training.windows import ar1
+from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import social
 from mcaptrack.predictors.forecast import PeopleSeen
@@ -141,12 +142,12 @@ def examples(seed: int) -> dict[str, np.ndarray]:
     network = blank()
     everyone = network.see(people.xy_m, people.valid)
     track, other = social.pairs_of(people, everyone.xy_m[:, -1])
-    tracks = everyone.chosen(row)
+    tracks = taken(everyone, row)
     slot = np.arange(len(track)) - np.searchsorted(track, track)
     count = len(row)
     pairs, differ = np.zeros((count, K, social.PAIR_FEATURES)), np.zeros((count, K, STEPS, 2))
     is_there = np.zeros((count, K), bool)
-    one, two = tracks.chosen(track), everyone.chosen(other)
+    one, two = taken(tracks, track), taken(everyone, other)
     pairs[track, slot], is_there[track, slot] = social.pair_features(one, two, STEP_S), True
     differ[track, slot] = (two.mean - two.xy_m[:, -1:]) - (one.mean - one.xy_m[:, -1:])
     now = tracks.xy_m[:, -1:]

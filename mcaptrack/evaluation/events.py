@@ -38,6 +38,7 @@ from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
 from mcaptrack.schema import COUNTS, EVENTS, TRACKS, EventKind, Frame, Rows
 from mcaptrack.schema.framing import frame_numbers, frame_times, joined_parts, split_rows
+from mcaptrack.schema.resampling import interval_ns
 
 
 @dataclass(frozen=True)
@@ -115,11 +116,6 @@ def event_rows(kind: EventKind, places: Rows, **columns: Ints | Floats) -> Rows:
     return out
 
 
-def frame_interval_ns(t_ns: Ints) -> int:
-    """The usual time between two frames: the median."""
-    return int(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0
-
-
 def unobserved_s(frame_ns: Ints, last_ns: Ints, next_ns: Ints) -> Floats:
     """Seconds from the first frame after ``last_ns`` to ``next_ns`` (R,): 0 for consecutive frames."""
     after = np.minimum(np.searchsorted(frame_ns, last_ns, "right"), max(len(frame_ns) - 1, 0))
@@ -152,7 +148,7 @@ class TrackLifecycle:
         until = self.row_ns[self._last]
         kept = until < (self.frame_ns[-1] if len(self.frame_ns) else 0)
         ends, until, since = self.rows[self._last][kept], until[kept], self.row_ns[self._first][kept]
-        lasted = (until - since + frame_interval_ns(self.frame_ns)) / NS_PER_S
+        lasted = (until - since + int(interval_ns(self.frame_ns))) / NS_PER_S
         size = self._size[kept]
         return until, event_rows(EventKind.END, ends, track_id=ends["track_id"], duration_s=lasted, frames=size)
 
@@ -286,7 +282,7 @@ def find_events(
         split_rows(t_ns, numbers, counts, np.arange(1, len(t_ns) + 1)),
         rule,
         notes,
-        frame_interval_ns(compared_ns) / NS_PER_S,
+        int(interval_ns(compared_ns)) / NS_PER_S,
     )
 
 
@@ -371,7 +367,7 @@ def _unmatched(comparison: _Comparison, kind: Literal[EventKind.MISS, EventKind.
     rows, slot = side.rows[unmatched], side.track[unmatched]
     order = np.lexsort((at, slot))
     rows, slot, at = rows[order], slot[order], at[order]
-    t_ns, interval = frame_ns[at], frame_interval_ns(frame_ns)
+    t_ns, interval = frame_ns[at], int(interval_ns(frame_ns))
     pause = max(seconds_to_ns(MAX_PAUSE_S), round(1.5 * interval))
     start = np.flatnonzero(run_starts(slot, times=t_ns, max_gap=pause))
     end = np.append(start[1:], len(slot)) if len(start) else start

@@ -73,7 +73,7 @@ _BLOCK: Final = 64
 
 
 _ALIGN: Final = 8
-_ROS_BATCHES_U4: Final = struct.Struct("<I")
+_U4: Final = struct.Struct("<I")
 #: Types of protobuf with a fixed width: that width.
 _FIXED: Final = {"DOUBLE": 8, "FIXED64": 8, "SFIXED64": 8, "FLOAT": 4, "FIXED32": 4, "SFIXED32": 4}
 #: Whole numbers of varying width that are part of a shape: their formats in ROS.
@@ -154,7 +154,7 @@ class _Shape:
                     numbers.append((start, length, len(base)))
                 elif length:
                     copies[_ALIGN if align == _ALIGN else 1].append((start, len(base), length))
-                base += constant or bytes(_ROS_BATCHES_U4.size if is_number else length)
+                base += constant or bytes(_U4.size if is_number else length)
             whole = np.frombuffer(bytes(base), np.uint8)
             nonzero = np.flatnonzero(whole)
             source, places = _places(copies[_ALIGN], _ALIGN)
@@ -191,7 +191,7 @@ def _steps(fields: Mapping[int, FieldType], data: bytes, low: int, high: int, ma
 
 def _list_steps(field: FieldType, data: bytes, values: Sequence[tuple[int, int, int]], mask: Bytes) -> Iterator[_Step]:
     if field.kind == "MESSAGE":
-        yield _Step(4, _ROS_BATCHES_U4.pack(len(values)))
+        yield _Step(4, _U4.pack(len(values)))
         for _, start, end in values:
             yield from _steps(field.fields, data, start, end, mask)
         return
@@ -199,7 +199,7 @@ def _list_steps(field: FieldType, data: bytes, values: Sequence[tuple[int, int, 
     if not width or len(values) > 1 or any(wire != 2 for wire, *_ in values):
         raise UnusualMessage
     start, end = values[0][1:] if values else (0, 0)
-    yield _Step(4, _ROS_BATCHES_U4.pack((end - start) // width))
+    yield _Step(4, _U4.pack((end - start) // width))
     if end > start:
         mask[start:end] = 0
         yield _Step(width, b"", start, end - start)
@@ -217,7 +217,7 @@ def _field_steps(field: FieldType, data: bytes, start: int, end: int, mask: Byte
     elif field.kind == "MESSAGE":
         yield from _steps(field.fields, data, start, end, mask)
     elif field.kind in ("STRING", "BYTES"):
-        yield _Step(4, _ROS_BATCHES_U4.pack(end - start + (field.kind == "STRING")))
+        yield _Step(4, _U4.pack(end - start + (field.kind == "STRING")))
         mask[start:end] = 0
         yield _Step(1, b"", start, end - start)
         yield _Step(1, b"\0" if field.kind == "STRING" else b"")
@@ -332,9 +332,9 @@ class Batches:
             at += -at % _ALIGN
             begin, index = at, first
             for number, field in self._fields.items():
-                at += -at % _ROS_BATCHES_U4.size
+                at += -at % _U4.size
                 place, since = at, index
-                at += _ROS_BATCHES_U4.size if field.is_list else 0
+                at += _U4.size if field.is_list else 0
                 while index < last and parts[index][0] == number:
                     shape, phase = shapes[index], at % _ALIGN
                     key = (id(shape), phase)
@@ -347,14 +347,14 @@ class Batches:
                 if field.is_list:
                     counts.append((place, index - since))
                 elif index == since:
-                    at += 2 * _ROS_BATCHES_U4.size
+                    at += 2 * _U4.size
                 elif index > since + 1:
                     raise UnusualMessage
             ends.append((begin, at))
         out = np.zeros(at + -at % _ALIGN, np.uint8)
         places = np.array([place for place, _ in counts], np.intp)
-        out[places[:, None] + np.arange(_ROS_BATCHES_U4.size)] = (
-            np.array([count for _, count in counts], "<u4").view(np.uint8).reshape(-1, _ROS_BATCHES_U4.size)
+        out[places[:, None] + np.arange(_U4.size)] = (
+            np.array([count for _, count in counts], "<u4").view(np.uint8).reshape(-1, _U4.size)
         )
         for shape, phase, starts, targets in groups.values():
             self._fill(out, raw, shape.layout(phase), np.array(starts, np.intp), np.array(targets, np.intp))
@@ -376,12 +376,11 @@ class Batches:
             numbers = (digits << (7 * np.arange(length))).sum(axis=1)
             if number % 2 == 0 and len(numbers):  # seconds come before nanoseconds
                 self._check_seconds(int(numbers.max()))
-            out[targets[:, None] + np.arange(place, place + _ROS_BATCHES_U4.size)] = (
-                numbers.astype("<u4").view(np.uint8).reshape(-1, _ROS_BATCHES_U4.size)
+            out[targets[:, None] + np.arange(place, place + _U4.size)] = (
+                numbers.astype("<u4").view(np.uint8).reshape(-1, _U4.size)
             )
 
 
-_U4: Final = struct.Struct("<I")
 _TIME: Final = struct.Struct("<iI")
 _PADDING: Final = bytes(8)
 

@@ -74,10 +74,6 @@ class Cuboids(NamedTuple):
     size_m: Floats
     heading_rad: Floats
 
-    def chosen(self, which: NDArray[Any]) -> Cuboids:
-        """Some of the boxes."""
-        return Cuboids(*(values[which] for values in self))
-
     def base_m(self) -> Floats:
         """The heights (N,) of the bottoms."""
         return np.asarray(self.centre_m[:, 2] - self.size_m[:, 2] / 2, np.float64)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Image", "Indices", "Ints"]
+__all__ = ["Bools", "Floats", "Image", "Indices", "Ints", "joined", "taken"]
 
 #: Measured values: coordinates, scores, seconds.
 Floats = NDArray[np.float64]

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Floats
 
 #: Halvings of the interval in which a quantile lies: to the precision of 64-bit numbers.
 _HALVINGS: Final = 60
@@ -42,10 +42,6 @@ class Tails(NamedTuple):
         is_normal = ~(is_known & np.isfinite(self.narrow_scale) & np.isfinite(self.wide_scale))
         weight = np.where(is_normal, 0.0, self.wide_weight)
         return Tails(weight, np.where(is_normal, 1.0, self.narrow_scale), np.where(is_normal, 1.0, self.wide_scale))
-
-    def chosen(self, which: Ints | Bools) -> Tails:
-        """Some of the mixtures."""
-        return Tails(self.wide_weight[which], self.narrow_scale[which], self.wide_scale[which])
 
 
 def normal_tails(shape: int | tuple[int, ...]) -> Tails:

@@ -16,45 +16,19 @@ from mcaptrack.predictors.red import Red
 
 
 @dataclass(frozen=True)
-class Blend:
+class Blend(Red):
     """The mean of what ``red`` and constant velocity predict, with the covariance of ``red``.
 
     ``red`` is better where positions are noisy, constant velocity where people walk straight on; their mean is no worse
     than constant velocity in either (docs/predictors.md has the figures).
-
-    Attributes
-    ----------
-    red : Red
-        The network, which also says how many steps there are and how long they are.
 
     References
     ----------
     J. M. Bates and C. W. J. Granger, "The combination of forecasts", Operational Research Quarterly, 1969.
     """
 
-    red: Red
-
     name: ClassVar[str] = "blend"
-
-    @property
-    def past(self) -> int:
-        """Number of past positions that are used, L."""
-        return self.red.past
-
-    @property
-    def steps(self) -> int:
-        """Number of future steps, T."""
-        return self.red.steps
-
-    @property
-    def step_s(self) -> float:
-        """Length of a step in seconds."""
-        return self.red.step_s
-
-    @property
-    def weights_sha256(self) -> str:
-        """The digest of the network's weights."""
-        return self.red.weights_sha256
+    network: ClassVar[str] = Red.name
 
     @cached_property
     def _constant_velocity(self) -> LinearPredictor:
@@ -62,5 +36,5 @@ class Blend:
 
     def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
         """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
-        network, straight = self.red.predict(xy_m, valid), self._constant_velocity.predict(xy_m, valid)
+        network, straight = super().predict(xy_m, valid), self._constant_velocity.predict(xy_m, valid)
         return network._replace(mean=(network.mean + straight.mean) / 2)

@@ -44,8 +44,9 @@ def red(steps: int, step_s: float, file: Path | None = None) -> Red:
 def blend(steps: int, step_s: float, file: Path | None = None) -> Blend:
     """The mean of ``red`` and ``cv``, with the weights of a file or those that come with mcaptrack."""
     from mcaptrack.predictors.blend import Blend
+    from mcaptrack.predictors.weights import SHIPPED, load
 
-    return Blend(red(steps, step_s, file))
+    return Blend.of(load(file or SHIPPED / "red.safetensors"))
 
 
 def social(steps: int, step_s: float, file: Path | None = None) -> Social:

@@ -21,7 +21,7 @@ from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.histories import last_positions
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.predictors.forecast import Forecast, PeopleSeen
@@ -55,9 +55,6 @@ class Seen(NamedTuple):
     gate: Floats
     spread: Floats
     state: Floats
-
-    def chosen(self, rows: Ints) -> Seen:
-        return Seen(*(part[rows] for part in self))  # type: ignore[arg-type]
 
 
 def pairs_of(people: PeopleSeen, now: Floats) -> tuple[Ints, Ints]:
@@ -210,8 +207,8 @@ class Social(Network):
         attend, attend_bias, alone, alone_bias, dense, dense_bias, head, head_bias = others
         everyone = self.see(people.xy_m, people.valid)
         track, other = pairs_of(people, everyone.xy_m[:, -1])
-        tracks = everyone.chosen(people.row)
-        viewer, two = tracks.chosen(track), everyone.chosen(other)
+        tracks = taken(everyone, people.row)
+        viewer, two = taken(tracks, track), taken(everyone, other)
         ego = np.tanh(np.concatenate([own_features(tracks), tracks.state], axis=1) @ own + own_bias)
         seen = np.tanh(pair_features(viewer, two, self.step_s) @ pair + pair_bias)
         seen = np.tanh(seen @ both + both_bias + (ego @ of_own)[track])
@@ -221,9 +218,9 @@ class Social(Network):
         pool = _summed(share[:, :1] * seen, track, len(ego))
         total = _summed(seen / (1 + np.exp(-score[:, :1])), track, len(ego))
         late = np.linspace(0.0, 1.0, self.steps)
-        taken = (1 - late) * share[:, 1:2] + late * share[:, 2:3]  # (P, T)
+        followed = (1 - late) * share[:, 1:2] + late * share[:, 2:3]  # (P, T)
         differ = (two.mean - two.xy_m[:, -1:]) - (viewer.mean - viewer.xy_m[:, -1:])
-        mean = tracks.mean + _summed(taken[..., None] * differ, track, len(ego))
+        mean = tracks.mean + _summed(followed[..., None] * differ, track, len(ego))
         hidden = np.tanh(np.concatenate([ego, pool, total], axis=1) @ dense + dense_bias)
         outputs = (hidden @ head + head_bias).reshape(len(ego), self.steps, OUTPUTS)
         gate = tracks.gate[:, None]

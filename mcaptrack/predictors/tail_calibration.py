@@ -145,15 +145,16 @@ class TailTable(NamedTuple):
         return TailTable(ahead_s, weight, *scales)
 
 
-@lru_cache(maxsize=1)
-def _tables() -> Mapping[str, Any]:
-    tables: Mapping[str, Any] = json.loads(TABLES.read_text(encoding="utf-8"))["predictors"]
+@lru_cache(maxsize=2)
+def tables_in(path: Path) -> Mapping[str, Any]:
+    """The tables of a file, by the names of predictors."""
+    tables: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))["predictors"]
     return tables
 
 
 def table_of(name: str) -> TailTable | None:
     """The table of a predictor by name; None for those of other packages, and for networks with other weights."""
-    table = _tables().get(name)
+    table = tables_in(TABLES).get(name)
     return None if table is None else TailTable(**{key: np.array(table[key], np.float64) for key in TailTable._fields})
 
 

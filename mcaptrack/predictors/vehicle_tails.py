@@ -10,17 +10,16 @@ Letters: N forecasts, T future steps.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.mixtures import Tails, normal_tails
 from mcaptrack.predictors.forecast import Forecast
+from mcaptrack.predictors.tail_calibration import tables_in
 
 TABLES: Final = Path(__file__).parent / "trained" / "vehicle_tails.json"
 #: The table of each class of vehicles, by its name among the limits of motion.
@@ -54,7 +53,7 @@ def calibrated(
         With the covariances of the mixtures, and their shapes (N, T), NaN for normal distributions; None if there is no
         table.
     """
-    tables = _tables().get(predictor)
+    tables = tables_in(TABLES).get(predictor)
     if tables is None:
         return forecast, None
     count, steps = forecast.mean.shape[:2]
@@ -83,9 +82,3 @@ def _at(table: Mapping[str, Sequence[float]], ahead_s: Floats) -> tuple[Floats, 
         np.exp(np.interp(ahead_s, table["ahead_s"], np.log(table[name]))) for name in ("narrow_scale", "wide_scale")
     )
     return weight, narrow, wide
-
-
-@lru_cache(maxsize=1)
-def _tables() -> Mapping[str, Any]:
-    tables: Mapping[str, Any] = json.loads(TABLES.read_text(encoding="utf-8"))["predictors"]
-    return tables

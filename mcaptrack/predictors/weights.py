@@ -58,10 +58,11 @@ class Weights:
 
 @dataclass(frozen=True)
 class Network:
-    """A trained network that runs in NumPy."""
+    """A trained network that runs in NumPy. ``network`` is that which its weights are of, if it isn't ``name``."""
 
     weights: Weights
     name: ClassVar[str]
+    network: ClassVar[str] = ""
 
     @classmethod
     def of(cls, weights: Weights) -> Self:
@@ -77,11 +78,11 @@ class Network:
 
     @property
     def steps(self) -> int:
-        return self.weights.clock(self.name)[0]
+        return self.weights.clock(self.network or self.name)[0]
 
     @property
     def step_s(self) -> float:
-        return self.weights.clock(self.name)[1]
+        return self.weights.clock(self.network or self.name)[1]
 
     @property
     def weights_sha256(self) -> str:

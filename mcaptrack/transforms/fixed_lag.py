@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints, joined, taken
 from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.neighbours import Pairing
@@ -87,8 +87,9 @@ def _log_density(off: Floats, cov: Floats) -> Floats:
 
 
 class Measured(NamedTuple):
-    """Detections (N,) of one frame: rows as in the tables of the tracker ``ground`` (rows, N), positions (N, 2),
-    covariances (N, 2, 2) with the noise of their class, scores (N,) with 0.5 where none is known, and classes (N,).
+    """Detections (N,) of one frame: columns as the rows in the tables of the tracker ``ground`` (N, rows), positions
+    (N, 2), covariances (N, 2, 2) with the noise of their class, scores (N,) with 0.5 where none is known, and classes
+    (N,).
     """
 
     rows: Floats
@@ -96,6 +97,26 @@ class Measured(NamedTuple):
     noise: Floats
     score: Floats
     class_id: Ints
+
+
+class _Open(NamedTuple):
+    """Detections (N,) that are open or may still be continued: their frame, the detections before and after in their
+    track, their number in the recording and that of the first one of their track; limits of motion; and of each with
+    all before it: log odds, sum of scores, and highest score (N, 3), and its state.
+    """
+
+    seen: Measured
+    frame: Ints
+    time_s: Floats
+    prev: Ints
+    next: Ints
+    serial: Ints
+    root: Ints
+    drift: Floats
+    speed: Floats
+    reach: Floats
+    worth: Floats
+    ahead: _States
 
 
 class Written(NamedTuple):
@@ -125,8 +146,8 @@ class FixedLag:
         Whether a track may continue with a detection of another class.
     limits : mapping of int to MotionLimits
         Limits of motion by class; it may grow.
-    rows : pair of slice
-        The rows of positions and of velocities in tables of detections.
+    rows : int and two slices
+        How many rows tables of detections have, and those of positions and of velocities.
     """
 
     def __init__(
@@ -137,33 +158,21 @@ class FixedLag:
         birth_score: float,
         across_classes: bool,
         limits: Mapping[int, MotionLimits],
-        rows: tuple[slice, slice],
+        rows: tuple[int, slice, slice],
     ) -> None:
         self._delay_s, self._gap_s, self._across_classes = delay_s, gap_s, across_classes
         self._confirm_score, self._birth_score = confirm_score, birth_score
-        self._limits, (self._place, self._velocity) = limits, rows
+        self._limits, (columns, self._place, self._velocity) = limits, rows
         self._frames: list[Frame] = []
         self._now = -1
         self._t_s = 0.0
         self._ids: dict[int, int] = {}
         self._serials = 0
-        self._seen: Measured | None = None
-
-    def _begin(self, seen: Measured) -> None:
-        """Take what the first frame has for the shape of all tables."""
-        none = np.empty(0, np.int64)
-        self._seen = Measured(seen.rows[:, :0], np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0), none)
-        self._frame, self._prev, self._next, self._serial, self._root = none, none, none, none, none
-        self._time_s = np.empty(0)
-        self._drift, self._speed, self._reach = np.empty((3, 0))
-        #: Of each detection with all before it in its track: log odds, sum of scores, and highest score.
-        self._worth = np.empty((0, 3))
-        self._ahead = _States.of(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+        none, nowhere, unknown = np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2))
+        self._open = self._begun(Measured(np.empty((0, columns)), nowhere, unknown, np.empty(0), none))
 
     def add(self, frame: Frame, seen: Measured) -> list[Written]:
         """Add a frame; returns the frames that are decided by now."""
-        if self._seen is None:
-            self._begin(seen)
         self._append(frame, seen)
         first = self._now - len(self._frames) + 1
         step = max(1, len(self._frames) // _STEPS)
@@ -182,62 +191,66 @@ class FixedLag:
         return [self._release() for _ in range(len(self._frames))]
 
     def _append(self, frame: Frame, seen: Measured) -> None:
-        assert self._seen is not None
-        count = len(seen.score)
         self._now += 1
         self._t_s = frame.t_ns / NS_PER_S
         self._frames.append(frame)
-        self._seen = Measured(*(np.concatenate([a, b], axis=-1 if a is self._seen.rows else 0)
-                            for a, b in zip(self._seen, seen, strict=True)))  # fmt: skip
-        self._frame = np.append(self._frame, np.full(count, self._now))
-        self._time_s = np.append(self._time_s, np.full(count, self._t_s))
-        self._prev, self._next = (np.append(links, np.full(count, -1)) for links in (self._prev, self._next))
-        self._serial = np.append(self._serial, self._serials + np.arange(count))
-        self._root = np.append(self._root, self._serials + np.arange(count))
-        self._serials += count
+        begun = self._begun(seen)
+        self._open = joined([self._open, begun])
+        self._serials += len(begun.frame)
+        self._filter(np.arange(len(self._open.frame) - len(begun.frame), len(self._open.frame)))
+
+    def _begun(self, seen: Measured) -> _Open:
+        """Detections of the frame that was added last, each a track of its own."""
+        count = len(seen.score)
         motion = [self._limits[number] for number in seen.class_id.tolist()]
-        self._drift = np.append(self._drift, [limit.drift_m_per_s for limit in motion])
-        self._speed = np.append(self._speed, [limit.speed_m_per_s for limit in motion])
-        self._reach = np.append(self._reach, [limit.gate_m for limit in motion])
-        new = np.arange(len(self._frame) - count, len(self._frame))
-        begun = _States.of(seen.xy_m, seen.noise, self._speed[new])
-        self._ahead = _States(*(np.concatenate(pair) for pair in zip(self._ahead, begun, strict=True)))
-        self._worth = np.concatenate([self._worth, np.zeros((count, 3))])
-        self._filter(new)
+        limits = [(limit.drift_m_per_s, limit.speed_m_per_s, limit.gate_m) for limit in motion]
+        drift, speed, reach = np.array(limits, float).reshape(count, 3).T
+        return _Open(
+            seen,
+            np.full(count, self._now),
+            np.full(count, self._t_s),
+            np.full(count, -1),
+            np.full(count, -1),
+            self._serials + np.arange(count),
+            self._serials + np.arange(count),
+            drift,
+            speed,
+            reach,
+            np.zeros((count, 3)),
+            _States.of(seen.xy_m, seen.noise, speed),
+        )
 
     def _filter(self, which: Indices) -> None:
         """Filter detections of one frame forwards, those before them being done."""
-        seen = self._seen
-        assert seen is not None
+        held, seen = self._open, self._open.seen
         share = np.clip(seen.score[which], _LEAST_SCORE, 1 - _LEAST_SCORE)
         own = np.stack([np.log(share / (1 - share)) + _DETECTED, seen.score[which], seen.score[which]], axis=1)
-        states = _States.of(seen.xy_m[which], seen.noise[which], self._speed[which])
-        goes_on = self._prev[which] >= 0
+        states = _States.of(seen.xy_m[which], seen.noise[which], held.speed[which])
+        goes_on = held.prev[which] >= 0
         own[~goes_on, 0] += _BEGINS_AND_ENDS
-        now, before = which[goes_on], self._prev[which[goes_on]]
-        predicted = self._ahead.after(before, self._time_s[now] - self._time_s[before], self._drift)
+        now, before = which[goes_on], held.prev[which[goes_on]]
+        predicted = held.ahead.after(before, held.time_s[now] - held.time_s[before], held.drift)
         corrected, likely = predicted.corrected(seen.xy_m[now], seen.noise[now])
         states.put(goes_on.nonzero()[0], corrected)
         own[goes_on, 0] += likely + self._missed(before, now)
-        own[goes_on, :2] += self._worth[before, :2]
-        own[goes_on, 2] = np.maximum(own[goes_on, 2], self._worth[before, 2])
-        self._root[which] = self._serial[which]
-        self._root[now] = self._root[before]
-        self._ahead.put(which, states)
-        self._worth[which] = own
+        own[goes_on, :2] += held.worth[before, :2]
+        own[goes_on, 2] = np.maximum(own[goes_on, 2], held.worth[before, 2])
+        held.root[which] = held.serial[which]
+        held.root[now] = held.root[before]
+        held.ahead.put(which, states)
+        held.worth[which] = own
 
     def _missed(self, before: Indices, after: Indices) -> Floats:
-        return np.asarray((self._frame[after] - self._frame[before] - 1) * np.log(1 - _SEEN))
+        return np.asarray((self._open.frame[after] - self._open.frame[before] - 1) * np.log(1 - _SEEN))
 
     def _backwards(self, low: int) -> _States:
         """Filter backwards: the states of each detection from frame ``low`` on, of it and what follows."""
-        seen = self._seen
-        assert seen is not None
-        states = _States.of(seen.xy_m, seen.noise, np.full(len(self._frame), _ANY_SPEED))
+        held, seen = self._open, self._open.seen
+        states = _States.of(seen.xy_m, seen.noise, np.full(len(held.frame), _ANY_SPEED))
         for number in range(self._now - 1, low - 1, -1):
-            now = np.flatnonzero((self._frame == number) & (self._next >= 0))
-            after = self._next[now]
-            predicted = states.after(after, self._time_s[now] - self._time_s[after], self._drift)
+            now = np.flatnonzero((held.frame == number) & (held.next >= 0))
+            after = held.next[now]
+            predicted = states.after(after, held.time_s[now] - held.time_s[after], held.drift)
             states.put(now, predicted.corrected(seen.xy_m[now], seen.noise[now])[0])
         return states
 
@@ -248,58 +261,55 @@ class FixedLag:
         behind = self._backwards(cuts[0])
         for cut in cuts:
             self._cut(cut, behind)
-            now = np.flatnonzero(self._frame == cut)
-            self._filter(now)
+            self._filter(np.flatnonzero(self._open.frame == cut))
 
     def _cut(self, cut: int, behind: _States) -> None:
         """Assign what comes after a cut to what was before it."""
-        seen = self._seen
-        assert seen is not None
-        is_before = self._frame < cut
-        first = np.flatnonzero(is_before & ((self._next < 0) | ~is_before[self._next]))
-        second = np.flatnonzero(~is_before & ((self._prev < 0) | is_before[self._prev]))
+        held, seen = self._open, self._open.seen
+        is_before = held.frame < cut
+        first = np.flatnonzero(is_before & ((held.next < 0) | ~is_before[held.next]))
+        second = np.flatnonzero(~is_before & ((held.prev < 0) | is_before[held.prev]))
         if not len(first) or not len(second):
             return
-        wait_s = self._time_s[second].max() - self._time_s[first]
-        pairs = Pairing(seen.xy_m[first].T, seen.xy_m[second].T, self._reach[first] + 2 * self._speed[first] * wait_s)
-        dt = pairs.of_second(self._time_s[second]) - pairs.of_first(self._time_s[first])
+        wait_s = held.time_s[second].max() - held.time_s[first]
+        pairs = Pairing(seen.xy_m[first].T, seen.xy_m[second].T, held.reach[first] + 2 * held.speed[first] * wait_s)
+        dt = pairs.of_second(held.time_s[second]) - pairs.of_first(held.time_s[first])
         x, y = (
             pairs.of_second(seen.xy_m[second].T[axis]) - pairs.of_first(seen.xy_m[first].T[axis]) for axis in (0, 1)
         )
-        near_m = pairs.of_first(self._reach[first]) + 2 * pairs.of_first(self._speed[first]) * dt
+        near_m = pairs.of_first(held.reach[first]) + 2 * pairs.of_first(held.speed[first]) * dt
         allowed = (dt <= self._gap_s) & (x * x + y * y <= near_m * near_m)
         if not self._across_classes:
             allowed &= pairs.of_first(seen.class_id[first]) == pairs.of_second(seen.class_id[second])
         i, j = pairs.chosen(allowed)
         before, after = first[i], second[j]
-        self._next[first], self._prev[second] = -1, -1
+        held.next[first], held.prev[second] = -1, -1
         if not len(i):
             return
-        predicted = self._ahead.after(before, self._time_s[after] - self._time_s[before], self._drift)
+        predicted = held.ahead.after(before, held.time_s[after] - held.time_s[before], held.drift)
         fits = _log_density(predicted.mean - behind.mean[after], predicted.cov + behind.cov[after])
         prior = np.zeros((len(after), 2, 2))
-        prior[:, 0, 0] = prior[:, 1, 1] = self._speed[after] ** 2
+        prior[:, 0, 0] = prior[:, 1, 1] = held.speed[after] ** 2
         apart = _log_density(behind.mean[after, 2:], behind.cov[after, 2:, 2:] + prior)
         gain = fits - apart + self._missed(before, after) - _BEGINS_AND_ENDS
         good = gain > 0
         if good.any():
             (i, j), _ = max_weight_matching((i[good], j[good]), np.round(gain[good], 6), pairs.shape)
-            self._next[first[i]], self._prev[second[j]] = second[j], first[i]
+            held.next[first[i]], held.prev[second[j]] = second[j], first[i]
 
     def _release(self) -> Written:
         """The first frame that waits, as it is decided."""
-        seen = self._seen
-        assert seen is not None
+        held = self._open
         number, frame = self._now - len(self._frames) + 1, self._frames.pop(0)
-        here = np.flatnonzero(self._frame == number)
-        over = np.flatnonzero((self._frame < number) & (self._next >= 0))
-        over = over[self._frame[self._next[over]] > number]
+        here = np.flatnonzero(held.frame == number)
+        over = np.flatnonzero((held.frame < number) & (held.next >= 0))
+        over = over[held.frame[held.next[over]] > number]
         last = np.concatenate([here, over])
-        while len(ahead := np.flatnonzero(self._next[last] >= 0)):
-            last[ahead] = self._next[last[ahead]]
-        worth = self._worth[last]
+        while len(ahead := np.flatnonzero(held.next[last] >= 0)):
+            last[ahead] = held.next[last[ahead]]
+        worth = held.worth[last]
         sure = (worth[:, 0] > 0) & (worth[:, 1] >= self._confirm_score) & (worth[:, 2] >= self._birth_score)
-        roots = np.concatenate([self._root[here], self._root[over]])
+        roots = np.concatenate([held.root[here], held.root[over]])
         sure |= np.array([root in self._ids for root in roots.tolist()], bool)
         for root in roots[sure].tolist():
             self._ids.setdefault(root, len(self._ids) + 1)
@@ -310,15 +320,15 @@ class FixedLag:
         return Written(frame, rows[:, order], observed[order], track_id[order])
 
     def _rows(self, which: Indices) -> Floats:
-        assert self._seen is not None
-        rows = self._seen.rows[:, which].copy()
-        rows[self._place], rows[self._velocity] = self._ahead.mean[which, :2].T, self._ahead.mean[which, 2:].T
+        rows, mean = self._open.seen.rows[which].T.copy(), self._open.ahead.mean[which].T
+        rows[self._place], rows[self._velocity] = mean[:2], mean[2:]
         return rows
 
     def _between(self, before: Indices, t_s: float) -> Floats:
         """Rows between detections and the next ones of their tracks."""
-        after = self._next[before]
-        share = (t_s - self._time_s[before]) / np.maximum(self._time_s[after] - self._time_s[before], 1e-9)
+        held = self._open
+        after = held.next[before]
+        share = (t_s - held.time_s[before]) / np.maximum(held.time_s[after] - held.time_s[before], 1e-9)
         start, end = self._rows(before), self._rows(after)
         rows = start + 0.0
         for part in (self._place, self._velocity):
@@ -327,20 +337,12 @@ class FixedLag:
 
     def _forget(self) -> None:
         """Forget detections of decided frames that nothing can continue any more."""
-        first = self._now - len(self._frames) + 1
-        is_open = self._frame >= first
-        ends = (self._next < 0) & (self._time_s >= self._t_s - self._gap_s)
-        kept = is_open | ends | ((self._next >= 0) & is_open[self._next])
-        ends_now = ~is_open & ~kept
-        if not ends_now.any():
+        held = self._open
+        is_open = held.frame > self._now - len(self._frames)
+        ends = (held.next < 0) & (held.time_s >= self._t_s - self._gap_s)
+        kept = is_open | ends | ((held.next >= 0) & is_open[held.next])
+        if kept.all():
             return
         new = np.append(np.cumsum(kept) - 1, -1)
-        assert self._seen is not None
-        rows, xy_m, noise, score, class_id = self._seen
-        self._seen = Measured(rows[:, kept], xy_m[kept], noise[kept], score[kept], class_id[kept])
-        self._prev, self._next = (
-            np.where((links >= 0) & kept[links], new[links], -1)[kept] for links in (self._prev, self._next)
-        )
-        for name in ("_frame", "_time_s", "_serial", "_root", "_drift", "_speed", "_reach", "_worth"):
-            setattr(self, name, getattr(self, name)[kept])
-        self._ahead = _States(*(values[kept] for values in self._ahead))
+        before, after = (np.where((links >= 0) & kept[links], new[links], -1) for links in (held.prev, held.next))
+        self._open = taken(held._replace(prev=before, next=after), kept)

@@ -970,7 +970,8 @@ class _Run:
         options = self._options
         gap_s = max(options.max_age_s, options.link_s)
         scores = options.confirm_score, options.birth_score
-        window = FixedLag(options.delay_s, gap_s, *scores, options.across_classes, self._limits, (PLACE, _VELOCITY))
+        rows = DETECTION_ROWS, PLACE, _VELOCITY
+        window = FixedLag(options.delay_s, gap_s, *scores, options.across_classes, self._limits, rows)
         for block in blocks:
             done: list[Written] = []
             for frame, boxes in zip(block, self.detections(block), strict=True):
@@ -984,7 +985,7 @@ class _Run:
         xx, xy, yy = boxes[_COVARIANCE_ROWS]
         noise = np.stack([xx + noise_m**2, xy, xy, yy + noise_m**2], axis=-1).reshape(-1, 2, 2)
         rows = boxes[:DETECTION_ROWS]
-        return Measured(rows, rows[PLACE].T, noise, certainty(boxes), rows[CLASS].astype(np.int64))
+        return Measured(rows.T, rows[PLACE].T, noise, certainty(boxes), rows[CLASS].astype(np.int64))
 
     def warn(self) -> None:
         """Warn of detections without a position in metres."""

@@ -244,10 +244,7 @@ class Stage:
         _check_suffixes(entry, outputs)
         for suffix, schema in outputs.items():
             if schema not in SCHEMAS.values():
-                raise McaptrackError(
-                    f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
-                    "writes = {'': TRACKS, 'debug': DETECTIONS}"
-                )
+                raise _unusual_output(entry, suffix, schema)
             if schema is not wanted.writes.get(suffix, schema):
                 raise McaptrackError(
                     f"{entry} has an output {suffix!r} of {schema.name}; that of a {entry.kind} has "
@@ -277,12 +274,16 @@ def _check_suffixes(entry: Entry, outputs: Mapping[Any, object]) -> None:
     """Raise McaptrackError if an output can't have its name, the last part of its topic."""
     for suffix, schema in outputs.items():
         if not isinstance(suffix, str) or not (not suffix or suffix.isidentifier()):
-            raise McaptrackError(
-                f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
-                "writes = {'': TRACKS, 'debug': DETECTIONS}"
-            )
+            raise _unusual_output(entry, suffix, schema)
         if suffix in RESERVED or suffix in names("finisher"):
             raise McaptrackError(f"{entry} has an output {suffix!r}, which is a name of what is made of results")
+
+
+def _unusual_output(entry: Entry, suffix: object, schema: object) -> McaptrackError:
+    return McaptrackError(
+        f"{entry} has writes with {suffix!r}: {schema!r}; it maps ends of topics to schemas of rows, as in "
+        "writes = {'': TRACKS, 'debug': DETECTIONS}"
+    )
 
 
 def _base(cls: type[Transform]) -> type[Transform]:

@@ -169,12 +169,20 @@ def _with_rows(frames: FrameColumns, rows: Rows, frame_of: Ints) -> FrameColumns
     out = FrameCollector(TRACKS)
     for low, high, joined in joined_parts(TRACKS, frames):
         here = (frame_of >= low) & (frame_of < high)
-        both = TRACKS.joined([joined.rows, rows[here]])
-        of = np.concatenate([joined.frame, frame_of[here] - low])
-        order = np.lexsort((both["track_id"], of))
-        ends = np.searchsorted(of[order], np.arange(high - low + 1))
-        out.extend(joined.t_ns, frames.numbers[low:high], ends, both.take(order))
+        _extend(out, joined, frames.numbers[low:high], rows[here], frame_of[here] - low)
     return out.done()
+
+
+def _extend(out: FrameCollector, joined: JoinedFrames, numbers: Ints, rows: Rows, frame_of: Ints) -> None:
+    """Collect frames with rows (N,) added to frames (N,)."""
+    rows, ends = _in_order(TRACKS.joined([joined.rows, rows]), np.append(joined.frame, frame_of), len(joined.t_ns))
+    out.extend(joined.t_ns, numbers, ends, rows)
+
+
+def _in_order(rows: Rows, frame_of: Ints, frames: int) -> tuple[Rows, Ints]:
+    """Rows in the order of frames and ids, and where those of each frame end."""
+    order = np.lexsort((rows["track_id"], frame_of))
+    return rows.take(order), np.searchsorted(frame_of[order], np.arange(frames + 1))
 
 
 def to_video_rate(tracks: Sequence[Frame], retracks: Sequence[Frame], planes: Planes) -> FrameColumns:
@@ -252,13 +260,11 @@ def _part(
     outside["source_id"], outside["track_id"] = outside["track_id"], ids[~inside]
     to_metres(outside, frame_ns[at[~inside]], planes)
     rows = TRACKS.joined([base, outside])
-    rows_at = np.concatenate([base_at, at[~inside]])
+    rows_at = np.append(base_at, at[~inside])
     track_ids, class_id = classes
     if len(track_ids):  # of the re-tracked track: that of the tracker's box may be another one
         rows["class_id"] = class_id[np.searchsorted(track_ids, rows["track_id"])]
-    order = np.lexsort((rows["track_id"], rows_at))
-    rows, rows_at = rows.take(order), rows_at[order]
-    return rows, np.searchsorted(rows_at, np.arange(len(frame_ns) + 1), "left")
+    return _in_order(rows, rows_at, len(frame_ns))
 
 
 def _have_sizes(frames: Sequence[Frame]) -> bool:
@@ -350,11 +356,7 @@ def _filled(frames: FrameColumns, ids: Ints, gap_ns: int) -> FrameColumns:
         is_new = np.isin(rows["track_id"], ids) & ~np.isin(at * width + rows["track_id"], have)
         new = rows[is_new]
         new["source_id"], new["observed"] = -1, False
-        of = np.concatenate([own.frame, at[is_new] - first])
-        both = np.concatenate([own.rows, new])
-        order = np.lexsort((both["track_id"], of))
-        ends = np.searchsorted(of[order], np.arange(last - first + 1))
-        out.extend(own.t_ns, frames.numbers[first:last], ends, both[order])
+        _extend(out, own, frames.numbers[first:last], new, at[is_new] - first)
     return out.done()
 
 

@@ -30,17 +30,13 @@ def background_picture(pictures: Pictures, is_still: bool = True) -> SceneBackgr
 
     Raises McaptrackError for damaged pictures.
     """
-    import cv2
-
     count = len(pictures.t_ns) if is_still else min(len(pictures.t_ns), 1)
     numbers = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int)).tolist() if count else []
     seen: list[Image] = []
     scale = 1.0
     for frame in pictures.readable(numbers):
-        high, wide = frame.rows.shape[:2]
-        scale = min(1.0, _WIDTH_PX / wide) if not seen else scale
-        size = (max(1, round(wide * scale)), max(1, round(high * scale)))
-        small = np.asarray(cv2.resize(frame.rows, size, interpolation=cv2.INTER_AREA), np.uint8)
+        scale = scale if seen else _scale(frame.rows)
+        small = _shrunk(frame.rows, scale)
         if not seen or small.shape == seen[0].shape:
             seen.append(small)
     if not seen:
@@ -54,13 +50,22 @@ def background_picture(pictures: Pictures, is_still: bool = True) -> SceneBackgr
 
 def moment_picture(pictures: Pictures, t_ns: int) -> SceneBackground | None:
     """The picture that is shown at a time; None if it can't be decoded."""
-    import cv2
-
     at = max(int(np.searchsorted(pictures.t_ns, t_ns, "right")) - 1, 0)
     for frame in pictures.readable([at]):
-        high, wide = frame.rows.shape[:2]
-        scale = min(1.0, _WIDTH_PX / wide)
-        size = (max(1, round(wide * scale)), max(1, round(high * scale)))
-        small = np.asarray(cv2.resize(frame.rows, size, interpolation=cv2.INTER_AREA), np.uint8)
-        return SceneBackground(encode_image(small, "jpeg", _QUALITY), *size, scale)
+        scale = _scale(frame.rows)
+        small = _shrunk(frame.rows, scale)
+        return SceneBackground(encode_image(small, "jpeg", _QUALITY), small.shape[1], small.shape[0], scale)
     return None
+
+
+def _scale(image: Image) -> float:
+    """The factor by which a picture is made smaller."""
+    return float(min(1.0, _WIDTH_PX / image.shape[1]))
+
+
+def _shrunk(image: Image, scale: float) -> Image:
+    import cv2
+
+    high, wide = image.shape[:2]
+    size = (max(1, round(wide * scale)), max(1, round(high * scale)))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.evaluation.metrics.matchup import Matchup, RowPairs, SparseTables, distances, metres_to_similarity
-from mcaptrack.geometry.arrays import Bools, Floats, Indices
+from mcaptrack.geometry.arrays import Bools, Floats, Indices, taken
 from mcaptrack.geometry.assignment import assign, assign_pairs_by_gain, solve
 
 __all__ = [
@@ -56,7 +56,7 @@ ALPHAS: Final = np.arange(0.05, 0.99, 0.05)
 Rules = Literal["trackeval", "motmetrics"]
 Counts = dict[str, float]
 
-_CLEAR_EPS: Final = float(np.finfo(float).eps)
+_EPS: Final = float(np.finfo(float).eps)
 _NO_ID: Final = -1
 
 
@@ -121,10 +121,10 @@ def clear(matchup: Matchup, rules: Rules = "trackeval") -> Counts:
 def matches(matchup: Matchup, rules: Rules = "trackeval") -> RowPairs:
     """The matched pairs of all frames, ordered by person and frame."""
     pairs, by_devkit = matchup.pairs, rules == "trackeval"
-    near = pairs.similarity >= matchup.threshold - _CLEAR_EPS if by_devkit else pairs.similarity >= matchup.threshold
+    near = pairs.similarity >= matchup.threshold - _EPS if by_devkit else pairs.similarity >= matchup.threshold
     memory = _LastTracks(matchup)
-    assigned = matchup.assigned(pairs.where(near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
-    return assigned.where(np.lexsort((assigned.frame, assigned.person)))
+    assigned = matchup.assigned(taken(pairs, near), memory.pairs_trackeval if by_devkit else memory.pairs_motmetrics)
+    return taken(assigned, np.lexsort((assigned.frame, assigned.person)))
 
 
 def is_switch(pairs: RowPairs) -> NDArray[np.bool_]:
@@ -186,13 +186,13 @@ class _LastTracks:
         if matchup.tables.is_large(number):
             rows, columns, similarity = matchup.tables.pairs_of(number)
             score = similarity + 1000.0 * (tracks[columns] == last[people[rows]])
-            score[similarity < matchup.threshold - _CLEAR_EPS] = 0
+            score[similarity < matchup.threshold - _EPS] = 0
             return self._decided(number, *matchup.tables.best(number, score))
         similarity = matchup.tables[number]
         score = similarity + 1000.0 * (tracks[None, :] == last[people][:, None])
-        score[similarity < matchup.threshold - _CLEAR_EPS] = 0
+        score[similarity < matchup.threshold - _EPS] = 0
         rows, columns = solve(-score)
-        kept = score[rows, columns] > _CLEAR_EPS
+        kept = score[rows, columns] > _EPS
         return self._decided(number, rows[kept], columns[kept])
 
     def pairs_motmetrics(self, number: int, easy: RowPairs, low: int, high: int) -> tuple[Indices, Indices]:
@@ -226,9 +226,6 @@ class _LastTracks:
         # One more pair gains more than all similarities together.
         more_rows, more_columns = tables.best(number, np.where(ok, len(people) + 1.0 + similarity, 0.0))
         return np.concatenate([rows[kept], more_rows]), np.concatenate([columns[kept], more_columns])
-
-
-_EPS: Final = float(np.finfo(float).eps)
 
 
 def hota(matchup: Matchup) -> dict[str, NDArray[np.float64]]:

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.assignment import solve
 from mcaptrack.geometry.mixtures import Tails, log_density, mahalanobis_squared, mass_within, normal_tails
 from mcaptrack.geometry.ragged import cross_pairs, find_rows, group_index, ragged_range, run_ends, run_starts
@@ -380,7 +380,7 @@ class Forecasts:
 
     def shapes(self, which: Ints | Bools) -> Tails:
         """The shapes of the distributions of some forecasts."""
-        return normal_tails(self.mean_m[which].shape[:2]) if self.tails is None else self.tails.chosen(which)
+        return normal_tails(self.mean_m[which].shape[:2]) if self.tails is None else taken(self.tails, which)
 
 
 class PairedForecasts(NamedTuple):

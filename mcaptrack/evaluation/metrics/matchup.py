@@ -33,10 +33,6 @@ class RowPairs(NamedTuple):
     track: Indices
     similarity: Floats
 
-    def where(self, kept: NDArray[np.bool_] | Indices) -> RowPairs:
-        """A selection of the pairs."""
-        return taken(self, kept)
-
     def contested(self) -> NDArray[np.bool_]:
         """Whether a pair (P,) shares its row or its column with another pair."""
         contested: NDArray[np.bool_] = (np.bincount(self.row)[self.row] > 1) | (
@@ -231,7 +227,7 @@ class Matchup:
         """
         hard = np.zeros(len(self.ground_truth), bool)
         hard[candidates.frame[candidates.contested()]] = True
-        easy, numbers = candidates.where(~hard[candidates.frame]), hard.nonzero()[0]
+        easy, numbers = taken(candidates, ~hard[candidates.frame]), hard.nonzero()[0]
         ends = np.searchsorted(easy.frame, numbers)
         by_frame: list[tuple[Indices, Indices, Floats]] = []
         low = 0

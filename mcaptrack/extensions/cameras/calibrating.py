@@ -31,7 +31,7 @@ from mcaptrack.extensions.cameras.ground_correction import (
     vote,
 )
 from mcaptrack.foxglove import views
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Floats, Ints, joined, taken
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.notices import warn
@@ -120,17 +120,6 @@ class Refined(NamedTuple):
     limit: str = ""
 
 
-class _Found(NamedTuple):
-    """The best correction of a camera, and how it does at other times."""
-
-    model: str
-    matrix: Floats
-    moved_m: float
-    before: Residual
-    after: Residual
-    limit: str
-
-
 @dataclass
 class Refiner:
     """Corrects cameras one by one, the worst first, by what the others agree on.
@@ -145,19 +134,18 @@ class Refiner:
     trusted: frozenset[str]
     reach: tuple[float, float]  # sigmas and metres up to which boxes of several cameras are one person
     progress: Callable[[int, int], None] = lambda done, total: None
-    maps: dict[str, Floats] = field(default_factory=dict)
+    found: dict[str, Refined] = field(default_factory=dict)
 
     def refine(self) -> list[Refined]:
         """Return what was found about each camera, in order."""
-        self.maps = {camera.name: np.eye(3) for camera in self.cameras}
-        verdicts: dict[str, _Found | str] = {}
+        self.found = {camera.name: _uncorrected(camera, camera.why_held) for camera in self.cameras}
         if self.trusted:
-            self._outwards(verdicts)
+            self._outwards()
         else:
-            self._worst_first(verdicts)
-        return [self._result(camera, verdicts.get(camera.name, "")) for camera in self.cameras]
+            self._worst_first()
+        return list(self.found.values())
 
-    def _outwards(self, verdicts: dict[str, _Found | str]) -> None:
+    def _outwards(self) -> None:
         """Judge the camera with the most pairs against those that are right, count it among them, and so on."""
         settled, left = set(self.trusted), [camera for camera in self.cameras if camera.name not in self.trusted]
         while left:
@@ -165,11 +153,11 @@ class Refiner:
             seen = [self._suspect(camera, places) for camera in left]
             best = int(np.argmax([suspect[2] for suspect in seen]))
             camera = left.pop(best)
-            self._take(camera, self._judge(camera, places, seen[best][1]), verdicts)
+            self.found[camera.name] = self._judge(camera, places, seen[best][1])
             settled.add(camera.name)
             self.progress(len(settled), len(self.cameras))
 
-    def _worst_first(self, verdicts: dict[str, _Found | str]) -> None:
+    def _worst_first(self) -> None:
         """Correct the camera with the most to gain until none gains; later corrections may change earlier ones."""
         names = {camera.name for camera in self.cameras}
         least = min(len(names) - 1, 2)
@@ -185,18 +173,14 @@ class Refiner:
                     places = self._places(camera.name, names, least)
                     seen[camera.name] = places, *self._suspect(camera, places)
             camera = max(left, key=lambda name_of: seen[name_of.name][1])
-            before = self.maps[camera.name]
-            self._take(camera, self._judge(camera, seen[camera.name][0], seen[camera.name][2]), verdicts)
+            before = self.found[camera.name].matrix
+            self.found[camera.name] = self._judge(camera, seen[camera.name][0], seen[camera.name][2])
             turns[camera.name] += 1
-            if _moves(camera, before, self.maps[camera.name]) > _SAME_M:
+            if _moves(camera, before, self.found[camera.name].matrix) > _SAME_M:
                 settled, seen = set(), {}
             settled.add(camera.name)
             self.progress(min(number + 1, most - 1), most)
         self.progress(most, most)
-
-    def _take(self, camera: Watched, judged: _Found | str, verdicts: dict[str, _Found | str]) -> None:
-        verdicts[camera.name] = judged
-        self.maps[camera.name] = np.eye(3) if isinstance(judged, str) or camera.why_held else judged.matrix
 
     def _places(self, but: str, among: set[str] | frozenset[str], least: int) -> Feet:
         """Return the places where ``least`` of the cameras ``among`` see a person, leaving out ``but``."""
@@ -204,39 +188,39 @@ class Refiner:
         for number, watched in enumerate(self.cameras):
             if watched.name == but or watched.name not in among:
                 continue
-            feet, kept = moved_feet(self.maps[watched.name], watched.feet)
+            feet, kept = moved_feet(self.found[watched.name].matrix, watched.feet)
             parts.append(feet)
             cameras.append(np.full(len(kept), number))
             classes.append(watched.classes[kept])
         if not parts:
             return Feet(np.empty((0, 2)), np.empty((0, 3)), np.empty(0, np.int64))
-        feet = Feet(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        feet = joined(parts)
         camera, kind = np.concatenate(cameras), np.concatenate(classes)
         order = np.lexsort((camera, kind, feet.frame))
-        feet, camera, kind = feet.at(order), camera[order], kind[order]
+        feet, camera, kind = taken(feet, order), camera[order], kind[order]
         key = feet.frame * (int(kind.max(initial=0)) + 1) + kind
         bounds = [*np.flatnonzero(np.diff(key, prepend=-1)).tolist(), len(key)]
         out: list[Feet] = []
         for begin, end in pairwise(bounds):
-            part = feet.at(np.arange(begin, end))
+            part = taken(feet, slice(begin, end))
             places = Places(part.xy_m, part.cov)
             of = group(camera[begin:end], places, self.reach[0] ** 2, self.reach[1])
             size = np.bincount(of)
             centre, seen = means(places, of, len(size)), size >= least
             out.append(Feet(centre.xy_m[seen], centre.cov[seen], np.full(int(seen.sum()), feet.frame[begin])))
-        return Feet(*(np.concatenate(columns) for columns in zip(*out, strict=True)))
+        return joined(out)
 
     def _suspect(self, camera: Watched, places: Feet) -> tuple[float, list[Floats], int]:
         """Return how much a correction gains, maps to start its search from, and the number of pairs."""
         if not len(camera.feet.frame) or not len(places.frame):
             return 0.0, [np.eye(3)], 0
         starts = [np.eye(3), vote(camera.feet, places, round(10 * self.rate_hz))]
-        if not np.array_equal(self.maps[camera.name], np.eye(3)):
-            starts.append(self.maps[camera.name])
+        if not np.array_equal(self.found[camera.name].matrix, np.eye(3)):
+            starts.append(self.found[camera.name].matrix)
         model = Corrector.around("rigid", camera.feet.xy_m)
         fits = [model.fit(camera.feet, places, start) for start in starts]
         costs = [self._cost(camera.feet, places, fit) for fit in fits]
-        now = self._cost(camera.feet, places, self.maps[camera.name])
+        now = self._cost(camera.feet, places, self.found[camera.name].matrix)
         pairs = max(len(pair(moved_feet(fit, camera.feet)[0], places, _PAIRED_M, GATE).feet) for fit in fits)
         order = np.argsort(costs, kind="stable")
         return (now - min(costs)) * len(camera.feet.frame), [fits[order[0]]], pairs
@@ -244,18 +228,19 @@ class Refiner:
     def _cost(self, feet: Feet, places: Feet, matrix: Floats) -> float:
         return float(np.nanmean(loss(moved_feet(matrix, feet)[0], places, self.frames)))
 
-    def _judge(self, camera: Watched, places: Feet, starts: Sequence[Floats]) -> _Found | str:
-        """Return the correction that fits best at times it was not fitted to; or why there is none."""
+    def _judge(self, camera: Watched, places: Feet, starts: Sequence[Floats]) -> Refined:
+        """Find the correction that fits best at times it was not fitted to, or why there is none."""
         pairs = pair(moved_feet(starts[0], camera.feet)[0], places, _PAIRED_M, GATE)
         frames = len(np.unique(places.frame[pairs.places]))
         if len(pairs.feet) < LEAST_PAIRS or frames < LEAST_FRAMES:
-            return (
+            return _uncorrected(
+                camera,
                 f"it can't be compared: {len(pairs.feet)} of its boxes in {frames} frames are near people seen by the "
-                f"others, and {LEAST_PAIRS} in {LEAST_FRAMES} are needed"
+                f"others, and {LEAST_PAIRS} in {LEAST_FRAMES} are needed",
             )
         models, limit = self._determined(camera, places.xy_m[pairs.places])
         block = np.arange(self.frames) * _BLOCKS // self.frames
-        folds = [camera.feet.at(block[camera.feet.frame] % 2 != fold) for fold in range(2)]
+        folds = [taken(camera.feet, block[camera.feet.frame] % 2 != fold) for fold in range(2)]
         fits = {"": [np.eye(3)] * 2}
         fits |= {model: [self._best_fit(model, camera, feet, places, starts) for feet in folds] for model in models}
         costs_of = {model: self._held_out(camera, places, pair_, block) for model, pair_ in fits.items()}
@@ -264,8 +249,13 @@ class Refiner:
         matrix = self._best_fit(chosen, camera, camera.feet, places, fits[chosen]) if chosen else np.eye(3)
         moves = _moves(camera, np.eye(3), matrix)
         if not _is_sure(costs_of[""] - costs_of[chosen]) or moves < LEAST_MOVED_M:
-            chosen, matrix, moves = "", np.eye(3), 0.0
-        return _Found(chosen, matrix, moves, *self._residuals(camera, places, fits[chosen], block), limit)
+            chosen = ""
+        before, after = self._residuals(camera, places, fits[chosen], block)
+        if camera.why_held:
+            return _uncorrected(camera, camera.why_held, before, before)
+        if not chosen:
+            return _uncorrected(camera, "it agrees with the others", before, after)
+        return Refined(camera.name, chosen, matrix, moves, before, after, limit=limit)
 
     def _best_fit(self, model: str, camera: Watched, feet: Feet, places: Feet, starts: Sequence[Floats]) -> Floats:
         """Return the correction of a kind that fits some feet of a camera best, from any of these starts."""
@@ -288,7 +278,7 @@ class Refiner:
         """The loss of each block (B,) under the map that was fitted to the other ones."""
         out = np.full(_BLOCKS, np.nan)
         for fold, fit in enumerate(fits):
-            feet = camera.feet.at(block[camera.feet.frame] % 2 == fold)
+            feet = taken(camera.feet, block[camera.feet.frame] % 2 == fold)
             cost = loss(moved_feet(fit, feet)[0], places, self.frames)
             for number in range(fold, _BLOCKS, 2):
                 part = cost[block == number]
@@ -302,7 +292,7 @@ class Refiner:
         """Distances before and after, of the same pairs, at the times that were not fitted."""
         before, after = [], []
         for fold, fit in enumerate(fits):
-            feet = camera.feet.at(block[camera.feet.frame] % 2 == fold)
+            feet = taken(camera.feet, block[camera.feet.frame] % 2 == fold)
             now, which = moved_feet(fit, feet)
             pairs = pair(now, places, _PAIRED_M)
             apart = feet.xy_m[which[pairs.feet]] - places.xy_m[pairs.places]
@@ -310,17 +300,9 @@ class Refiner:
             after.append(pairs.distance_m)
         return _residual(np.concatenate(before)), _residual(np.concatenate(after))
 
-    def _result(self, camera: Watched, judged: _Found | str) -> Refined:
-        none = np.eye(3)
-        if isinstance(judged, str):
-            return Refined(camera.name, "", none, 0.0, None, None, judged or camera.why_held)
-        if camera.why_held:
-            return Refined(camera.name, "", none, 0.0, judged.before, judged.before, camera.why_held)
-        why = "" if judged.model else "it agrees with the others"
-        limit = judged.limit if judged.model else ""
-        return Refined(
-            camera.name, judged.model, judged.matrix, judged.moved_m, judged.before, judged.after, why, limit
-        )
+
+def _uncorrected(camera: Watched, why: str, before: Residual | None = None, after: Residual | None = None) -> Refined:
+    return Refined(camera.name, "", np.eye(3), 0.0, before, after, why)
 
 
 def _residual(distance_m: Floats) -> Residual:

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
+from mcaptrack.geometry.arrays import Floats, Indices, Ints, taken
 from mcaptrack.geometry.neighbours import squared_sigmas
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 
@@ -67,10 +67,6 @@ class Feet(NamedTuple):
     cov: Floats
     frame: Ints
 
-    def at(self, which: Bools | Indices) -> Feet:
-        """Some of them."""
-        return Feet(self.xy_m[which], self.cov[which], self.frame[which])
-
     def _in_space(self) -> Floats:
         return np.column_stack([self.xy_m, self.frame * _APART_M])
 
@@ -102,7 +98,7 @@ def moved_feet(matrix: Floats, feet: Feet) -> tuple[Feet, Indices]:
     cov = cov @ jacobian.transpose(0, 2, 1)
     out = Feet(at, np.stack([cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]], axis=-1), feet.frame)
     kept = np.flatnonzero(np.isfinite(at).all(axis=1) & np.isfinite(cov).all(axis=(1, 2)))
-    return out.at(kept), kept
+    return taken(out, kept), kept
 
 
 def pair(feet: Feet, places: Feet, reach_m: float, gate: float = np.inf) -> Paired:

@@ -136,7 +136,7 @@ def _set_weights(events: Sequence[IdentityEvent], frames: Sequence[Frame], colum
     for event in events:
         by_id.setdefault(int(event.row[column]), []).append(event)
     for track_id, members in by_id.items():
-        low, high = np.searchsorted(ids, track_id, "left"), np.searchsorted(ids, track_id, "right")
+        low, high = np.searchsorted(ids, [track_id, track_id + 1])
         if low == high:
             continue
         bounds = [int(t_ns[low]), *(event.t_ns for event in members), int(t_ns[high - 1])]
@@ -200,10 +200,7 @@ def _label(event_row: Any, is_after: bool) -> int:
 
 def _row_at(rows: Rows, t_ns: Ints, track_id: int, until_ns: int) -> tuple[int, Any] | None:
     """Time and row of a track's last row up to a time; rows are ordered by track and time."""
-    low, high = (
-        np.searchsorted(rows["track_id"], track_id, "left"),
-        np.searchsorted(rows["track_id"], track_id, "right"),
-    )
+    low, high = np.searchsorted(rows["track_id"], [track_id, track_id + 1])
     at = int(low + np.searchsorted(t_ns[low:high], until_ns, "right")) - 1
     return (int(t_ns[at]), rows[at]) if at >= low else None
 

@@ -19,6 +19,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import frame_times, join_frames
+from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.transforms import Predict
 from mcaptrack.viewing.charts import round_step, thinned
 
@@ -30,8 +31,7 @@ _BINS, _SHOWN = 18, 99.0
 
 def frame_interval_s(frames: Sequence[Frame]) -> float:
     """The usual time between two frames: the median; 0 for fewer than two frames."""
-    t_ns = frame_times(frames)
-    return float(np.median(np.diff(t_ns))) / NS_PER_S if len(t_ns) > 1 else 0.0
+    return interval_ns(frame_times(frames)) / NS_PER_S
 
 
 def rows_by_track(frames: Sequence[Frame]) -> tuple[Any, Ints]:

@@ -80,8 +80,35 @@ class ZoneWatch:
     name: ClassVar[str] = STAGE
 
     def make(self, state: RunState, planes: Planes, stamps: Mapping[str, Sequence[int]]) -> dict[str, Made]:
-        """Count them (see ``make_zones``)."""
-        return make_zones(state, planes, self, stamps)
+        """Count the zones of channels of tracks that are not counted yet, or that have changed since.
+
+        ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises McaptrackError for given
+        topics that hold no tracks, and for zones that none of the tracks can be compared with.
+        """
+        opened, prefix, *_ = state
+        before = _before(opened, prefix)
+        zones = self.zones or before.zones
+        if not zones:
+            return {}
+        options = self.options or before.options or ZoneOptions()
+        zones = _of_camera(opened, prefix, zones, is_given=bool(self.zones))
+        topics = _topics(state, self, before)
+        if self.zones and not topics:
+            raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
+        out: dict[str, Made] = {}
+        faults: list[McaptrackError] = []
+        parameters = _parameters(zones, options, planes)
+        for topic in _due_topics(state, topics, self, parameters):
+            try:
+                pictures = picture_clock(opened, prefix, stamps)
+                out |= _counted(state, topic, planes, zones, options, parameters, pictures)
+            except McaptrackError as error:
+                faults.append(error)
+        if faults and (not out or self.topics) and self.zones:
+            raise McaptrackError(f"{opened.path}: {faults[0]}")
+        for fault in faults:
+            warn(str(fault), "not-compared")
+        return out
 
     def report(self, opened: log.Log, prefixes: Sequence[str]) -> Finished | None:
         """Return the totals by the topic of the tracks, of all channels that were counted, now or before."""
@@ -113,40 +140,6 @@ class CountedZones(NamedTuple):
 def outputs(topic: str) -> tuple[str, ...]:
     """Return the topics for the zones of a channel of tracks; those of views on pictures and scenes may be missing."""
     return *(topic + _BELOW + name for name in _SCHEMAS), *(topic + _BELOW + suffix for suffix in _VIEWS)
-
-
-def make_zones(
-    state: RunState, planes: Planes, watch: ZoneWatch, stamps: Mapping[str, Sequence[int]]
-) -> dict[str, Made]:
-    """Count the zones of channels of tracks that are not counted yet, or that have changed since.
-
-    ``stamps`` are as for ``write``. Returns the channels that it makes by topic. Raises
-    McaptrackError for given topics that hold no tracks, and for zones that none of the tracks can be compared with.
-    """
-    opened, prefix, *_ = state
-    before = _before(opened, prefix)
-    zones = watch.zones or before.zones
-    if not zones:
-        return {}
-    options = watch.options or before.options or ZoneOptions()
-    zones = _of_camera(opened, prefix, zones, is_given=bool(watch.zones))
-    topics = _topics(state, watch, before)
-    if watch.zones and not topics:
-        raise McaptrackError(f"{opened.path} has no tracks of {prefix}; {call('run', opened.path)} makes them")
-    out: dict[str, Made] = {}
-    faults: list[McaptrackError] = []
-    parameters = _parameters(zones, options, planes)
-    for topic in _due_topics(state, topics, watch, parameters):
-        try:
-            pictures = picture_clock(opened, prefix, stamps)
-            out |= _counted(state, topic, planes, zones, options, parameters, pictures)
-        except McaptrackError as error:
-            faults.append(error)
-    if faults and (not out or watch.topics) and watch.zones:
-        raise McaptrackError(f"{opened.path}: {faults[0]}")
-    for fault in faults:
-        warn(str(fault), "not-compared")
-    return out
 
 
 def _due_topics(

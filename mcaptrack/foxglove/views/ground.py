@@ -28,7 +28,7 @@ from mcaptrack.foxglove.views.people import (
     trails,
 )
 from mcaptrack.foxglove.views.styles import RETRACKED, TrackStyle
-from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.arrays import Floats, Ints, taken
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.schema import DETECTIONS, Frame
@@ -105,7 +105,7 @@ def tracks(shown: PeopleInParts, t_ns: Ints, frame_id: str, style: TrackStyle) -
                     trail, opacity = segments(trail, style.trail), np.repeat(opacity[1:], 2)
                 frame, label = people.frame[these] - span.start, people.label[these]
                 if is_solid:
-                    boxes = people.body.chosen(these)
+                    boxes = taken(people.body, these)
                     scene.boxes(
                         frame, label, boxes, rgb[these], body_alpha[these], style.box, trail, opacity, style.marker,
                         style.sign,
@@ -134,7 +134,7 @@ def detections(frames: Sequence[Frame], t_ns: Ints, frame_id: str, classes: Mapp
     bounds = np.searchsorted(joined.frame[complete], np.arange(len(t_ns) + 1))
     for span, scene in instants.batches():
         rows = complete[bounds[span.start] : bounds[span.stop]]
-        some = body.chosen(rows)
+        some = taken(body, rows)
         scene.boxes(
             joined.frame[rows] - span.start, number[rows], some, rgb[rows], np.full(len(rows), _DETECTED),
             RETRACKED.box, some.centre_m[:, None], np.ones(1), RETRACKED.marker,

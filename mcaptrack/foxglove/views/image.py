@@ -27,7 +27,7 @@ from mcaptrack.foxglove.views.people import (
     trails,
 )
 from mcaptrack.foxglove.views.styles import Scale, TrackStyle
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import Planes
@@ -176,7 +176,7 @@ def predictions(
             for number, future in enumerate(futures):
                 which, frame = shown_at(future.message, wanted[span])
                 now_ns = pictures.t_ns[span][frame]
-                seen = _in_pixels(future.chosen(which), planes, now_ns) if has_own else once[number].chosen(which)
+                seen = _in_pixels(taken(future, which), planes, now_ns) if has_own else taken(once[number], which)
                 then_ns = seen_ns[seen.message][:, None]
                 ok = seen.has_path
                 if seen.path_px.shape[1] > 1 and ok.any():
@@ -207,11 +207,6 @@ class _Future(NamedTuple):
     has_path: Bools
     ellipse_px: Floats
     has_ellipse: Bools
-
-    def chosen(self, which: Ints) -> _Future:
-        """Some of the forecasts."""
-        paths, rings = (self.path_px[which], self.has_path[which]), (self.ellipse_px[which], self.has_ellipse[which])
-        return _Future(self.message[which], self.rgb[which], *paths, *rings)
 
 
 def _in_pixels(future: ForecastPaths, planes: Planes, at_ns: Ints) -> _Future:

@@ -88,11 +88,6 @@ class ForecastPaths(NamedTuple):
     end_m: Floats
     spread_m2: Floats
 
-    def chosen(self, which: Ints) -> ForecastPaths:
-        """Some of the forecasts."""
-        ends = (self.end_m[which], self.spread_m2[which])
-        return ForecastPaths(self.message[which], self.number[which], self.path_m[which], *ends)
-
 
 def by_plane(planes: Planes, t_ns: Ints) -> Iterator[tuple[GroundPlane, NDArray[np.bool_]]]:
     """Each plane and the times (N,) at which it holds; the first plane holds from the beginning."""

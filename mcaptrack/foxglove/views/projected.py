@@ -25,7 +25,7 @@ from mcaptrack.foxglove.views.people import (
     shown_at,
 )
 from mcaptrack.foxglove.views.styles import Scale, TrackStyle
-from mcaptrack.geometry.arrays import Bools, Floats, Ints
+from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.pinhole import Lens, project
 from mcaptrack.schema import Frame
 
@@ -62,7 +62,7 @@ def tracks(frames: Sequence[Frame], camera: MovingCamera, style: TrackStyle) -> 
     for first, last, people in PeopleInParts(frames, camera.at_ns, ()).parts(BATCH):
         with_body = np.flatnonzero(people.has_body())
         rgb, alpha = style.colours(people.number), styles.opacity(people.observed)
-        px, is_seen = _on_pictures(corners(people.body.chosen(with_body))[:, _EDGES], people.frame[with_body], camera)
+        px, is_seen = _on_pictures(corners(taken(people.body, with_body))[:, _EDGES], people.frame[with_body], camera)
         named, corner = _label_corners(people, with_body, px, is_seen, scale.text_px, camera.at_ns)
         for span, drawn in pictures.batches(first, last):
             some = slice(*np.searchsorted(people.frame[with_body], [span.start, span.stop]))

@@ -17,6 +17,7 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.extensions.cameras.calibrating import Refined, Refiner, Watched
 from mcaptrack.extensions.cameras.ground_correction import MODELS, Corrector, Feet, moved, vote
+from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.pinhole import Lens, ground_homography
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
@@ -121,7 +122,7 @@ class TestCorrections:
 
     def test_too_few_people_are_not_compared(self) -> None:
         at = walks(7)
-        rare = [replace(one, feet=one.feet.at(one.feet.frame < 8), classes=one.classes[one.feet.frame < 8]) for one in
+        rare = [replace(one, feet=taken(one.feet, one.feet.frame < 8), classes=one.classes[one.feet.frame < 8]) for one in
                 (watched("a", at), watched("b", at, SHIFT), watched("c", at))]  # fmt: skip
         found = refined(rare)
         assert not any(one.model for one in found.values())

@@ -52,7 +52,7 @@ DEEP = {
     "report": (
         "it shows all that is evaluated",
         "evaluation.aligned evaluation.events evaluation.forecasts evaluation.people "
-        "foxglove.views.people tables.catalogue tables.export.contents viewing.background "
-        "viewing.charts",
+        "foxglove.views.people schema.resampling tables.catalogue tables.export.contents "
+        "viewing.background viewing.charts",
     )
 }

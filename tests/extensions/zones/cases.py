@@ -97,7 +97,7 @@ QUERIES = {
 }
 TOPICS = {"zones": ("tracks", _of_topic)}
 PROPOSALS = {
-    "extensions/zones/counting.py:make_zones:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
+    "extensions/zones/counting.py:make:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(
         "zones", "LOG", "--zones", str(zones_file(Path()))
     ),
     "extensions/zones/counting.py:finished:zones": lambda s: s.says(

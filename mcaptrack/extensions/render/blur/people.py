@@ -28,6 +28,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import PEOPLE, UNKNOWN, class_name, class_names
 from mcaptrack.schema.framing import frame_times, joined_parts
 from mcaptrack.schema.provenance import frame_id_of
+from mcaptrack.schema.resampling import interval_ns
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import moving_camera
 from mcaptrack.sources.cameras import Camera
@@ -413,8 +414,7 @@ class HiddenPeople:
 
     def __init__(self, opened: log.Log, of_pictures: Sequence[Camera], pictures: str) -> None:
         self._at_ns = opened.times(pictures)
-        usual = float(np.median(np.diff(self._at_ns))) if len(self._at_ns) > 1 else 0.0
-        near_ns = round(min(_NEAR_PICTURES * usual, seconds_to_ns(_NEAR_S)))
+        near_ns = round(min(_NEAR_PICTURES * interval_ns(self._at_ns), seconds_to_ns(_NEAR_S)))
         pieces, topics, looked = [], [], [np.empty(0, np.int64)]
         wanted = {topic for camera in of_pictures for topic in (*camera.topics, camera.truth, camera.boxes or "")}
         for topic in sorted(wanted & set(opened.channels)):

@@ -400,28 +400,24 @@ class _Run:
         self._unknown: Counter[int] = Counter()
         self._wanted = np.array(wanted(self._names, options.classes, str(file.path)), np.int64)
         self._numbers = numbers_of(self._names)
-        self._contest = Contest(file.path, layouts)
+        self._contest, self._has_found = Contest(file.path, layouts), False
 
     def detect(self, frames: Iterator[Frame]) -> Iterator[tuple[_Seen, Boxes]]:
         """The boxes of each picture, of all classes. Raises McaptrackError as the network and the contest do."""
         waiting: list[_Seen] = []
         kept: list[Image] = []
-        pictures, anything = 0, False
+        pictures = 0
         for image, seen in self._look(frames):
             self._contest.see(seen.results)
             waiting.append(seen)
             pictures += 1
-            if not anything and (pictures & (pictures - 1)) == 0:  # the first, second, fourth, eighth ...
+            if not self._has_found and (pictures & (pictures - 1)) == 0:  # the first, second, fourth, eighth ...
                 kept = [*kept, image][-_KEPT:]
             if self._contest.is_settled:
-                for looked_at, boxes in self._drain(waiting):
-                    anything |= len(boxes.score) > 0
-                    yield looked_at, boxes
+                yield from self._drain(waiting)
         self._contest.end()
-        for looked_at, boxes in self._drain(waiting):
-            anything |= len(boxes.score) > 0
-            yield looked_at, boxes
-        if not anything:
+        yield from self._drain(waiting)
+        if not self._has_found:
             self._refuse_if_misread(pictures, kept)
         self._warn_of_unknown()
 
@@ -452,6 +448,7 @@ class _Run:
             boxes = seen.results[layout.name]
             if isinstance(boxes, MisreadError):
                 raise McaptrackError(self._misread(seen.frame, layout, boxes))
+            self._has_found |= len(boxes.score) > 0
             yield seen, boxes
         waiting.clear()
 
