@@ -406,7 +406,7 @@ def test_a_recording_of_a_format_of_a_package_becomes_a_log_with_all_of_its_mess
         ),
         ("Odd.declared_counts = {Odd.channels[0]: 'x'}; return Odd([])", "gave what is no RecordingReader: TypeError"),
         ("Odd.declared_counts = {'/a': 1}; return Odd([])", "gave what is no RecordedChannel of its own: '/a'"),
-        ("Odd.close = lambda self: 1 / 0; return Odd([])", "can't close drive.odd: ZeroDivisionError"),
+        ("Odd.close = lambda self: 1 / 0; return Odd([3])", "gave what is no message of a channel of its own: 3"),
         (
             "Odd.notes = lambda self, report: vars(report).update(lost=3); return Odd([])",
             "gave what are no ReadingNotes",

@@ -107,7 +107,7 @@ def test_later_runs_do_it_again_and_one_line_says_where_nothing_can(site, path, 
         (("odd: int = 0", "odd: 'nothing' = 0"), "finisher odd (another 2.0) has annotations that can't be read"),
         (
             ("odd: int = 0", "odd: dict[str, complex] = None"),
-            "finisher odd (another 2.0) has annotations that can't be",
+            "finisher odd (another 2.0) can't have the option odd: TypeError: an option can't have the type",
         ),
         (
             ("    return Step()\n", "    return Step()\nPart.most_used = 7\n"),

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from mcaptrack.api.declared import hints_of, options_of
+from mcaptrack.api.declared import hints_of, parameter_of
 from mcaptrack.contracts import Finished
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
@@ -81,7 +81,6 @@ def _options_of(entry: Entry) -> dict[str, inspect.Parameter]:
     """Return the options of a finisher. Raises McaptrackError for one that has no default, or no type of options."""
     with blamed(entry, "has annotations that can't be read"):
         hints, parameters = hints_of(entry.cls), inspect.signature(entry.cls).parameters
-        options_of(entry.cls)
         tuple(getattr(entry.cls, "most_used", ()))
     own = {
         name: parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=hints.get(name, Any))
@@ -91,6 +90,8 @@ def _options_of(entry: Entry) -> dict[str, inspect.Parameter]:
     for name, parameter in own.items():
         if parameter.default is parameter.empty:
             raise McaptrackError(f"{entry} can't have the option {name}: it has no default")
+        with blamed(entry, f"can't have the option {name}"):
+            parameter_of(name, parameter.annotation, parameter.default)
     return own
 
 

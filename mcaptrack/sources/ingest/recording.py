@@ -87,9 +87,12 @@ class _OfPackage(RecordingReader):
                 raise McaptrackError(f"{entry} gave what is no RecordedChannel of its own: {channel!r:.60}")
 
     def close(self) -> None:
-        """Close its files."""
-        with self._blamed(f"can't close {self._path}"):
-            self._recording.close()
+        """Close its files. What fails then is a warning: all has been read, or another error says why not."""
+        try:
+            with self._blamed(f"can't close {self._path}"):
+                self._recording.close()
+        except McaptrackError as error:
+            warn(str(error), "other")
 
     def _blamed(self, what: str) -> Any:
         return blamed(self._entry, what, self._guard)
