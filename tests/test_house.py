@@ -224,3 +224,17 @@ def test_extensions_use_public_names_of_public_modules(extension):
                 assert name in public, f"{path}: {module} has no public name {name}"
     _, modules = of_extensions("DEEP").get(extension, ("", ""))
     assert deep == {*modules.split()}
+
+
+@pytest.mark.parametrize(("command", "option"), [("run", "zones"), ("zones", "topic")])
+def test_a_setting_of_a_missing_extension_is_named_with_it(command, option, tmp_path):
+    house_without(["zones"], tmp_path)
+    (tmp_path / "own.toml").write_text(f'[{command}]\n{option} = "a"\n')
+    environment = {"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin"}
+    ways = (["--config", "own.toml"], {}), ([], {f"MCAPTRACK_{command}_{option}".upper(): "a"})
+    for words, more in ways:
+        done = subprocess.run([sys.executable, "-m", "mcaptrack", *words, "check", "a.mcap"], cwd=tmp_path,
+                              env=environment | more, capture_output=True, text=True, check=False)  # fmt: skip
+        assert done.returncode == 2
+        assert "zones is an extension that isn't installed; install mcaptrack again" in done.stderr
+        assert len(done.stderr.splitlines()) == 1
