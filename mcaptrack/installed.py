@@ -71,7 +71,7 @@ def missing_extension(name: str, kind: str = "name", what: str = "") -> str:
     own, in_python = re.escape(name), kind in ("name", "command")
     pattern = rf"^from {_PLACE}\S* import {own} as" if in_python else rf"^# {kind} {own}: {_PLACE}$"
     match = re.search(pattern, _stub(), re.M)
-    if not match or any(point.is_own and point.value.split(".")[2] == match[1] for point in declared().points):
+    if not match or match[1] in _extensions():
         return ""
     text = f"{what or name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/"
     return f"{text}{match[1]}"
@@ -93,17 +93,31 @@ def missing_parts(kind: str) -> str:
 def _missing(kind: str) -> list[tuple[str, str]]:
     """Names of a kind, by the comments of the stub, and their extensions, which aren't installed."""
     named = re.findall(rf"^# {kind} (\S+): {_PLACE}$", _stub(), re.M)
-    return [(name, extension) for name, extension in named if not _is_extension(extension)]
+    present = _extensions()
+    return [(name, extension) for name, extension in named if extension not in present]
 
 
 def _stub() -> str:
     return Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
 
 
-def _is_extension(name: str) -> bool:
-    """Whether the folder of an extension is there, with more than what Python has compiled of it."""
+def _extensions() -> set[str]:
+    """The extensions that are installed: the folder is there, and an entry point leads to it."""
+    return {extension for point in declared().points if (extension := _extension_of(point))}
+
+
+def _extension_of(point: Point) -> str:
+    """The extension that an entry point of mcaptrack itself leads to; "" for others."""
+    match = re.match(rf"{_PLACE}\b", point.value)
+    return match[1] if match and point.is_own else ""
+
+
+def _leads_somewhere(point: Point) -> bool:
+    """Whether the extension of an own entry point is there, with more than what Python has compiled of it."""
+    if not point.is_own:
+        return True
     try:
-        spec = find_spec(f"{_EXTENSIONS}.{name}")
+        spec = find_spec(f"{_EXTENSIONS}.{name}") if (name := _extension_of(point)) else None
     except ModuleNotFoundError:  # the folder of all extensions
         return False
     return spec is not None and spec.origin is not None
@@ -177,7 +191,7 @@ def _declared(places: tuple[tuple[str, int], ...]) -> Declared:
         except ValueError:
             unreadable.append(_name_and_version(info)[0])
             continue
-        points += [point for point in declared if not point.is_own or _is_extension(point.value.split(".")[2])]
+        points += filter(_leads_somewhere, declared)
     return Declared(tuple(points), tuple(unreadable))
 
 

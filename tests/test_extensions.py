@@ -30,7 +30,8 @@ from mcaptrack.api.finishing import Finishers
 from mcaptrack.choices import BoxFormat, TableFormat
 from mcaptrack.contracts import Box, Box3d, LabelBoxes
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import BUILT_IN, KINDS, others
+from mcaptrack.pipeline.scenes import Scenes
+from mcaptrack.registry import BUILT_IN, KINDS, Entry, others
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Plugin
 from mcaptrack.sources import fixed_frame
@@ -397,7 +398,23 @@ def test_a_recording_of_a_format_of_a_package_becomes_a_log_with_all_of_its_mess
     ("opens", "said"),
     [
         ("raise OSError('gone')", "can't read drive.odd: OSError: gone"),
-        ("return 3", "gave a int of drive.odd; open has to give a RecordingReader"),
+        ("return 3", "gave an int; open has to give a RecordingReader"),
+        ("Odd.channels = ['/a']; return Odd([])", "gave what is no RecordedChannel of its own: '/a'"),
+        (
+            "Odd.channels = [RecordedChannel('/a', ('A',))]; return Odd([])",
+            "gave what is no RecordedChannel of its own",
+        ),
+        ("Odd.declared_counts = {Odd.channels[0]: 'x'}; return Odd([])", "gave what is no RecordingReader: TypeError"),
+        ("Odd.declared_counts = {'/a': 1}; return Odd([])", "gave what is no RecordedChannel of its own: '/a'"),
+        ("Odd.close = lambda self: 1 / 0; return Odd([3])", "gave what is no message of a channel of its own: 3"),
+        (
+            "Odd.notes = lambda self, report: vars(report).update(lost=3); return Odd([])",
+            "gave what are no ReadingNotes",
+        ),
+        (
+            "return Odd([RecordedMessage(Odd.channels[0], 1.5, b'')])",
+            "gave what is no message of a channel of its own: Rec",
+        ),
         ("return Odd([3])", "gave what is no message of a channel of its own: 3"),
         (
             "return Odd([RecordedMessage(RecordedChannel('/a'), 1, b'')])",
@@ -415,7 +432,8 @@ def test_a_recording_format_that_fails_is_named_and_leaves_nothing(site, opens, 
         "from mcaptrack.contracts import RecordedChannel, RecordedMessage, RecordingReader\n"
         "class Odd(RecordingReader):\n    channels = [RecordedChannel('/a')]\n"
         "    def __init__(self, given):\n        super().__init__()\n        self.given = given\n"
-        "    def messages(self, report):\n        yield from self.given\n"
+        "    def messages(self, report):\n        yield from self.given\n        self.notes(report)\n"
+        "    def notes(self, report):\n        pass\n"
         "class Part:\n    def recognises(self, path):\n        return 'odd' * (path.suffix == '.odd')\n"
         f"    def open(self, path):\n        {opens}\n"
     )
@@ -987,6 +1005,15 @@ class Meeting(SceneMaker):
 def Part(*, meet: Annotated[bool, Option(help="Join cameras.")] = True):
     return Meeting(meet)
 """
+
+
+@pytest.mark.usefixtures("site")
+def test_a_scene_of_a_package_that_is_no_maker_of_scenes_is_one_line():
+    entry = Entry("odd", "scene", lambda: 3, "another", "another", "2.0")
+    with pytest.raises(
+        McaptrackError, match=r"scene odd \(another 2.0\) gave an int; its function has to give a Scene"
+    ):
+        Scenes([(entry, 3)])
 
 
 def test_a_package_makes_a_scene_of_cameras(site, monkeypatch):

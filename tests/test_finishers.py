@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -104,6 +105,14 @@ def test_later_runs_do_it_again_and_one_line_says_where_nothing_can(site, path, 
         (("odd: int = 0", "odd"), "finisher odd (another 2.0) can't have the option odd: it has no default"),
         (("odd: int = 0", "topic: int = 0"), "finisher odd (another 2.0) can't have the option topic: run has one"),
         (("odd: int = 0", "odd: 'nothing' = 0"), "finisher odd (another 2.0) has annotations that can't be read"),
+        (
+            ("odd: int = 0", "odd: dict[str, complex] = None"),
+            "finisher odd (another 2.0) can't have the option odd: TypeError: an option can't have the type",
+        ),
+        (
+            ("    return Step()\n", "    return Step()\nPart.most_used = 7\n"),
+            "finisher odd (another 2.0) has annotations",
+        ),
     ],
 )
 def test_a_finisher_that_cannot_have_its_options_is_left_out_and_each_run_says_so(site, change, why):  # noqa: F811
@@ -122,6 +131,7 @@ def test_a_finisher_that_cannot_have_its_options_is_left_out_and_each_run_says_s
     ("change", "why"),
     [
         (("return Step()", "raise OSError('no licence')"), "failed: OSError: no licence (another.py"),
+        (("return Step()", "return 3"), "failed: AttributeError"),
         (
             ("        how = ", "        1 / 0\n        how = "),
             "failed: ZeroDivisionError: division by zero (another.py",
@@ -144,6 +154,21 @@ def test_what_a_finisher_may_not_do_is_said_in_one_line_and_changes_nothing(site
     assert "finisher odd (another 2.0)" in str(refusal.value)
     assert why in str(refusal.value)
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("report", "why"),
+    [
+        ("'text'", "gave a str; report has to give a Finished"),
+        ("Finished({}, object(), '')", "gave what is no Finished: TypeError"),
+        ("Finished(3, {}, '')", "gave what is no Finished: TypeError"),
+    ],
+)
+def test_the_report_of_a_finisher_that_is_none_is_one_line(site, path, run, report, why):  # noqa: F811
+    code = CODE.replace("def Part", f"    def report(self, *_):\n        return {report}\ndef Part")
+    add(site, "finisher", "odd", f"from mcaptrack.contracts import Finished\n{code}")
+    with pytest.raises(McaptrackError, match=re.escape(f"finisher odd (another 2.0) {why}")):
+        run(path)
 
 
 def test_a_finisher_cannot_have_the_name_of_a_command_of_the_core(site):  # noqa: F811

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 import re
 import shlex
+import subprocess
+import sys
 from collections import Counter, defaultdict
 from dataclasses import fields
 from itertools import product
@@ -303,3 +306,16 @@ class TestPage:
         assert bounded < numbers
         scores = {("track", name) for name in ("min-score",)}  # each detector has its own
         assert numbers - bounded == scores
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"), [("mcaptrack run --dete", "--detector"), ("mcaptrack nothing --", "--help")]
+)
+def test_words_are_completed_also_after_a_command_that_there_is_not(typed, offered):
+    words = {"_MCAPTRACK_COMPLETE": "complete_bash", "COMP_WORDS": typed, "COMP_CWORD": "2"}
+    program = "import sys; sys.argv[0] = 'mcaptrack'; from mcaptrack.cli import app; app(prog_name='mcaptrack')"
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=os.environ | words, capture_output=True, text=True, check=False
+    )
+    assert offered in done.stdout.splitlines()
+    assert done.stderr == ""

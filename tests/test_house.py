@@ -144,6 +144,24 @@ def test_entry_points_of_a_folder_that_is_gone_do_not_count(gone, tmp_path):
         assert ("isn't installed" in said["commands"][name]) is (room_of(value) == gone)
 
 
+@pytest.mark.parametrize("gone", EXTENSIONS[:1])
+def test_a_folder_that_no_entry_point_leads_to_is_no_extension(gone, tmp_path):
+    house_without([gone], tmp_path)
+    (tmp_path / "mcaptrack" / "extensions" / gone).symlink_to(ROOT / "mcaptrack" / "extensions" / gone)
+    with (tmp_path / "mcaptrack-1.dist-info" / "entry_points.txt").open("a") as file:
+        file.write("\n[mcaptrack.commands]\nelsewhere = mcaptrack:open\n")  # of another version
+    said = ask(tmp_path, core=False)
+    assert "elsewhere" not in said["help"]
+    for group in CHOSEN:
+        for name in (name for name, value in POINTS[group].items() if room_of(value) == gone):
+            assert "isn't installed" in said["names"][f"{group.partition('.')[2][:-1]} {name}"]
+    ask_missing = "from mcaptrack.installed import missing_names; print(*missing_names('ending'))"
+    done = subprocess.run([sys.executable, "-c", ask_missing], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path)},
+                          capture_output=True, text=True, check=True)  # fmt: skip
+    stub = (ROOT / "mcaptrack" / "__init__.pyi").read_text()
+    assert done.stdout.split() == re.findall(rf"^# ending (\S+): mcaptrack\.extensions\.{gone}$", stub, re.M)
+
+
 def test_every_extension_has_a_folder_of_tests_and_every_entry_point_a_folder():
     tested = {path.name for path in (ROOT / "tests" / "extensions").iterdir() if list(path.glob("test_*.py"))}
     assert set(EXTENSIONS) == tested == {room_of(value) for points in POINTS.values() for value in points.values()}
@@ -206,3 +224,17 @@ def test_extensions_use_public_names_of_public_modules(extension):
                 assert name in public, f"{path}: {module} has no public name {name}"
     _, modules = of_extensions("DEEP").get(extension, ("", ""))
     assert deep == {*modules.split()}
+
+
+@pytest.mark.parametrize(("command", "option"), [("run", "zones"), ("zones", "topic")])
+def test_a_setting_of_a_missing_extension_is_named_with_it(command, option, tmp_path):
+    house_without(["zones"], tmp_path)
+    (tmp_path / "own.toml").write_text(f'[{command}]\n{option} = "a"\n')
+    environment = {"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin"}
+    ways = (["--config", "own.toml"], {}), ([], {f"MCAPTRACK_{command}_{option}".upper(): "a"})
+    for words, more in ways:
+        done = subprocess.run([sys.executable, "-m", "mcaptrack", *words, "check", "a.mcap"], cwd=tmp_path,
+                              env=environment | more, capture_output=True, text=True, check=False)  # fmt: skip
+        assert done.returncode == 2
+        assert "zones is an extension that isn't installed; install mcaptrack again" in done.stderr
+        assert len(done.stderr.splitlines()) == 1

@@ -237,7 +237,10 @@ def on_command_line(hint: Any) -> tuple[Any, bool]:
         return Path, False
     if Literal in members and str not in members:
         return Literal[tuple(members[Literal])], False
-    return next(kind for kind in (str, bool, float, int) if kind in members), False
+    for kind in (str, bool, float, int):
+        if kind in members:
+            return kind, False
+    raise TypeError(f"an option can't have the type {hint}")
 
 
 def _parts(hint: Any) -> list[Any]:

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from mcaptrack.api.declared import hints_of
+from mcaptrack.api.declared import hints_of, parameter_of
+from mcaptrack.contracts import Finished
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
-from mcaptrack.registry import Entry, Kind, blamed, find, others
+from mcaptrack.registry import Entry, Kind, blamed, find, of_type, others
 
 if TYPE_CHECKING:
-    from mcaptrack.contracts import Finished
     from mcaptrack.geometry.plane import Planes
     from mcaptrack.log import Log
     from mcaptrack.pipeline.runner import Finish
@@ -31,12 +32,13 @@ class Finishers:
     """
 
     def __init__(self) -> None:
-        self._entries: list[Entry] = []
+        self._entries: dict[Entry, dict[str, inspect.Parameter]] = {}
         self._options: dict[Entry, dict[str, inspect.Parameter]] = {}
         self._faults: list[str] = []
         for kind, name in ((each, name) for each in _KINDS for name in others(each)):
             try:
-                self._entries.append(find(kind, name))
+                entry = find(kind, name)
+                self._entries[entry] = _options_of(entry)
             except McaptrackError as error:
                 self._faults.append(str(error))
 
@@ -48,11 +50,9 @@ class Finishers:
     def options(self, taken: Collection[str]) -> dict[str, inspect.Parameter]:
         """Return the options by name; ``taken`` are the names that they can't have."""
         out: dict[str, inspect.Parameter] = {}
-        for entry in self._entries:
-            try:
-                own = _options_of(entry, {*taken, *out})
-            except McaptrackError as error:
-                self._faults.append(str(error))
+        for entry, own in self._entries.items():
+            if name := next((name for name in own if name in taken or name in out), ""):
+                self._faults.append(f"{entry} can't have the option {name}: run has one of this name")
             else:
                 self._options[entry] = own
                 out |= own
@@ -72,23 +72,26 @@ class Finishers:
             own = {name: values[name] for name in self._options[entry] if name in values}
             own |= {_FORCE: force} if _FORCE in inspect.signature(entry.cls).parameters else {}
             with blamed(entry, "failed"):
-                parts.append((entry, entry.cls(**own)))
+                part = entry.cls(**own)
+            parts.append((entry, part))
         return parts
 
 
-def _options_of(entry: Entry, taken: Collection[str]) -> dict[str, inspect.Parameter]:
-    """Return the options of a finisher. Raises McaptrackError for one that is taken, or has no default."""
+def _options_of(entry: Entry) -> dict[str, inspect.Parameter]:
+    """Return the options of a finisher. Raises McaptrackError for one that has no default, or no type of options."""
     with blamed(entry, "has annotations that can't be read"):
         hints, parameters = hints_of(entry.cls), inspect.signature(entry.cls).parameters
+        tuple(getattr(entry.cls, "most_used", ()))
     own = {
         name: parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=hints.get(name, Any))
         for name, parameter in parameters.items()
         if name != _FORCE
     }
     for name, parameter in own.items():
-        if name in taken or parameter.default is parameter.empty:
-            why = "run has one of this name" if name in taken else "it has no default"
-            raise McaptrackError(f"{entry} can't have the option {name}: {why}")
+        if parameter.default is parameter.empty:
+            raise McaptrackError(f"{entry} can't have the option {name}: it has no default")
+        with blamed(entry, f"can't have the option {name}"):
+            parameter_of(name, parameter.annotation, parameter.default)
     return own
 
 
@@ -125,5 +128,10 @@ class _OfPackage:
         if not hasattr(self.step, "report"):
             return None
         with blamed(self.entry, "failed"):
-            report: Finished | None = self.step.report(opened, prefixes)
-        return report
+            report = self.step.report(opened, prefixes)
+        if report is None:
+            return None
+        finished = of_type(self.entry, report, Finished, "report")
+        with blamed(self.entry, "gave what is no Finished"):
+            json.dumps(finished.data)
+            return finished._replace(value={**finished.value}, text=str(finished.text))

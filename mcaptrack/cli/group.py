@@ -240,7 +240,7 @@ class Group(TyperGroup):
         """Find the command; refuse an unknown one in one line."""
         name = args[0]
         every = self.list_commands(ctx)
-        if name not in every and not name.startswith("-"):
+        if name not in every and not name.startswith("-") and not ctx.resilient_parsing:  # which completes words
             if Path(name).exists():
                 refuse_usage(f"{name} is a file; the command comes first, as in {command('info', Path(name))}")
             if missing := missing_extension(name):

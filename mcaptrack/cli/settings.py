@@ -22,6 +22,7 @@ from mcaptrack.cli.config import NAME, ConfigFile, read_files, user_file
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.environment import PREFIX, VARIABLES
 from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.installed import missing_extension
 from mcaptrack.ranges import limits
 
 #: Words for a switch.
@@ -151,8 +152,11 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
         if setting is None and command not in commands and _is_of_package(command):
             continue
         if setting is None:
-            variables = [each.variable for command in commands for each in commands[command].settings.values()]
-            refuse_usage(f"the environment variable {name} names no option{nearest(name, [*variables, *VARIABLES])}")
+            variables = [each.variable for other in commands for each in commands[other].settings.values()]
+            option = name.removeprefix(f"{PREFIX}{command.upper()}_").lower()
+            missing = missing_extension(command) or missing_extension(option)
+            hint = f"; {missing}" if missing else nearest(name, [*variables, *VARIABLES])
+            refuse_usage(f"the environment variable {name} names no option{hint}")
         if not text:
             continue
         try:
@@ -207,6 +211,8 @@ def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """The end of a message: a question about the name that is meant; "" if none is close."""
-    question = did_you_mean(name, names)
-    return f"; {question.rstrip()}" if question else ""
+    """The end of a message: the extension that a name is of, if it is missing, or a question about the name that is
+    meant; "" if none is close.
+    """
+    hint = missing_extension(name) or did_you_mean(name, names).rstrip()
+    return f"; {hint}" if hint else ""

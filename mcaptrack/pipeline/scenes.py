@@ -18,7 +18,7 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.pictures import PictureClock
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.write import Made, RunState
-from mcaptrack.registry import Entry, blamed, find, names
+from mcaptrack.registry import Entry, blamed, find, names, of_type
 from mcaptrack.schema import Frame, Schema
 from mcaptrack.schema.provenance import FUSE, Provenance
 from mcaptrack.sources.cameras import detections_topic, provenance_of
@@ -97,7 +97,8 @@ class Scenes:
     """All makers of scenes, with the options of a run, or without any. Each is asked in turn."""
 
     def __init__(self, makers: Sequence[tuple[Entry, SceneMaker]] | None = None) -> None:
-        self._makers = makers if makers is not None else [*_usual()]
+        every = _usual() if makers is None else makers
+        self._makers = [(entry, of_type(entry, maker, SceneMaker, "its function")) for entry, maker in every]
 
     def _answers(self, question: Callable[[SceneMaker], T]) -> Iterator[T]:
         for entry, maker in self._makers:

@@ -32,14 +32,14 @@ from importlib import import_module
 from pathlib import Path
 from traceback import extract_tb
 from types import MappingProxyType
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, TypeVar, get_args
 
 from mcaptrack import _MODULES, __version__
 from mcaptrack.errors import McaptrackError, did_you_mean
 from mcaptrack.installed import Point, declared, distribution_of, entry_points, missing_extension
 from mcaptrack.registry.guard import Guard, contained_import
 
-__all__ = ["Entry", "blamed", "find", "others"]
+__all__ = ["Entry", "blamed", "find", "of_type", "others"]
 
 Kind = Literal[
     "detector",
@@ -63,6 +63,7 @@ Kind = Literal[
     "scene",  # what makes a scene of several cameras (mcaptrack.pipeline.scenes)
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+T = TypeVar("T")
 _OWN: Final = "mcaptrack"
 _FOLDER: Final = Path(__file__).parent.parent
 #: Exit codes of processes that end by a signal.
@@ -207,6 +208,11 @@ def titled(kind: str, name: str, package: tuple[str, str] = ("", "")) -> str:
     return f"{in_words(kind)} {name}" + (f" ({' '.join(package).strip()})" if any(package) else "")
 
 
+def _a(noun: str) -> str:
+    """The article of a noun."""
+    return "an" if noun[0].lower() in "aeiou" else "a"
+
+
 def _group(kind: str) -> str:
     """The group of entry points of a kind."""
     return f"{_OWN}.{kind}s"
@@ -286,7 +292,7 @@ def find(kind: Kind, name: str, distribution: str = "") -> Entry:
     named = [point for point in named if point.package[0] == distribution] or named
     if len(named) > 1:
         values = " and ".join(sorted(f"{point.value} ({' '.join(point.package)})" for point in named))
-        what = f"{'an' if kind[0] in 'aeiou' else 'a'} {titled(kind, name)}"
+        what = f"{_a(kind)} {titled(kind, name)}"
         hint = "remove one of them" if kind in _BY_ENTRY_POINT else "name one as module:Class"
         raise McaptrackError(f"several installed packages have {what}: {values}; {hint}")
     package = (_OWN, __version__) if named[0].is_own else named[0].package
@@ -342,6 +348,14 @@ def blamed(entry: Entry, what: str, guard: Guard | None = None) -> Iterator[None
         if is_interruption(error):
             raise
         raise failure(entry, what, error) from error
+
+
+def of_type(entry: Entry, value: Any, wanted: type[T], function: str) -> T:
+    """Return what a function of an entry gave, if it is of this type. Raises McaptrackError, with both types."""
+    if not isinstance(value, wanted):
+        gave, kind = type(value).__name__, wanted.__name__
+        raise McaptrackError(f"{entry} gave {_a(gave)} {gave}; {function} has to give {_a(kind)} {kind}")
+    return value
 
 
 def is_interruption(error: BaseException) -> bool:

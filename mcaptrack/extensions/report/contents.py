@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,7 +35,7 @@ from mcaptrack.extensions.report.identity_events import (
 from mcaptrack.extensions.report.scene_map import forecast_map
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
-from mcaptrack.registry import blamed, find, others
+from mcaptrack.registry import blamed, find, of_type, others
 from mcaptrack.schema import DECISIONS, EVENTS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import frame_times
@@ -189,9 +190,25 @@ def _add_sections(opened: log.Log, out: LogReport) -> None:
     for name in others("report_section"):
         entry = find("report_section", name)
         with blamed(entry, "failed"):
-            section: ReportSection | None = entry.cls(opened, out.prefix, names)
+            section = entry.cls(opened, out.prefix, names)
         if section is not None:
-            out.sections[name] = section
+            out.sections[name] = of_type(entry, section, ReportSection, "its function")
+            with blamed(entry, "gave what is no ReportSection"):
+                _check(section)
+
+
+def _check(section: ReportSection) -> None:
+    """Raise an error for a section that can't stand in a page, or in its data."""
+    texts = [section.short, section.title, section.note]
+    for caption, columns, groups in section.tables:
+        texts += [caption, *columns]
+        for heading, rows in groups:
+            texts += [heading, *(text for role, name, topic, cells in rows for text in (role, name, topic, *cells))]
+    for figure in section.figures:
+        texts += [figure["title"], figure["caption"], figure["chart"]["kind"]]
+    json.dumps(plain(section.data))
+    if wrong := [text for text in texts if not isinstance(text, str)]:
+        raise TypeError(f"{wrong[0]!r:.40} is no text")
 
 
 def _without_path(error: McaptrackError, opened: log.Log) -> str:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing
+from operator import index
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, SupportsIndex
 
 from mcap.well_known import MessageEncoding, Profile
 
@@ -15,7 +16,7 @@ from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import visible
 from mcaptrack.log.recording_files import format_of, is_mcap, logs_in, refuse_missing
 from mcaptrack.notices import warn
-from mcaptrack.registry import Entry, blamed
+from mcaptrack.registry import Entry, blamed, of_type
 from mcaptrack.registry.guard import Guard
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.foreign.definitions import Defined, MessageType, defined, is_defined, is_packed, unpacked
@@ -67,8 +68,7 @@ def _opened(entry: Entry, form: Any, path: Path) -> RecordingReader:
     """The recording that a format opens; that of another package is checked while it is read."""
     with blamed(entry, f"can't read {path}"):
         recording = form.open(path)
-    if not isinstance(recording, RecordingReader):
-        raise McaptrackError(f"{entry} gave a {type(recording).__name__} of {path}; open has to give a RecordingReader")
+    of_type(entry, recording, RecordingReader, "open")
     return recording if entry.is_built_in else _OfPackage(entry, recording, path)
 
 
@@ -78,34 +78,70 @@ class _OfPackage(RecordingReader):
     def __init__(self, entry: Entry, recording: RecordingReader, path: Path) -> None:
         super().__init__()
         self._entry, self._recording, self._path, self._guard = entry, recording, path, Guard(str(entry))
-        self.closing.callback(recording.close)
         with self._blamed("gave what is no RecordingReader"):
-            self.channels, self.findings = list(recording.channels), recording.findings
-            self.profile, self.declared_counts = str(recording.profile), recording.declared_counts
+            self.channels, self.findings = list(recording.channels), _notes_of(recording.findings)
+            self.profile, counts = str(recording.profile), recording.declared_counts
+            self.declared_counts = None if counts is None else {each: index(count) for each, count in counts.items()}
+        for channel in (*self.channels, *(self.declared_counts or ())):
+            if not _is_channel(channel) or channel not in self.channels:
+                raise McaptrackError(f"{entry} gave what is no RecordedChannel of its own: {channel!r:.60}")
+
+    def close(self) -> None:
+        """Close its files. What fails then is a warning: all has been read, or another error says why not."""
+        try:
+            with self._blamed(f"can't close {self._path}"):
+                self._recording.close()
+        except McaptrackError as error:
+            warn(str(error), "other")
 
     def _blamed(self, what: str) -> Any:
         return blamed(self._entry, what, self._guard)
 
     def messages(self, report: ReadingNotes) -> Iterator[RecordedMessage]:
         """All messages. Raises McaptrackError for what is none of a channel of the recording."""
-        failed = f"can't read {self._path}"
+        failed, notes = f"can't read {self._path}", ReadingNotes()
         with self._blamed(failed):
-            messages = iter(self._recording.messages(report))
+            messages = iter(self._recording.messages(notes))
         channels = set(self.channels)
         while True:
             with self._blamed(failed):
                 message = next(messages, None)
             if message is None:
-                return
-            is_own = isinstance(message, RecordedMessage) and message.channel in channels
-            if not (is_own and isinstance(message.payload, bytes) and 0 <= message.t_ns < 2**63):
+                break
+            if not (isinstance(message, RecordedMessage) and message.channel in channels and _fits(message)):
                 raise McaptrackError(f"{self._entry} gave what is no message of a channel of its own: {message!r:.60}")
             yield message
+        with self._blamed("gave what are no ReadingNotes"):
+            notes = _notes_of(notes)
+        report.notes += notes.notes
+        report.lost += notes.lost
 
     def extras(self, writer: Any, has_clock: bool, is_copied: bool) -> None:
         """Write attachments and metadata."""
         with self._blamed(f"can't write what {self._path} holds beside messages"):
             self._recording.extras(writer, has_clock, is_copied)
+
+
+def _is_channel(channel: Any) -> bool:
+    """Whether a channel holds what can be written into a log."""
+    if not isinstance(channel, RecordedChannel):
+        return False
+    schema, metadata = channel.schema, channel.metadata
+    is_schema = isinstance(schema, tuple) and [*map(type, schema)] == [str, str, bytes]
+    is_text = isinstance(metadata, Mapping) and all(isinstance(part, str) for pair in metadata.items() for part in pair)
+    return isinstance(channel.topic, str) and isinstance(channel.encoding, str) and is_schema and is_text
+
+
+def _fits(message: RecordedMessage) -> bool:
+    """Whether times, number and payload of a message can be written into a log."""
+    numbers = [(message.t_ns, 2**63), (message.publish_ns or 0, 2**64), (message.sequence or 0, 2**32)]
+    are_whole = all(isinstance(number, SupportsIndex) and 0 <= index(number) < end for number, end in numbers)
+    return are_whole and isinstance(message.payload, bytes)
+
+
+def _notes_of(notes: ReadingNotes) -> ReadingNotes:
+    """A copy of remarks, as texts."""
+    return ReadingNotes([*map(str, notes.notes)], [*map(str, notes.lost)])
 
 
 class Parts(RecordingReader):

@@ -17,8 +17,24 @@ def test_a_section_of_a_package_stands_in_the_page_and_its_data_in_the_json(fini
     assert '"lengths"' not in said  # it has no data
 
 
-def test_a_section_that_fails_is_one_line(site, finished, tmp_path):  # noqa: F811
-    add(site, "report_section", "odd", "def Part(*_):\n    return 1 / 0\n")
+@pytest.mark.parametrize(
+    ("section", "why"),
+    [
+        ("1 / 0", "failed: ZeroDivisionError: division by zero (another.py, line 3)"),
+        ("'html'", "gave a str; its function has to give a ReportSection"),
+        ("ReportSection('a', None)", "gave what is no ReportSection: TypeError: None is no text"),
+        ("ReportSection('a', 'b', [('c',)])", "gave what is no ReportSection: ValueError"),
+        (
+            "ReportSection('a', 'b', [('c', ['d'], [('e', [('tracks', 'f', '/g', [1])])])])",
+            "gave what is no ReportSect",
+        ),
+        ("ReportSection('a', 'b', figures=[3])", "gave what is no ReportSection: TypeError"),
+        ("ReportSection('a', 'b', data=object())", "gave what is no ReportSection: TypeError"),
+    ],
+)
+def test_a_section_that_fails_or_is_none_is_one_line(site, finished, tmp_path, section, why):  # noqa: F811
+    code = f"from mcaptrack.contracts import ReportSection\ndef Part(*_):\n    return {section}\n"
+    add(site, "report_section", "odd", code)
     said = one_line("report", str(finished), "-o", str(tmp_path / "a.html"))
-    assert "report section odd (another 2.0) failed: ZeroDivisionError: division by zero (another.py, line 2)" in said
+    assert f"report section odd (another 2.0) {why}" in said
     assert not (tmp_path / "a.html").exists()
