@@ -7,16 +7,18 @@
 # of JSON for each note. The exit code is the worst of the two commands: 0, or 3 if some logs failed, which are tried
 # again the next night. Two of these at once, also on two machines that share FOLDER, share the work.
 #
-# MCAPTRACK names the program, by default that of the image (see Dockerfile); JOBS how many logs are processed at once.
+# MCAPTRACK names the program, by default that of the image (see Dockerfile); JOBS how many logs are processed at once,
+# and MCAPTRACK_MAX_WORKER_MB how much memory a log may take.
 set -u
 cd "$1" || exit 1
 : "${JOBS:=2}"
-: "${MCAPTRACK:=docker run --rm --interactive --user $(id -u):$(id -g) --volume $PWD:/data mcaptrack}"
+export MCAPTRACK_MAX_WORKER_MB="${MCAPTRACK_MAX_WORKER_MB:-8000}"
+: "${MCAPTRACK:=docker run --rm --interactive --user $(id -u):$(id -g) --volume $PWD:/data --env MCAPTRACK_MAX_WORKER_MB mcaptrack}"
 
 find recordings -name '*.mcap' ! -name '*.results.mcap' -mtime "-${2:-2}" -print0 |
-    $MCAPTRACK run - --jobs "$JOBS" --timeout 1h --memory-limit 8GB --ledger run.jsonl --log-format json 2>> nightly.log
+    $MCAPTRACK run - --jobs "$JOBS" --timeout 1h --ledger run.jsonl --log-format json 2>> nightly.log
 ran=$?
-$MCAPTRACK export recordings/ --output-dir tables/ --jobs "$JOBS" --ledger export.jsonl --log-format json 2>> nightly.log
+$MCAPTRACK export recordings/ --output tables/ --jobs "$JOBS" --ledger export.jsonl --log-format json 2>> nightly.log
 exported=$?
 [ "$ran" -gt "$exported" ] && exit "$ran"
 exit "$exported"

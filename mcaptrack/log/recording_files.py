@@ -76,6 +76,13 @@ def is_mcap(path: Path) -> bool:
         return False
 
 
+def is_video(path: Path) -> bool:
+    """Whether a file begins as MP4, Matroska, WebM or AVI do, whatever its name."""
+    with path.open("rb") as stream:
+        head = stream.read(16)
+    return head[4:8] == b"ftyp" or head.startswith(_MATROSKA) or (head[:4], head[8:12]) == (b"RIFF", b"AVI ")
+
+
 def refuse_non_mcap(path: Path) -> None:
     """Raise McaptrackError for a recording in another format, with the command that converts it to a log.
 
@@ -103,13 +110,10 @@ def _description(path: Path) -> str:
         logs = logs_in(path)
         if len(logs) == 1 and listing_of(logs[0]) is None:
             return ""  # it can be given itself
-    else:
-        with path.open("rb") as stream:
-            head = stream.read(16)
-        if head.startswith(MAGIC):
-            return ""
-        if head[4:8] == b"ftyp" or head.startswith(_MATROSKA) or (head[:4], head[8:12]) == (b"RIFF", b"AVI "):
-            return "a video"
+    elif is_mcap(path):
+        return ""
+    elif is_video(path):
+        return "a video"
     recognised = format_of(path)
     return str(recognised.answer) if recognised else ""
 

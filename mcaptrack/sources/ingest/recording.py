@@ -14,7 +14,7 @@ from mcaptrack import log
 from mcaptrack.contracts import ReadingNotes, RecordedChannel, RecordedMessage, RecordingReader
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.files import visible
-from mcaptrack.log.recording_files import format_of, is_mcap, logs_in, refuse_missing
+from mcaptrack.log.recording_files import format_of, is_mcap, is_video, logs_in, refuse_missing
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, blamed, of_type
 from mcaptrack.registry.guard import Guard
@@ -52,7 +52,7 @@ def open_recording(path: Path) -> RecordingReader | None:
             )
     elif is_mcap(path):
         return McapRecording([path], path)
-    elif path.suffix.lower() == _SUFFIX:
+    elif path.suffix.lower() == _SUFFIX and not is_video(path):
         raise unlike(path, "an MCAP file")
     refuse_missing(path)
     return None

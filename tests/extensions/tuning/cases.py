@@ -12,7 +12,7 @@ EFFECTS = {
     "tune": (
         "tune a.mcap --trials 2 --search min-iou",
         {
-            "truth": ("tune truth.txt --trials 1", "--truth truth.txt"),
+            "truth": ("tune truth.txt --fps 10 --trials 1", "--truth truth.txt"),
             "stage": "--stage sample --search max-gap-s",
             "tracker": "--tracker bytetrack",
             "metric": "--metric mota",
