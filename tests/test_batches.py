@@ -29,6 +29,8 @@ def folder(template, tmp_path, monkeypatch) -> Path:
     for name in ("a.mcap", "z.mcap"):
         shutil.copy(template, tmp_path / name)
     (tmp_path / "broken.mcap").write_bytes(b"no log at all")
+    for name, text in of_extensions("FILES").items():
+        (tmp_path / name).write_text(text)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -156,7 +156,7 @@ def look(path: Path, change: Change) -> str:
         found = seen(path)
     assert photo(path.parent) == before
     assert [(notice.code, "\n" in notice.message) for notice in said] == [("journal", False)] * is_beside
-    half = is_beside and "left half written" in said[0].message
+    half = is_beside and "left half written by" in said[0].message
     checked = log.check(path)
     assert [f.kind for f in checked.findings if f.level == "error"] == ["half-written"] * half
     assert photo(path.parent) == before

@@ -177,6 +177,8 @@ class _Comparison:
         """Whether the file is a log with a readable end: then its change was finished and must not be rolled back."""
         try:
             index = read_index(self._now)
+            if index.loose and not index.data_crc:
+                return False  # nothing tells whether messages outside of chunks are whole
             for chunk in index.chunks:
                 if chunk.chunk_start_offset >= self._journal.start:
                     open_chunk(self._now, chunk_record(self._now, chunk))

@@ -331,8 +331,11 @@ class LogWriter:
         return chunk.entries.setdefault(channel_id, array("Q"))
 
     def _description(self, *channel_ids: int) -> bytes:
-        channels = [self.channels[number] for number in channel_ids]
-        schemas = [self.schemas[number] for number in dict.fromkeys(it.schema_id for it in channels) if number]
+        try:
+            channels = [self.channels[number] for number in channel_ids]
+            schemas = [self.schemas[number] for number in dict.fromkeys(it.schema_id for it in channels) if number]
+        except KeyError as number:  # in a log of others
+            raise Damaged(f"messages name a channel or schema {number} that is defined nowhere") from None
         return b"".join([*map(records.pack_schema, schemas), *map(records.pack_channel, channels)])
 
     def _close_chunk(self, group: tuple[ChunkKind, str]) -> None:
