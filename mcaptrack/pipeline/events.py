@@ -89,7 +89,8 @@ def outputs(topic: str) -> tuple[str, ...]:
 def _events_of(state: RunState, topic: str, options: EventOptions, truth: _GroundTruth) -> dict[str, Made]:
     """Find the events of one channel of tracks, and count tracks and errors in its frames."""
     opened, classes = state.opened, (truth.classes, state.classes(topic))
-    frames = repaired_tracks(state.frames(topic), state.provenance(topic))
+    tracks = state.results[topic].frames if topic in state.results else opened.frame_columns(topic, TRACKS)
+    frames = repaired_tracks(tracks, state.provenance(topic))
     track_events = find_events(frames, truth.frames, options, opened.path.stem, topic, classes)
     for note in track_events.notes:
         warn(note, "not-compared")
