@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-__version__ = "0.3.0.dev0"
+__version__ = "0.3.0"
 #: Version of the shape of everything that is printed, or put into a page, as JSON.
 SCHEMA_VERSION = 1
 
