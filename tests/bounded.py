@@ -23,6 +23,19 @@ from typing import NamedTuple
 CPU_S, MEMORY_BYTES = 5, 10**9
 
 
+@contextmanager
+def limited(kind: int, most: int) -> Iterator[None]:
+    """Bound this process. Python keeps no compiled module meanwhile: it would keep one that had no room as it is."""
+    before, keeps_none = resource.getrlimit(kind), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True
+    resource.setrlimit(kind, (most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(kind, before)
+        sys.dont_write_bytecode = keeps_none
+
+
 class Outcome(NamedTuple):
     """How a command ended: ``code`` is negative if a signal ended it.
 

@@ -23,6 +23,12 @@ def of_extensions(table: str) -> dict[Any, Any]:
     return entries
 
 
+def is_gone(path: str) -> bool:
+    """Whether this is a path of an extension that was taken away."""
+    name = path.partition("extensions/")[2].partition("/")[0]
+    return bool(name) and not (EXTENSIONS / name).is_dir()
+
+
 def needs(*names: str) -> pytest.MarkDecorator:
     """Skip tests of what the core does for an extension, where its names in Python are gone."""
     return pytest.mark.skipif(not {*names} <= {*mcaptrack.__all__}, reason="an extension is gone")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import shutil
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from mcaptrack.pipeline import with_views
 from mcaptrack.pipeline.staleness import is_finished
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import VIEW, Provenance
+from tests.bounded import limited
 from tests.logs import our_messages
 
 
@@ -90,15 +92,12 @@ def test_no_file_is_served_for_a_view_that_others_recorded(template, temporary, 
 
 @pytest.mark.parametrize("lacks", ["a folder", "room"])
 def test_no_room_for_temporary_files_is_said_in_one_line(without_views, temporary, lacks):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     if lacks == "a folder":
         temporary.rmdir()
-    else:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
-    try:
-        with pytest.raises(McaptrackError, match=r"walk\.mcap lacks can't be drawn .* TMPDIR names another") as refused:
-            mcaptrack.view(without_views)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with (
+        limited(resource.RLIMIT_FSIZE, 1000) if lacks == "room" else nullcontext(),
+        pytest.raises(McaptrackError, match=r"walk\.mcap lacks can't be drawn .* TMPDIR names another") as refused,
+    ):
+        mcaptrack.view(without_views)
     assert "\n" not in str(refused.value)
     assert not temporary.exists() or list(temporary.iterdir()) == []

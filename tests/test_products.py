@@ -17,6 +17,7 @@ import pytest
 import mcaptrack
 from mcaptrack import fleet
 from mcaptrack.errors import McaptrackError
+from tests.bounded import limited
 from tests.extension_cases import of_extensions
 from tests.interrupted import CALLS, killed
 from tests.tiers import one_in, thorough
@@ -314,11 +315,9 @@ WRITTEN: dict[str, Callable[[Path, Path], object]] = {
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_what_has_no_room_is_named_and_leaves_nothing(name, finished, tmp_path):
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    try:
-        with pytest.raises(McaptrackError, match=f"{name} can't be written: (File too large|disk I/O)"):
-            WRITTEN[name](finished, tmp_path / name)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with (
+        limited(resource.RLIMIT_FSIZE, 1000),
+        pytest.raises(McaptrackError, match=f"{name} can't be written: (File too large|disk I/O)"),
+    ):
+        WRITTEN[name](finished, tmp_path / name)
     assert [path.name for path in tmp_path.iterdir()] == [name] * name.endswith(".jsonl")  # the trials so far

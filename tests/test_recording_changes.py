@@ -20,6 +20,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import byte_source
 from tests.commands import done
+from tests.extension_cases import needs
 from tests.logs import SCHEMA, some_log
 from tests.test_log_changed import KINDS, overwrite, replace, write_value
 
@@ -74,6 +75,7 @@ def test_every_method_gives_what_is_there_now(tmp_path, look, certain):
     assert len(set(map(repr, seen))) > 1
 
 
+@needs("Player")
 def test_pictures_players_and_boxes_are_those_of_now(finished, template, tmp_path):
     path = Path(shutil.copy(finished, tmp_path / "a.mcap"))
 

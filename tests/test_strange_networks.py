@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from itertools import product
 from pathlib import Path
 from threading import Thread
@@ -28,6 +28,7 @@ from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import OnnxDetector
 from tests.awaiting import is_running
+from tests.bounded import limited
 from tests.onnx_graphs import (
     FLOAT,
     INPUTS,
@@ -294,16 +295,6 @@ def test_without_room_for_open_files_no_process_is_started(free):
 def test_where_files_have_to_be_small_no_process_is_started():
     with limited(resource.RLIMIT_FSIZE, 1_000_000):
         refuses_to_start()
-
-
-@contextmanager
-def limited(kind: int, most: int) -> Iterator[None]:
-    before = resource.getrlimit(kind)
-    resource.setrlimit(kind, (most, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(kind, before)
 
 
 def refuses_to_start() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mcaptrack.transforms import PROFILES
+from tests.extension_cases import needs
 from tools import lines_kept, reproduce, wildtrack
 from tools.ablation import PARTS, STEPS, cell
 from tools.mutations import find, mutants_of, sample
@@ -115,6 +116,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@needs("fuse")
 def test_each_view_is_scored_on_those_in_its_picture_and_the_scene_on_all(folder, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["reproduce", str(folder), "--profile", "default", "-o", "out"])
     reproduce.main()
