@@ -276,6 +276,7 @@ def test_threads_may_share_an_iterator(tmp_path):
         assert all(one in wanted for one in found)
 
 
+@needs("Player")
 def test_closing_waits_for_a_call_and_what_follows_is_refused(finished):
     opened, begun, go_on = mcaptrack.open(finished), Event(), Event()
 
