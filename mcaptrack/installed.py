@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 _OWN: Final = "mcaptrack."
 _EXTENSIONS: Final = f"{_OWN}extensions"
 #: How the stub names an extension.
-_PLACE: Final = rf"{re.escape(_EXTENSIONS)}\.(\w+)"
+_PLACE: Final = rf"{re.escape(_EXTENSIONS)}\.(?P<extension>\w+)"
 #: A folder with what pip says of a package, and the name of the package in it.
 _INFO: Final = re.compile(r"(.+?)(-.*)?\.(dist|egg)-info")
 _FILES: Final = ("METADATA", "PKG-INFO")
@@ -68,37 +68,33 @@ def missing_extension(name: str, kind: str = "name", what: str = "") -> str:
     The stub for type checkers says which names those are, in Python and, in comments, of other kinds: it alone names
     extensions from outside. ``what`` is said in place of the name.
     """
-    own, in_python = re.escape(name), kind in ("name", "command")
-    pattern = rf"^from {_PLACE}\S* import {own} as" if in_python else rf"^# {kind} {own}: {_PLACE}$"
-    match = re.search(pattern, _stub(), re.M)
-    if not match or match[1] in _extensions():
+    if (extension := _missing(kind).get(name)) is None:
         return ""
     text = f"{what or name} is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/"
-    return f"{text}{match[1]}"
+    return f"{text}{extension}"
 
 
 def missing_names(kind: str) -> list[str]:
     """The names of a kind that are of extensions which aren't installed."""
-    return [name for name, _ in _missing(kind)]
+    return [*_missing(kind)]
 
 
 def missing_parts(kind: str) -> str:
     """Say which names of a kind extensions have that aren't installed, and what to do; "" if there are none."""
     missing = _missing(kind)
-    folders = " and ".join(sorted({f"mcaptrack/extensions/{extension}" for _, extension in missing}))
-    names = ", ".join(name for name, _ in missing)
+    folders = " and ".join(sorted({f"mcaptrack/extensions/{extension}" for extension in missing.values()}))
+    names = ", ".join(missing)
     return f"{names} are of an extension that isn't installed; install mcaptrack again, with {folders}" if names else ""
 
 
-def _missing(kind: str) -> list[tuple[str, str]]:
-    """Names of a kind, by the comments of the stub, and their extensions, which aren't installed."""
-    named = re.findall(rf"^# {kind} (\S+): {_PLACE}$", _stub(), re.M)
+def _missing(kind: str) -> dict[str, str]:
+    """The extensions that aren't installed by the names of a kind that they have, by the stub."""
+    in_python = kind in ("name", "command")
+    line = rf"^from {_PLACE}\S* import (?P<name>\w+) as" if in_python else rf"^# {kind} (?P<name>\S+): {_PLACE}$"
+    stub = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
+    named = {match["name"]: match["extension"] for match in re.finditer(line, stub, re.M)}
     present = _extensions()
-    return [(name, extension) for name, extension in named if extension not in present]
-
-
-def _stub() -> str:
-    return Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
+    return {name: extension for name, extension in named.items() if extension not in present}
 
 
 def _extensions() -> set[str]:
@@ -109,7 +105,7 @@ def _extensions() -> set[str]:
 def _extension_of(point: Point) -> str:
     """The extension that an entry point of mcaptrack itself leads to; "" for others."""
     match = re.match(rf"{_PLACE}\b", point.value)
-    return match[1] if match and point.is_own else ""
+    return match["extension"] if match and point.is_own else ""
 
 
 def _leads_somewhere(point: Point) -> bool:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -20,7 +21,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources import demo
 from tests import bounded
 from tests.commands import done, made_log
-from tests.worlds import small_scene
+from tests.worlds import noisy_tracks, small_scene, write_channels
 
 # The same examples each time, so that a failure comes from a change; `--hypothesis-profile search` tries many new ones.
 settings.register_profile(
@@ -196,4 +197,13 @@ def bare(template, tmp_path_factory) -> Path:
         ways = {name: Provenance.from_metadata(channel.metadata) for name, channel in opened.channels.items()}
     made = [name for name, how in ways.items() if how is not None and how.transform != "ingest"]
     mcaptrack.drop(template, made, output=path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def with_worlds(tmp_path_factory) -> Path:
+    """A log of walkers with nine worlds. Tests must not change it."""
+    path = tmp_path_factory.mktemp("worlds") / "log.mcap"
+    write_channels(path, samples=noisy_tracks(np.random.default_rng(5), people=14, ticks=80, hidden=0.03))
+    done("retrack", path, "--worlds", "9", "-q")
     return path

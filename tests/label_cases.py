@@ -15,8 +15,12 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 
+from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import points
+from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.table import BoxTable
 
 
 @dataclass(frozen=True)
@@ -152,3 +156,28 @@ def writers() -> dict[str, Writer]:
         parent, _, name = point.value.partition(":")[0].replace("mcaptrack.", "tests.", 1).rpartition(".")
         out |= import_module(f"{parent}.test_{name}").WRITERS if point.is_own else {}
     return out
+
+
+def read(folder: Path, content: Any, role: str = "detections", name: str = "a", **options: Any) -> BoxTable:
+    """Labels of a file with this text, or of JSON of something else."""
+    path = folder / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return read_labels(path, role=role, **options)
+
+
+def refused(folder: Path, content: Any, role: str = "detections") -> str:
+    """What is said of it, after the name of the file."""
+    with pytest.raises(McaptrackError) as error:
+        read(folder, content, role)
+    assert str(error.value).startswith(str(folder / "a"))
+    return str(error.value)[len(str(folder / "a")) :]
+
+
+def said(folder: Path, labels: BoxTable) -> list[str]:
+    """Doubts, after the name of the file."""
+    assert all(words.startswith(str(folder)) for words, _ in labels.doubts)
+    return [words.removeprefix(str(folder / "a")) for words, _ in labels.doubts]
+
+
+def table(*rows: str, header: str = "frame,x,y,w,h") -> str:
+    return "\n".join([header, *rows])

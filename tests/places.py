@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import mcaptrack
+from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
 
 PEOPLE, SECONDS = 5, 16
@@ -139,3 +140,14 @@ def errors(found: Mapping[int, np.ndarray]) -> tuple[np.ndarray, int, int]:
 
 def said(result: mcaptrack.RunResult, code: str) -> list[str]:
     return [notice.message for notice in result.warnings if notice.code == code]
+
+
+def topics(path: Path) -> set[str]:
+    return {channel.topic for channel in mcaptrack.info(path).channels}
+
+
+def ran_copy(boxes: Path) -> tuple[Path, mcaptrack.RunResult]:
+    """A copy of a log after a run, and its result."""
+    path = Path(shutil.copy(boxes, boxes.with_name("ran.mcap")))
+    with collected():
+        return path, mcaptrack.run(path, tables=False)

@@ -17,7 +17,7 @@ from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
-from tests.places import CAMERAS, HEIGHT, WIDTH, said, write_log
+from tests.places import CAMERAS, HEIGHT, WIDTH, ran_copy, said, topics, write_log
 
 
 @pytest.fixture(scope="module")
@@ -33,18 +33,12 @@ def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def ran(boxes: Path) -> tuple[Path, RunResult]:
     """The log after a run."""
-    path = Path(shutil.copy(boxes, boxes.with_name("ran.mcap")))
-    with collected():
-        return path, mcaptrack.run(path, tables=False)
+    return ran_copy(boxes)
 
 
 @pytest.fixture
 def path(boxes: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(boxes, tmp_path / "log.mcap"))
-
-
-def topics(path: Path) -> set[str]:
-    return {channel.topic for channel in mcaptrack.info(path).channels}
 
 
 class TestAllCameras:

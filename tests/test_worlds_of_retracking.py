@@ -21,7 +21,7 @@ from mcaptrack.schema import TRACKS, WORLDS, Frame
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import decisions, offline
 from tests.commands import done
-from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks, write_channels
+from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks
 
 QUICK = [Phase.explicit, Phase.generate]
 SEEDS = st.integers(0, 2**32 - 1)
@@ -166,15 +166,6 @@ def test_retracking_without_the_option_removes_worlds(template, tmp_path):
         assert "/camera/retracks/worlds" not in opened.channels
 
 
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory) -> Path:
-    """A log of walkers with nine worlds."""
-    path = tmp_path_factory.mktemp("worlds") / "log.mcap"
-    write_channels(path, samples=noisy_tracks(np.random.default_rng(5), people=14, ticks=80, hidden=0.03))
-    done("retrack", path, "--worlds", "9", "-q")
-    return path
-
-
 def kept_samples(path: Path) -> list[dict[tuple[int, float], int]]:
     """The track of each sample that a world keeps, by its time and place, from the rows of worlds and samples."""
     with log.Log(path) as opened:
@@ -195,11 +186,11 @@ def kept_samples(path: Path) -> list[dict[tuple[int, float], int]]:
     return [{at: track for at, track in world.items() if track >= 0} for world in out]
 
 
-def test_worlds_have_the_samples_that_they_keep_and_join_whole_tracks_of_them(drawn):
+def test_worlds_have_the_samples_that_they_keep_and_join_whole_tracks_of_them(with_worlds):
     joined = 0
-    for world, wanted in enumerate(kept_samples(drawn), start=1):
+    for world, wanted in enumerate(kept_samples(with_worlds), start=1):
         query = f"select t_ns, x_m, track_id from world_tracks where world = {world} and observed"
-        found = {(row["t_ns"], row["x_m"]): row["track_id"] for row in mcaptrack.query(drawn, query).to_pylist()}
+        found = {(row["t_ns"], row["x_m"]): row["track_id"] for row in mcaptrack.query(with_worlds, query).to_pylist()}
         assert found.keys() == wanted.keys()
         names = {(wanted[at], track) for at, track in found.items()}
         assert len(names) == len({track for track, _ in names})
@@ -207,12 +198,12 @@ def test_worlds_have_the_samples_that_they_keep_and_join_whole_tracks_of_them(dr
     assert joined > 0
 
 
-def test_a_number_has_its_median_and_an_interval_around_those_of_the_worlds(drawn):
+def test_a_number_has_its_median_and_an_interval_around_those_of_the_worlds(with_worlds):
     query = "select count(distinct track_id) as n, avg(x_m) as x from tracks where observed and x_m > 0"
-    (row,) = mcaptrack.query(drawn, query, worlds=True).to_pylist()
-    (again,) = mcaptrack.query(drawn, query, worlds=True).to_pylist()
+    (row,) = mcaptrack.query(with_worlds, query, worlds=True).to_pylist()
+    (again,) = mcaptrack.query(with_worlds, query, worlds=True).to_pylist()
     grouped = query.replace("tracks", "world_tracks") + " group by world"
-    many = mcaptrack.query(drawn, grouped).column("n").to_pylist()
+    many = mcaptrack.query(with_worlds, grouped).column("n").to_pylist()
     low, middle, high = np.percentile(many, [5, 50, 95])
     assert len(set(many)) > 1
     assert (row, row["n"], row["worlds"]) == (again, middle, 9)
@@ -220,8 +211,8 @@ def test_a_number_has_its_median_and_an_interval_around_those_of_the_worlds(draw
     assert row["x_from"] < row["x"] < row["x_to"]
 
 
-def test_unseen_rows_of_a_track_that_was_seen_are_straight_and_no_track_is_at_two_places_at_once(drawn):
-    rows = mcaptrack.query(drawn, "from world_tracks order by world, track_id, t_ns").to_pylist()
+def test_unseen_rows_of_a_track_that_was_seen_are_straight_and_no_track_is_at_two_places_at_once(with_worlds):
+    rows = mcaptrack.query(with_worlds, "from world_tracks order by world, track_id, t_ns").to_pylist()
     seen = {(row["world"], row["track_id"]) for row in rows if row["observed"]}
     for one, row, other in zip(rows, rows[1:], rows[2:], strict=False):
         ends = (one, row, other)
@@ -277,23 +268,23 @@ def test_where_a_log_can_not_tell_there_are_no_intervals_and_it_says_why(people,
     assert [warning.message.count(why) for warning in warnings] == ([1] if why else [])
 
 
-def test_numbers_of_pairs_have_no_interval(drawn):
+def test_numbers_of_pairs_have_no_interval(with_worlds):
     for pairs in (
         "tracks a join tracks b using (t_ns)",
         "tracks a, tracks b",
         "tracks as a left join tracks b using (t_ns)",
     ):
         with collected() as warnings:
-            (row,) = mcaptrack.query(drawn, f"select count(*) as n from {pairs}", worlds=True).to_pylist()
+            (row,) = mcaptrack.query(with_worlds, f"select count(*) as n from {pairs}", worlds=True).to_pylist()
         assert (row["n_from"], row["n_to"], row["n"] > 0) == (None, None, True)
         assert ["no interval" in warning.message for warning in warnings] == [True]
 
 
-def test_rows_are_told_apart_by_texts_and_counts_of_missing_rows_are_none(drawn):
+def test_rows_are_told_apart_by_texts_and_counts_of_missing_rows_are_none(with_worlds):
     query = "select track_id::text as track, count(*) as n from tracks group by all"
-    rows = mcaptrack.query(drawn, query, worlds=True).to_pylist()
+    rows = mcaptrack.query(with_worlds, query, worlds=True).to_pylist()
     per_world = mcaptrack.query(
-        drawn, "select world, track_id, count(*) as n from world_tracks group by all"
+        with_worlds, "select world, track_id, count(*) as n from world_tracks group by all"
     ).to_pylist()
     for row in rows:
         many = [found["n"] for found in per_world if str(found["track_id"]) == row["track"]]
@@ -311,9 +302,9 @@ def test_rows_are_told_apart_by_texts_and_counts_of_missing_rows_are_none(drawn)
         ("select track_id from tracks", "same texts"),
     ],
 )
-def test_what_worlds_do_not_change_is_refused(drawn, query, message):
+def test_what_worlds_do_not_change_is_refused(with_worlds, query, message):
     with pytest.raises(McaptrackError, match=message):
-        mcaptrack.query(drawn, query, worlds=True)
+        mcaptrack.query(with_worlds, query, worlds=True)
 
 
 def test_logs_without_worlds_are_refused(template):

@@ -13,7 +13,7 @@ from mcaptrack import RunResult, log
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS
 from tests.commands import done
-from tests.places import CAMERAS, NS, PEOPLE, said, walk, write_log, write_parts
+from tests.places import CAMERAS, NS, PEOPLE, ran_copy, said, topics, walk, write_log, write_parts
 
 
 @pytest.fixture(scope="module")
@@ -25,18 +25,12 @@ def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def ran(boxes: Path) -> tuple[Path, RunResult]:
     """The log after a run."""
-    path = Path(shutil.copy(boxes, boxes.with_name("ran.mcap")))
-    with collected():
-        return path, mcaptrack.run(path, tables=False)
+    return ran_copy(boxes)
 
 
 @pytest.fixture
 def path(boxes: Path, tmp_path: Path) -> Path:
     return Path(shutil.copy(boxes, tmp_path / "log.mcap"))
-
-
-def topics(path: Path) -> set[str]:
-    return {channel.topic for channel in mcaptrack.info(path).channels}
 
 
 def test_the_scene_is_tracked(ran: tuple[Path, RunResult]) -> None:

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange import coco as coco_format
 from mcaptrack.extensions.exchange import gathered
 from mcaptrack.sources.ingest.job import fitted
 from mcaptrack.sources.ingest.labels import format as formats
-from mcaptrack.sources.ingest.labels.reading import read_labels
-from mcaptrack.sources.ingest.labels.table import BoxTable
-from tests.label_cases import Row, Writer, as_json
+from tests.label_cases import Row, Writer, as_json, read, refused, said, table
 
 
 def annotations(rows: Sequence[Row]) -> Any:
@@ -36,31 +32,6 @@ WRITERS = {
 
 
 NAN = float("nan")
-
-
-def read(folder: Path, content: Any, role: str = "detections", name: str = "a", **options: Any) -> BoxTable:
-    """Labels of a file with this text, or of JSON of something else."""
-    path = folder / name
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    return read_labels(path, role=role, **options)
-
-
-def refused(folder: Path, content: Any, role: str = "detections") -> str:
-    """What is said of it, after the name of the file."""
-    with pytest.raises(McaptrackError) as error:
-        read(folder, content, role)
-    assert str(error.value).startswith(str(folder / "a"))
-    return str(error.value)[len(str(folder / "a")) :]
-
-
-def said(folder: Path, labels: BoxTable) -> list[str]:
-    """Doubts, after the name of the file."""
-    assert all(words.startswith(str(folder)) for words, _ in labels.doubts)
-    return [words.removeprefix(str(folder / "a")) for words, _ in labels.doubts]
-
-
-def table(*rows: str, header: str = "frame,x,y,w,h") -> str:
-    return "\n".join([header, *rows])
 
 
 def test_a_category_has_a_number_within_bounds_and_a_name(tmp_path):

@@ -2,16 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-from typing import Any
-
-import pytest
-
-from mcaptrack.errors import McaptrackError
-from mcaptrack.sources.ingest.labels.reading import read_labels
-from mcaptrack.sources.ingest.labels.table import BoxTable
-from tests.label_cases import Writer, corners, number, text
+from tests.label_cases import Writer, corners, number, read, refused, text
 
 SUPERVISION = "x_min,y_min,x_max,y_max,class_id,confidence,tracker_id,frame_index"
 WRITERS = {
@@ -33,21 +24,6 @@ WRITERS = {
         first="stated",
     ),
 }
-
-
-def read(folder: Path, content: Any, role: str = "detections", name: str = "a", **options: Any) -> BoxTable:
-    """Labels of a file with this text, or of JSON of something else."""
-    path = folder / name
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    return read_labels(path, role=role, **options)
-
-
-def refused(folder: Path, content: Any, role: str = "detections") -> str:
-    """What is said of it, after the name of the file."""
-    with pytest.raises(McaptrackError) as error:
-        read(folder, content, role)
-    assert str(error.value).startswith(str(folder / "a"))
-    return str(error.value)[len(str(folder / "a")) :]
 
 
 def test_rows_of_json_say_which_one_is_wrong(tmp_path):

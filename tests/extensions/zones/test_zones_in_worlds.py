@@ -38,17 +38,8 @@ select world, count(*) filter (visits > 0) as tracks, coalesce(sum(s) / sum(visi
 """
 
 
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory) -> Path:
-    """A log of walkers with nine worlds."""
-    path = tmp_path_factory.mktemp("worlds") / "log.mcap"
-    write_channels(path, samples=noisy_tracks(np.random.default_rng(5), people=14, ticks=80, hidden=0.03))
-    done("retrack", path, "--worlds", "9", "-q")
-    return path
-
-
-def test_zones_have_the_medians_and_intervals_of_what_sql_counts_in_each_world(drawn, tmp_path):
-    there = Path(shutil.copyfile(drawn, tmp_path / "log.mcap"))
+def test_zones_have_the_medians_and_intervals_of_what_sql_counts_in_each_world(with_worlds, tmp_path):
+    there = Path(shutil.copyfile(with_worlds, tmp_path / "log.mcap"))
     made = mcaptrack.zones(there, zones=SIDES, margin_m=0, max_gap_s=1.3).zones["/camera/retracks"]
     (right,) = (total.in_worlds for total in made if total.zone == "right")
     wanted = mcaptrack.query(there, OF_SIDES).to_pydict()
