@@ -46,7 +46,7 @@ from mcaptrack.transforms.retrack.decisions import draw_worlds, find_joins
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.motion_model import Tracks, Trajectories, filtered, to_trajectories
 from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers, motion_model
-from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, probability
+from mcaptrack.transforms.retrack.weights import WEIGHTS, Choices, Logistic, columns, probability
 
 DEFAULT = PROFILES["default"]
 #: The classes of gaps, as in ``hypotheses.GAPS_S``.
@@ -188,7 +188,7 @@ def pairs_of(run: Run) -> Pairs:
     parts = [(i, j) for i, j, _ in linking.pairs_in_reach(sides, MAX_GAP_S)]
     i, j = map(np.concatenate, zip(*parts, strict=True))
     gaps = sides.gaps(i, j)
-    gap_s, found = gaps.seconds, linking.features(sides.model, gaps)
+    gap_s, found = gaps.seconds, columns(linking.FEATURES, linking.motion_terms(sides.model, gaps))
     owner = owners_of(run, paths)
     ends, begins = usual(owner, paths, -1), usual(owner, paths, 1)
     same = np.flatnonzero((ends[i] >= 0) & (ends[i] == begins[j]))

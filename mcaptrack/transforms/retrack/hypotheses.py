@@ -20,18 +20,12 @@ from mcaptrack.geometry.arrays import Floats, Ints, taken
 from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.transforms.retrack.linking import (
-    FEATURES,
-    Fit,
-    Gaps,
+    MIN_LOG_ODDS,
     TrackEnds,
     best_links,
     chains,
-    features,
-    features_of,
-    has_chance,
-    log_distance,
     log_odds,
-    log_speed,
+    motion_terms,
     pairs_in_reach,
 )
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Tracks, filtered, to_trajectories
@@ -131,16 +125,15 @@ class Hypotheses(NamedTuple):
             more = more[:, tracklets.ends[more[0]] < tracklets.begins[more[1]]]
             before, after = np.unique(np.concatenate([[before, after], more], axis=1), axis=1)
         gaps = ends.gaps(before, after)
-        gap_s, alone = gaps.seconds, features(model, ends_alone.gaps(before, after))
+        gap_s, alone = gaps.seconds, motion_terms(model, ends_alone.gaps(before, after))
         same_track = tracklets.online[before] == tracklets.online[after]
         so_far, left = _samples(tracks, tracklets)
         of_ids, of_tracks = _rates(tracks, tracklets)
         terms = {
             "link": np.ones(len(before)),
-            **_motion_terms(model, gaps),
-            "miss alone": alone[:, 0],
-            "misfit to noise alone": alone[:, 1],
-            "gap": gap_s,
+            **motion_terms(model, gaps),
+            "miss alone": alone["miss"],
+            "misfit to noise alone": alone["misfit to noise"],
             "log gap": np.log(gap_s + 0.2),
             "same input id": tracklets.source[before] == tracklets.source[after],
             "same track": same_track,
@@ -266,7 +259,7 @@ def _candidates(ends: TrackEnds, follows: Ints, max_gap_s: float) -> tuple[Ints,
     joined = np.flatnonzero(follows >= 0)
     pairs = [joined * len(follows) + follows[joined]]
     for before, after, gaps in pairs_in_reach(ends, max_gap_s):
-        likely = has_chance(log_odds(features(ends.model, gaps)))
+        likely = log_odds(ends.model, gaps) > MIN_LOG_ODDS
         pairs.append(before[likely] * len(follows) + after[likely])
     before, after = np.divmod(np.unique(np.concatenate(pairs)), max(len(follows), 1))
     return before, after
@@ -290,23 +283,6 @@ def _ends(model: MotionModel, tracklets: Tracklets, forward: State, backward: St
 def _largest(near: csr_array) -> Floats:
     """The largest of each row."""
     return np.asarray(near.max(axis=1).todense()).ravel()
-
-
-def _motion_terms(model: MotionModel, gaps: Gaps) -> dict[str, Floats]:
-    """The terms of how the motion before a gap fits that after it."""
-    fit = Fit.of(model, gaps)
-    of_link = dict(zip(FEATURES, features_of(fit, gaps.seconds).T, strict=True))
-    return {
-        "miss": of_link["miss"],
-        "misfit to noise": of_link["misfit"],
-        "misfit": np.log(fit.misfit + 0.2),
-        "misfit or stay": log_distance(np.minimum(fit.misfit, fit.stay)),
-        "turn": of_link["turn"],
-        "stay and speed": of_link["distance and speed"],
-        "misfit and speed": of_link["misfit and speed"],
-        "speed": log_speed(fit.speed),
-        "noise": np.log(fit.spread_m2),
-    }
 
 
 def _samples(tracks: Tracks, tracklets: Tracklets) -> tuple[Ints, Ints]:

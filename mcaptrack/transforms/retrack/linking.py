@@ -81,14 +81,9 @@ def best_links(ends: Ints, begins: Ints, gain: Floats, count: int) -> Ints:
     return np.asarray(links[np.argsort(ends[links], kind="stable")])
 
 
-def log_odds(values: Floats) -> Floats:
-    """The log odds that links with these features (E, F) are right, where as many are as usual."""
-    return _LINKS.log_odds(values)
-
-
-def has_chance(log_odds: Floats) -> Bools:
-    """Whether links with these log odds (E,) are considered at all."""
-    return np.asarray(log_odds > MIN_LOG_ODDS)
+def log_odds(model: MotionModel, gaps: Gaps) -> Floats:
+    """The log odds that links over gaps (E,) are right, where as many are as usual."""
+    return _LINKS.log_odds(columns(FEATURES, motion_terms(model, gaps)))
 
 
 def pairs_in_reach(ends: TrackEnds, max_gap_s: float) -> Iterator[tuple[Ints, Ints, Gaps]]:
@@ -148,80 +143,35 @@ def prior_shifts(log_odds: Floats, gap_s: Floats) -> Floats:
     return shifts
 
 
-class Fit(NamedTuple):
-    """The fit of the motion before gaps (E,) to that after them.
+def motion_terms(model: MotionModel, gaps: Gaps) -> dict[str, Floats]:
+    """The terms (E,) of how well the motion before gaps fits that after them, by name.
 
-    Attributes
-    ----------
-    miss : (E,) of float
-        The distance from one side to where the other, extrapolated at its own velocity, expects it (the smaller of the
-        two), in m.
-    misfit : (E,) of float
-        That distance with the mean of both velocities, in m.
-    stay : (E,) of float
-        The distance from one side to the other, in m.
-    turn, speed : (E,) of float
-        The difference of both velocities, and the higher speed, in m/s.
-    spread_m2 : (E,) of float
-        The variance of the misfit per axis.
+    "miss" is the distance from one side to where the other, extrapolated at its own velocity, expects it (the smaller
+    of the two), "misfit" that with the mean of both velocities, "stay" that from one side to the other, "noise" the
+    variance of the misfit per axis.
     """
-
-    miss: Floats
-    misfit: Floats
-    stay: Floats
-    turn: Floats
-    speed: Floats
-    spread_m2: Floats
-
-    @classmethod
-    def of(cls, model: MotionModel, gaps: Gaps) -> Fit:
-        """The fit of gaps (E,)."""
-        before, after, gap_s = gaps
-        span = gap_s[:, None]
-        way = after.mean[:, :2] - before.mean[:, :2]
-        left, came = before.mean[:, 2:], after.mean[:, 2:]
-        speed = np.maximum(_length(left), _length(came))
-        power = (model.drift_m_per_s + model.drift_ratio * speed) ** 2
-        spread = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
-        spread += power * gap_s**3 / 12
-        return cls(
-            np.minimum(_length(way - left * span), _length(way - came * span)),
-            _length(way - (left + came) / 2 * span),
-            _length(way),
-            _length(came - left),
-            speed,
-            spread,
-        )
-
-
-def features(model: MotionModel, gaps: Gaps) -> Floats:
-    """The features that distinguish right links from wrong ones, (E, F): see ``FEATURES``."""
-    return features_of(Fit.of(model, gaps), gaps.seconds)
-
-
-def features_of(fit: Fit, gap_s: Floats) -> Floats:
-    """The same of gaps (E,) with this fit and so many seconds."""
-    speed = log_speed(fit.speed)
-    values = {
-        "miss": log_distance(fit.miss),
-        "misfit": np.log1p(fit.misfit**2 / fit.spread_m2 / 2),
+    before, after, gap_s = gaps
+    span = gap_s[:, None]
+    way = after.mean[:, :2] - before.mean[:, :2]
+    left, came = before.mean[:, 2:], after.mean[:, 2:]
+    fastest = np.maximum(_length(left), _length(came))
+    variance = before.cov[:, 0] + after.cov[:, 0] + gap_s**2 / 4 * (before.cov[:, 2] + after.cov[:, 2])
+    variance += (model.drift_m_per_s + model.drift_ratio * fastest) ** 2 * gap_s**3 / 12
+    misfit, stay = _length(way - (left + came) / 2 * span), _length(way)
+    nearest, speed = np.log(np.minimum(misfit, stay) + _NEAR_M), np.log(fastest + _SPEED_M_PER_S)
+    return {
+        "miss": np.log(np.minimum(_length(way - left * span), _length(way - came * span)) + _NEAR_M),
+        "misfit to noise": np.log1p(misfit**2 / variance / 2),
+        "misfit": np.log(misfit + 0.2),
+        "misfit or stay": nearest,
+        "misfit or stay by gap": nearest * np.log(gap_s + 0.4),
+        "turn": np.log(_length(came - left) + _SPEED_M_PER_S),
+        "stay and speed": np.log(stay + _NEAR_M) * speed,
+        "misfit and speed": np.log(misfit + _NEAR_M) * speed,
+        "speed": speed,
+        "noise": np.log(variance),
         "gap": gap_s,
-        "misfit or stay": log_distance(np.minimum(fit.misfit, fit.stay)) * np.log(gap_s + 0.4),
-        "turn": log_speed(fit.turn),
-        "distance and speed": log_distance(fit.stay) * speed,
-        "misfit and speed": log_distance(fit.misfit) * speed,
     }
-    return columns(FEATURES, values)
-
-
-def log_distance(distance_m: Floats) -> Floats:
-    """The logarithms of distances (E,), of which differences below some centimetres mean nothing."""
-    return np.asarray(np.log(distance_m + _NEAR_M))
-
-
-def log_speed(speed_m_per_s: Floats) -> Floats:
-    """The logarithms of speeds (E,), of which small differences mean nothing."""
-    return np.asarray(np.log(speed_m_per_s + _SPEED_M_PER_S))
 
 
 def _length(vector: Floats) -> Floats:

@@ -196,8 +196,8 @@ class OnlineLinks:
             # nothing is known of the velocity of what was observed once: it may be that of the lost one
             single = new.hits[row] == 1
             after.mean[single, 2:], after.cov[single, 2] = before.mean[single, 2:], before.cov[single, 2]
-            log_odds = linking.log_odds(linking.features(self._model, gaps))
-            parts.append(taken(_Links(candidate, row, gap_s, log_odds), linking.has_chance(log_odds)))
+            log_odds = linking.log_odds(self._model, gaps)
+            parts.append(taken(_Links(candidate, row, gap_s, log_odds), log_odds > linking.MIN_LOG_ODDS))
         return joined(parts)
 
     def _decide(self, links: _Links, is_first: Bools, is_settled: Bools) -> Bools:
