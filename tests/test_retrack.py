@@ -54,15 +54,13 @@ def along(path: dict[int, tuple[float, float]], truth: dict[int, tuple[float, fl
 class TestHorizon:
     """Horizons of prediction, on people who walk along the first axis."""
 
-    @pytest.mark.parametrize("distance", ["mean", "max", "first"])
+    @pytest.mark.parametrize("distance", ["mean", "max"])
     def test_predictions_of_one_step_are_refused_where_two_predictions_of_one_time_are_compared(self, distance):
         frames = walk(lambda n: {7: (0.5 * n, 0.0)}, 12)
         with pytest.raises(McaptrackError, match=r"horizon_s 0\.4 is one step at 2\.5 Hz.*takes 0\.8 s at least"):
             run(replace(PAPER, distance=distance, horizon_s=0.4), frames)
         two = run(replace(PAPER, distance=distance, horizon_s=0.8), frames)[0]
         assert [ids(frame) for frame in two] == [[1]] * 12
-        one = run(replace(PAPER, distance="now", horizon_s=0.4), frames)[0]
-        assert [ids(frame) for frame in one] == [[1]] * 12
 
 
 class TestFailuresOfThePaper:
@@ -136,7 +134,7 @@ def made(path) -> dict[str, object]:
 def test_a_profile_names_its_method_and_options_of_another_are_refused(walked):
     assert call("retrack", "a.mcap", "--profile", "authors").code == 0
     assert made(walked / "a.mcap")["retracker"] == "consistency"
-    result = call("retrack", "a.mcap", "--set", "distance=now")
+    result = call("retrack", "a.mcap", "--set", "distance=max")
     assert (result.code, result.err) == (
         1,
         "mcaptrack: --set distance is an option of consistency, not of likelihood\n",

@@ -102,7 +102,7 @@ NUMBERS = {
     "min_hits": [0, 1, 2], "min_track_s": [0.0, 0.8, 2.0], "rate_hz": [2.5, 4.0],
 }  # fmt: skip
 CHOICES = {
-    "distance": ["mean", "max", "first", "now"],
+    "distance": ["mean", "max"],
     "covariance": ["paper", "predictor"],
     "birth": ["raw", "smoothed"],
     "backfill": ["none", "unclaimed", "all"],
@@ -275,9 +275,7 @@ def test_links_with_equal_odds_do_not_depend_on_how_many_steps_are_read_at_once(
 # Symmetries of re-tracking: positions, times, ids and distant people don't change the tracks of a crowd
 
 
-#: "now" compares predictions of the current step, which the other distances of Algorithm 1 don't.
-METHODS = dict(PROFILES) | {"now": RetrackByConsistency(distance="now", noise_m=0.3)}
-every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+every_method = pytest.mark.parametrize("method", PROFILES.values(), ids=PROFILES)
 
 
 def outputs(method: Retracking, frames: list[Frame]) -> list[Rows]:

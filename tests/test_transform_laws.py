@@ -47,7 +47,7 @@ def variants() -> list[tuple[str, Transform]]:
     """Every transform with its defaults, and with what changes its course."""
     out: list[tuple[str, Transform]] = [(name, kind()) for name, kind in TRANSFORMS.items()]
     out += [("retrack", profile) for profile in PROFILES.values()]
-    out += [("retrack", RetrackByConsistency(distance="first", min_history=1, backfill="none", max_age_s=1.0))]
+    out += [("retrack", RetrackByConsistency(min_history=1, backfill="none", max_age_s=1.0))]
     out += [("predict", TRANSFORMS["predict"](predictor=name)) for name in ("cv", "holt-cv")]
     out += [("detect", KnnDetector(stabilise=False))]
     plane = {"ground_planes": ((0, PLANE),)}

@@ -35,28 +35,13 @@ from mcaptrack.transforms.retrack import Retracking
 PAPER, AUTHORS, DEFAULT = PROFILES["paper"], PROFILES["authors"], PROFILES["default"]
 #: Nothing done after the fact.
 _PLAIN = {"link_s": 0.0, "resolve_swaps": False, "smooth": False, "track_confidence": 0.0}
-_NOW = replace(
-    AUTHORS,
-    distance="now",
-    priority_distance=0.0,
-    birth="raw",
-    interpolated=False,
-    min_history=2,
-    backfill="unclaimed",
-    trim_ends=False,
-)
 #: The way from the paper to the default, one step a row; each row's options are those of `mcaptrack retrack`.
 STEPS: dict[str, tuple[str, Retracking]] = {
     "paper": ("--profile paper", PAPER),
     "authors": ("--profile authors", AUTHORS),
-    "distance of current positions": (
-        "--profile authors --set distance=now --set priority_distance=0 --set birth=raw --set interpolated=false "
-        "--set min_history=2 --set backfill=unclaimed --set trim_ends=false",
-        _NOW,
-    ),
     "computed covariance": (
-        "... --set covariance=predictor --predictor kalman --set gate_m=3 --set alpha=1 --set beta=0",
-        replace(_NOW, covariance="predictor", predictor="kalman", gate_m=3.0, alpha=1.0, beta=0.0),
+        "--profile authors --set covariance=predictor --predictor kalman --set gate_m=3 --set alpha=1 --set beta=0",
+        replace(AUTHORS, covariance="predictor", predictor="kalman", gate_m=3.0, alpha=1.0, beta=0.0),
     ),
     "likelihood, estimated noise": (
         "--link-s 0 --set resolve_swaps=false --no-smooth --set track_confidence=0",

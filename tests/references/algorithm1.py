@@ -98,7 +98,7 @@ class Algorithm1:
             value.append([])
             for row, run, mean, cov in observations:
                 age = step - track.seen
-                distance = round(self.distance(track, age, run[-1], mean, cov), 6)
+                distance = round(self.distance(track, age, mean, cov), 6)
                 jump = hypot(*(track.mean[age - 1] - run[-1])) if age <= len(track.mean) else inf
                 near = distance <= o.max_distance and (o.gate_m is None or jump <= o.gate_m)
                 cost = distance if near else None
@@ -108,7 +108,7 @@ class Algorithm1:
                 value[-1].append(None if cost is None else same - cost)
         return best_assignment(value, most_pairs=True)
 
-    def distance(self, track: Track, age: int, here: Point, mean: np.ndarray, cov: np.ndarray) -> float:
+    def distance(self, track: Track, age: int, mean: np.ndarray, cov: np.ndarray) -> float:
         """Eq. 1 at each step that both predict, and Eq. 2 or a variant of it."""
         o, horizon = self.options, len(mean)
 
@@ -118,19 +118,13 @@ class Algorithm1:
         def mahalanobis(off: np.ndarray, of: np.ndarray) -> float:
             return float(sqrt(off @ np.linalg.inv(of) @ off))
 
-        if o.distance == "now":
-            if age > horizon:
-                return inf
-            noise = 0.2 if o.noise_m is None else o.noise_m
-            of = spread(track.cov[age - 1], age) + noise**2 * np.eye(2)
-            return mahalanobis(track.mean[age - 1] - here, of)
         each = []
         for u in range(1, horizon - age + 1):  # u steps from now
             of = spread(track.cov[age + u - 1], age + u) + spread(cov[u - 1], u)
             each.append(mahalanobis(track.mean[age + u - 1] - mean[u - 1], of))
         if not each:
             return inf
-        return {"mean": sum(each) / len(each), "max": max(each), "first": each[0]}[o.distance]
+        return {"mean": sum(each) / len(each), "max": max(each)}[o.distance]
 
     def update(self, step: int, pairs: list[tuple[int, int]], observations) -> list[tuple[Track, Row]]:
         shown = []

@@ -58,11 +58,10 @@ class ConsistencyPass(OnlinePass):
 
     def __init__(self, options: ConsistencyOptions, _: Movers, frames: FrameColumns) -> None:
         horizon = max(1, round(options.horizon_s * options.rate_hz))
-        if horizon == 1 and options.distance != "now":
+        if horizon == 1:
             raise McaptrackError(
-                f"horizon_s {options.horizon_s:g} is one step at {options.rate_hz:g} Hz; the distance "
-                f'"{options.distance}" compares predictions of one time made at different steps, which takes '
-                f'{2 / options.rate_hz:g} s at least; the distance "now" needs one step'
+                f"horizon_s {options.horizon_s:g} is one step at {options.rate_hz:g} Hz; predictions of one time made "
+                f"at different steps are compared, which takes {2 / options.rate_hz:g} s at least"
             )
         super().__init__(frames, options.rate_hz, options.bridged_s)
         self._options = options
@@ -112,10 +111,7 @@ class ConsistencyPass(OnlinePass):
         options, tracks = self._options, self._tracks
         age = step - tracks.last_step
         sigma_m = options.sigma_m if options.covariance == "paper" else None
-        if options.distance == "now":
-            distance = position_distances(tracks.prediction, age, xy_m, self.noise_m, sigma_m)
-        else:
-            distance = prediction_distances(tracks.prediction, age, predictions, options.distance, sigma_m)
+        distance = prediction_distances(tracks.prediction, age, predictions, options.distance, sigma_m)
         # The last digits of predictions depend on the size of the batch; assignments must not.
         distance = np.round(distance, 6)
         cost = np.where(distance <= options.max_distance, distance, np.inf)
@@ -188,16 +184,15 @@ def paper_covariance(first: Ints, steps: int, sigma_m: float) -> Floats:
 
 
 def prediction_distances(
-    tracks: Forecast, age: Ints, observations: Forecast, kind: Literal["mean", "max", "first"], sigma_m: float | None
+    tracks: Forecast, age: Ints, observations: Forecast, kind: Literal["mean", "max"], sigma_m: float | None
 ) -> Floats:
     """Distances (K, N) between predictions of tracks, made ``age`` (K,) steps ago, and of observations, made now.
 
-    Eq. 2 averages over the steps that both predict ("mean"); the authors' program takes the largest ("max"); "first"
-    takes the first of them alone. ``sigma_m`` uses the paper's covariance, None that of the predictions. Infinite where
-    no steps overlap.
+    Eq. 2 averages over the steps that both predict ("mean"); the authors' program takes the largest ("max").
+    ``sigma_m`` uses the paper's covariance, None that of the predictions. Infinite where no steps overlap.
     """
     horizon = observations.mean.shape[1]
-    steps = 1 if kind == "first" else max(horizon - int(age.min(initial=horizon)), 0)
+    steps = max(horizon - int(age.min(initial=horizon)), 0)
     at = age[:, None] + np.arange(steps)  # step of the track's prediction that belongs to each overlapping step
     overlaps = at < horizon
     at = np.minimum(at, horizon - 1)
@@ -217,27 +212,9 @@ def prediction_distances(
     return np.where(counted.any(axis=-1), np.where(counted, distance, -np.inf).max(axis=-1, initial=-np.inf), np.inf)
 
 
-def expected_positions(tracks: Forecast, age: Ints) -> Floats:
-    """The expected positions (K, 2) of tracks ``age`` (K,) steps after their prediction; NaN beyond its horizon."""
+def metric_distances(tracks: Forecast, age: Ints, xy_m: Floats) -> Floats:
+    """Distances (K, N) in metres between where tracks are expected now and positions (N, 2); NaN beyond the horizon."""
     horizon = tracks.mean.shape[1]
     now = tracks.mean[np.arange(len(age)), np.minimum(age, horizon) - 1]
-    return np.where((age <= horizon)[:, None], now, np.nan)
-
-
-def metric_distances(tracks: Forecast, age: Ints, xy_m: Floats) -> Floats:
-    """Distances (K, N) in metres between where tracks are expected now and positions (N, 2)."""
-    off = expected_positions(tracks, age)[:, None] - xy_m[None]
+    off = np.where((age <= horizon)[:, None], now, np.nan)[:, None] - xy_m[None]
     return np.asarray(np.hypot(off[..., 0], off[..., 1]))
-
-
-def position_distances(tracks: Forecast, age: Ints, xy_m: Floats, noise_m: float, sigma_m: float | None) -> Floats:
-    """Mahalanobis distances (K, N) between where tracks are expected now and measured positions.
-
-    Positions (N, 2) are measured with ``noise_m`` on each axis. Infinite for tracks beyond the horizon of their
-    prediction.
-    """
-    now = np.minimum(age, tracks.mean.shape[1]) - 1
-    cov = tracks.cov[np.arange(len(age)), now] if sigma_m is None else paper_covariance(age, 1, sigma_m)[:, 0]
-    off = expected_positions(tracks, age)[:, None] - xy_m[None]
-    distance = mahalanobis(off, (cov + noise_m**2 * np.eye(2))[:, None])
-    return np.where(np.isnan(distance), np.inf, distance)

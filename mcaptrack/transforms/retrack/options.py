@@ -178,8 +178,6 @@ class RetrackOptions:
         return "no track is likely enough to be a person (track_confidence)"
 
 
-Distance = Literal["mean", "max", "first", "now"]
-Covariance = Literal["paper", "predictor"]
 Value = TypeVar("Value")
 
 
@@ -280,8 +278,7 @@ class ConsistencyOptions(RetrackOptions):
     Parameters
     ----------
     distance : str
-        How a track and an observation are compared: mean, max or first distance between their predicted steps,
-        or that between expected and measured position (now).
+        How a track and an observation are compared: by the mean or the max distance between their predicted steps.
     max_distance : float
         Gate: pairs further apart, in standard deviations of their predictions (d_min in the paper), are not
         matched.
@@ -309,11 +306,11 @@ class ConsistencyOptions(RetrackOptions):
 
     #: Its covariances decide which tracks match, so that it isn't that of predictions alone.
     predictor: PredictorName = option("kalman", kind="predictor", theme=_PREDICTIONS)
-    distance: Distance = setting("mean", theme=_ASSOCIATION)
+    distance: Literal["mean", "max"] = setting("mean", theme=_ASSOCIATION)
     max_distance: float = setting(3.0, least=0.0, theme=_ASSOCIATION)
     gate_m: float | None = setting(3.0, least=0.0, theme=_ASSOCIATION)
     priority_distance: float = setting(0.0, least=0.0, theme=_ASSOCIATION)
-    covariance: Covariance = setting("predictor", theme=_PREDICTIONS)
+    covariance: Literal["paper", "predictor"] = setting("predictor", theme=_PREDICTIONS)
     sigma_m: float = setting(1.0, least=1e-6, theme=_PREDICTIONS)
     alpha: float = setting(1.0, least=0.0, most=1.0, theme=_PREDICTIONS)
     beta: float = setting(0.0, least=0.0, most=1.0, theme=_PREDICTIONS)
