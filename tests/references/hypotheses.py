@@ -27,7 +27,7 @@ from tests.references.offline import (
 
 CHOICES = FITTED["choices"]
 GAPS = ("next step", "up to 1.7 s", "up to 5 s", "longer")
-ENOUGH, USUAL, BESIDE_M, SQUARE_M, ALONE, ALONE_M_PER_S = 1 / 5, 20, 2.0, 1.0, 8.0, 1.1
+ENOUGH, USUAL, BESIDE_M, SQUARE_M = 1 / 5, 20, 2.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,6 @@ class Scene:
             "rate of tracks": log((len({claim.online for claim in self.claims}) + 1) / (samples + 50)),
         }
 
-    def is_alone(self, a: list[Claim], b: list[Claim]) -> bool:
-        """Whether a link is to the next step of one online track, nearby, with no other track beside."""
-        end, begin = a[-1], b[0]
-        apart = hypot(begin.at[0] - end.at[0], begin.at[1] - end.at[1])
-        near = begin.step - end.step == 1 and apart < ALONE_M_PER_S * self.motion.step_s
-        return near and begin.online == end.online and not self.beside(end) and not self.beside(begin)
-
     def end(self, part: list[Claim], leaves: bool) -> dict[str, float]:
         """The terms of leaving at the end of a tracklet, or of coming at its beginning."""
         claim = part[-1] if leaves else part[0]
@@ -185,7 +178,7 @@ def gains_of(scene: Scene, max_gap_s: float, least: float) -> dict[tuple[int, in
         if terms is not None:
             bounds = np.maximum.accumulate([1.5 * motion.step_s, 1.7, 5.0])
             gap[i, j] = GAPS[int(np.searchsorted(bounds, terms["gap"]))]
-            link[i, j] = total(CHOICES["links"][gap[i, j]], terms) + ALONE * scene.is_alone(parts[i], parts[j])
+            link[i, j] = total(CHOICES["links"][gap[i, j]], terms)
     gains = dict.fromkeys(link, -log(least / (1 - least) * ENOUGH))
     for side, name in enumerate(("leaves", "comes")):
         none = [total(CHOICES[name], scene.end(part, name == "leaves")) for part in parts]

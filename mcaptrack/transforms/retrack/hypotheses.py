@@ -41,9 +41,6 @@ _USUAL_ENDS: Final = 20.0
 #: A person who is lost beside another one may be hidden by that one, or in one detection with that one; from this
 #: distance on nothing speaks for it, and at half of it half as much.
 _BESIDE_M: Final = 2.0
-#: The log odds that are added to links of an online track from one step to the next, no farther than at this speed and
-#: with no other track beside: however sharply a person turns there, it is the same one.
-_ALONE, _WALK_M_PER_S = 8.0, 1.1
 #: A long tracklet has so many samples, few are fewer than that; people are counted in squares of this size.
 _LONG, _FEW, _CELL_M = 8, 4, 1.0
 #: Links are kept from these odds on, as a share of those of the least confidence: pieces of a person that stay apart
@@ -108,7 +105,7 @@ class Hypotheses(NamedTuple):
     def of(
         cls, model: MotionModel, tracks: Tracks, max_gap_s: float, asked: tuple[Ints, Ints] | None = None
     ) -> Hypotheses:
-        """The hypotheses about tracks as they are now, with the ``evidence`` of those that go on alone.
+        """The hypotheses about tracks as they are now, without ``evidence``.
 
         ``asked`` are assignments before and after that are of one person, however far apart.
         """
@@ -126,7 +123,6 @@ class Hypotheses(NamedTuple):
             before, after = np.unique(np.concatenate([[before, after], more], axis=1), axis=1)
         gaps = ends.gaps(before, after)
         gap_s, alone = gaps.seconds, motion_terms(model, ends_alone.gaps(before, after))
-        same_track = tracklets.online[before] == tracklets.online[after]
         so_far, left = _samples(tracks, tracklets)
         of_ids, of_tracks = _rates(tracks, tracklets)
         terms = {
@@ -136,7 +132,7 @@ class Hypotheses(NamedTuple):
             "misfit to noise alone": alone["misfit to noise"],
             "log gap": np.log(gap_s + 0.2),
             "same input id": tracklets.source[before] == tracklets.source[after],
-            "same track": same_track,
+            "same track": tracklets.online[before] == tracklets.online[after],
             "beside one track": _largest(beside[0][before].minimum(beside[1][after])),
             "samples before": np.log(tracklets.samples[before]),
             "samples after": np.log(tracklets.samples[after]),
@@ -145,10 +141,6 @@ class Hypotheses(NamedTuple):
             "rate of input ids": np.full(len(before), of_ids),
             "rate of tracks": np.full(len(before), of_tracks),
         }
-        near_end, near_begin = map(_largest, beside)
-        apart_m = np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T)
-        is_alone = (tracklets.begins[after] - tracklets.ends[before] == 1) & (apart_m < _WALK_M_PER_S * gap_s)
-        is_alone &= same_track & (near_end[before] + near_begin[after] == 0)
         bounds = np.maximum.accumulate([1.5 * model.step_s, *GAPS_S])
         return cls(
             tracklets,
@@ -157,9 +149,9 @@ class Hypotheses(NamedTuple):
             gap_s,
             np.searchsorted(bounds, gap_s),
             columns(CHOICES.terms, terms),
-            _end_terms(model, tracks, tracklets, tracked[0], near_end, leaving=True),
-            _end_terms(model, tracks, tracklets, tracked[1], near_begin, leaving=False),
-            np.where(is_alone, _ALONE, 0.0),
+            _end_terms(model, tracks, tracklets, tracked[0], _largest(beside[0]), leaving=True),
+            _end_terms(model, tracks, tracklets, tracked[1], _largest(beside[1]), leaving=False),
+            np.zeros(len(before)),
         )
 
     def scored(self) -> Scored:

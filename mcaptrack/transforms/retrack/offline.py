@@ -56,8 +56,6 @@ _CONFIRMED_SHARE: Final = 0.25
 _SPARSE: Final = 0.25
 #: The log odds of tracks that are left out because they are too short are no larger.
 _SHORT: Final = -0.05
-#: Identities are decided so often, each time with the motion of the tracks that were decided before.
-_SWEEPS: Final = 2
 
 
 # Rows of offline tracks: described by a few numbers each while tracks are decided about, then made part by part.
@@ -229,7 +227,7 @@ def _as_assigned(options: RetrackOptions, run: OnlinePass, movers: Movers) -> Tr
 def _identified(log: WholeLog, tracks: Tracks) -> Tracks:
     """Tracks as they are decided to be, ordered by track and step."""
     options = log.options
-    for _ in range(_SWEEPS if options.link_s > 0 else 0):
+    if options.link_s > 0:
         tracks = tracks._replace(track=hypotheses_of(log, tracks).scored().best(options.link_confidence))
     if options.resolve_swaps and not log.movers.on_ground:
         tracks = _without_swaps(log, tracks)
