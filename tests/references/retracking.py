@@ -130,7 +130,7 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
     of = {(step, row["track_id"]): row for step, rows in zip(steps, samples, strict=True) for row in rows}
     paths = claims.paths(of, o.shares_samples)
     online = {(step, row["track_id"]): track for track, path in paths.items() for step, row in path.items()}
-    if o.link_s > 0:
+    for _ in range(2 if o.link_s > 0 else 0):
         places = [(track, step, row) for track, path in paths.items() for step, row in path.items()]
         held = [
             Claim(step, track, online[step, row["track_id"]], row["track_id"], (row["x_m"], row["y_m"]))

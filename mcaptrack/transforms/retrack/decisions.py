@@ -149,7 +149,7 @@ def _usual(track: Ints, source: Ints) -> Ints:
 #
 # Each world is the best set of links under scores with noise of Gumbel's distribution (perturb and MAP: Papandreou and
 # Yuille 2011), by the same solver. What was decided for reasons that no single link has (encounters, corrections of
-# people) counts for its links as much as it takes for them to be the best ones without noise.
+# people, the sweep before) counts for its links as much as it takes for them to be the best ones without noise.
 
 
 #: The scale of the noise of scores: joins hold in as many worlds as are right. (Chosen on synthetic crowds.)

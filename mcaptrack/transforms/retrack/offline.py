@@ -227,7 +227,7 @@ def _as_assigned(options: RetrackOptions, run: OnlinePass, movers: Movers) -> Tr
 def _identified(log: WholeLog, tracks: Tracks) -> Tracks:
     """Tracks as they are decided to be, ordered by track and step."""
     options = log.options
-    if options.link_s > 0:
+    for _ in range(2 if options.link_s > 0 else 0):  # the second time with the motion over gaps
         tracks = tracks._replace(track=hypotheses_of(log, tracks).scored().best(options.link_confidence))
     if options.resolve_swaps and not log.movers.on_ground:
         tracks = _without_swaps(log, tracks)
