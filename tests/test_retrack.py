@@ -202,18 +202,6 @@ def test_rows_without_metres_count_as_if_they_were_not_there(profile):
             assert_same_rows(frame.rows, same.rows)
 
 
-@pytest.mark.parametrize(("at_once", "is_person"), [(1, False), (3, False), (6, True)])
-def test_what_flickers_at_one_place_is_no_person_however_long(at_once, is_person):
-    """Two people pass; a place has samples with ids of their own now and then, for a minute."""
-
-    def positions(n):
-        out = {7: (0.4 * n - 30, 8.0), 8: (30 - 0.4 * n, 12.0)}
-        return out | ({100 + n // 25: (0.0, 0.0)} if n % 25 < at_once else {})
-
-    offline, *_ = run(DEFAULT, walk(positions, 150))
-    assert any((0.0, 0.0) in places(frame).values() for frame in offline) == is_person
-
-
 def test_one_class_is_not_split():
     frames = collect(TRACKS, [Frame(0, 0, rows_of([1, 2], [3, 3]))])
     assert split_classes(frames) == [frames]

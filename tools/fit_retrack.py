@@ -272,7 +272,9 @@ def decisions_of(run: Run) -> tuple[Judged, Judged, Judged]:
     joins = Judged(decided.hypotheses.scored().log_odds()[link][counts], (sides[0] == sides[1])[counts])
     _, track, count = np.unique(tracks.track, return_inverse=True, return_counts=True)
     is_person = np.bincount(track, people >= 0) * 2 >= count
-    short = offline._are_short(*reached("_are_short", *run.args))
+    log, *_ = reached("_people", *run.args)
+    lasts = [tracks.step[tracks.track == name].ptp() for name in np.unique(tracks.track)]
+    short = np.array(lasts) < round(log.least_s * DEFAULT.rate_hz)
     return joins, *(Judged(decided.log_odds[some, None], is_person[some]) for some in (~short, short))
 
 
@@ -428,7 +430,7 @@ def main() -> None:
     linking._PRIOR, linking.MIN_LOG_ODDS = links["usual"], links["least"]
     more = [*scenes, *runs(MORE, given.steps)]
     choices = fit_choices(list(told(choices_of, more, "choices")))
-    hypotheses.CHOICES = Choices.from_entry(choices)
+    hypotheses.CHOICES = Choices.of(choices)
     others = list(runs(JUDGED, JUDGED_STEPS))
     people = fit_people(list(told(people_of, more, "people")))
     install(false_tracks, "_PEOPLE", people)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import numpy as np
 
@@ -159,9 +159,6 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
                 move_to(tracks[track][step], state.mean[:, 0], () if step in paths[track] else o.ground_planes)
         least_s = min(o.min_track_s, (steps[-1] - steps[0]) / o.rate_hz / 3) if o.track_confidence else o.min_track_s
         length = len(tracks[track])
-        if 4 * len(paths[track]) < length:  # hardly seen: its longest run of samples counts
-            runs = groupby(enumerate(sorted(paths[track])), key=lambda seen: seen[1] - seen[0])
-            length = max(len(list(run)) for _, run in runs)
         if length < round(least_s * o.rate_hz) + 1 or person(odds[track]) < o.track_confidence:
             del tracks[track]
     return [[tracks[track][step] for track in sorted(tracks) if step in tracks[track]] for step in steps]

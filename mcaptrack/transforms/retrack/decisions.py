@@ -21,6 +21,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import find_rows, run_ends, run_starts
 from mcaptrack.notices import warn
 from mcaptrack.schema import DECISIONS, WORLDS, DecisionKind, Frame, Rows
+from mcaptrack.schema.classes import majority
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import join_frames, nearest_times, rows_at
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, best_next, following, named
@@ -106,16 +107,12 @@ def _joined(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
 def _alternatives(hypotheses: Hypotheses, log_odds: Floats) -> Ints:
     """The input id of the likeliest other link of the end of each link (E,), or -1 if there is none that may be."""
     order = np.lexsort((-log_odds, hypotheses.before))
-    rank = np.arange(len(order)) - np.maximum.accumulate(
-        np.where(run_starts(hypotheses.before[order]), np.arange(len(order)), 0)
-    )
-    other = np.full((2, len(hypotheses.tracklets.first)), _NO_ID)  # the best of each end, and the second
-    for place in (0, 1):
-        link = order[(rank == place) & (log_odds[order] >= _MAY_BE)]
-        other[place, hypotheses.before[link]] = hypotheses.tracklets.source[hypotheses.after[link]]
-    best = np.zeros(len(order), bool)
-    best[order[rank == 0]] = True
-    return np.asarray(np.where(best, other[1, hypotheses.before], other[0, hypotheses.before]))
+    order = order[log_odds[order] >= _MAY_BE]
+    low, high = (np.searchsorted(hypotheses.before[order], hypotheses.before, side) for side in ("left", "right"))
+    order = np.append(order, -1)
+    other = low + (order[low] == np.arange(len(log_odds)))
+    source = hypotheses.tracklets.source[hypotheses.after[order[np.minimum(other, len(order) - 1)]]]
+    return np.where(other < high, source, _NO_ID)
 
 
 def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
@@ -127,22 +124,12 @@ def _persons(decided: Decided, step_s: float) -> tuple[Ints, Rows]:
     rows["kind"] = np.where(decided.kept, DecisionKind.KEPT, DecisionKind.LEFT_OUT)
     rows["track_id"] = np.where(decided.kept, track[first], _NO_ID)
     rows["previous_id"] = rows["alternative_id"] = _NO_ID
-    rows["source_id"] = _usual(track, source)
+    rows["source_id"] = majority(np.cumsum(starts) - 1, source, len(first))
     is_person = probability(decided.log_odds)
     rows["probability"] = np.where(decided.kept, is_person, 1 - is_person)
     rows["duration_s"] = (step[last] - step[first]) * step_s
     rows["frames"] = last - first + 1
     return first, rows
-
-
-def _usual(track: Ints, source: Ints) -> Ints:
-    """The input id of most samples of each track (K,), of several the lowest. Assignments (C,) are by track."""
-    order = np.lexsort((source, track))
-    starts = np.flatnonzero(run_starts(track[order], source[order]))
-    count = np.diff(np.append(starts, len(order)))
-    of, ids = track[order][starts], source[order][starts]
-    best = np.lexsort((ids, -count, of))
-    return np.asarray(ids[best[run_starts(of[best])]])
 
 
 # Plausible worlds: identities of tracks, and which are people, as they may be where offline re-tracking is not sure.

@@ -230,16 +230,11 @@ def scored_log_odds(xy_m: Floats, first: Ints, score: Floats, observed: Bools, u
     in the log is clutter. Rows (N,) of track k begin at ``first[k]``, of K + 1; ``xy_m`` (N, 2) are their positions.
     ``usual`` is the median score of the log. Rows without a score count as usual ones.
     """
-    return np.asarray(scored_features(xy_m, first, score, observed, usual, step_s) @ np.array(SCORED))
-
-
-def scored_features(xy_m: Floats, first: Ints, score: Floats, observed: Bools, usual: float, step_s: float) -> Floats:
-    """The features of tracks of detections with scores, (K, 5), see ``SCORED``."""
     begin, length = first[:-1], np.diff(first)
     counted = observed & ~np.isnan(score)
     count = np.add.reduceat(observed.astype(float), begin)
     total = np.add.reduceat(np.where(counted, score / usual - _LOW, 0.0), begin)
     excess = total / np.maximum(np.add.reduceat(counted.astype(float), begin), 1) * np.minimum(length, _ENOUGH)
-    extent = np.hypot(*(np.maximum.reduceat(xy_m, begin) - np.minimum.reduceat(xy_m, begin)).T)
-    moved = np.log(np.clip(extent, 0.5, 5.0))
-    return np.stack([np.ones(len(begin)), excess, np.log(length * step_s), count / length, moved], axis=1)
+    moved = np.log(np.clip(_extent(xy_m, begin), 0.5, 5.0))
+    values = [np.ones(len(begin)), excess, np.log(length * step_s), count / length, moved]
+    return np.asarray(np.stack(values, axis=1) @ np.array(SCORED))

@@ -29,7 +29,7 @@ from mcaptrack.transforms.retrack.linking import (
     pairs_in_reach,
 )
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Tracks, filtered, to_trajectories
-from mcaptrack.transforms.retrack.weights import Choices, columns
+from mcaptrack.transforms.retrack.weights import FILE, Choices, columns
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -47,7 +47,7 @@ _LONG, _FEW, _CELL_M = 8, 4, 1.0
 #: cost more than wrong ones that go together. (Chosen on synthetic crowds.)
 _ENOUGH: Final = 1 / 5
 #: What ends and beginnings choose.
-CHOICES = Choices.of("choices")
+CHOICES = Choices.of(FILE["choices"])
 
 
 class Tracklets(NamedTuple):
@@ -323,18 +323,13 @@ def _end_terms(
     return columns(CHOICES.end_terms, terms)
 
 
-def _around(points: Floats, xy: Floats) -> Floats:
+def _around(points: Floats, xy: Floats) -> Ints:
     """The number of points (N, 2) in the square of each position (K, 2) and in the eight around it, (K,)."""
+    from scipy.spatial import cKDTree
+
     corner = np.concatenate([points, xy]).min(axis=0)
-    squares, at = (((places - corner) // _CELL_M).astype(np.int64) + 1 for places in (points, xy))
-    height = max(int(squares[:, 1].max(initial=0)), int(at[:, 1].max(initial=0))) + 2
-    square, count = np.unique(squares @ [height, 1], return_counts=True)
-    total = np.zeros(len(xy))
-    for beside in (np.array([[-1], [0], [1]]) * height + [-1, 0, 1]).ravel().tolist():
-        wanted = at @ [height, 1] + beside
-        place = np.minimum(np.searchsorted(square, wanted), len(square) - 1)
-        total += np.where(square[place] == wanted, count[place], 0) if len(square) else 0
-    return total
+    squares, here = ((places - corner) // _CELL_M for places in (points, xy))
+    return np.asarray(cKDTree(squares).query_ball_point(here, 1.5, p=np.inf, return_length=True))
 
 
 def _shifts(which: Ints, link: Floats, end: Floats, gap: Ints, usual: Floats) -> Floats:

@@ -10,7 +10,6 @@ Letters: C encounters, T steps of them, N rows of trajectories.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -18,7 +17,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.neighbours import near_pairs
-from mcaptrack.geometry.ragged import group_index, run_ends, run_starts
+from mcaptrack.geometry.ragged import batches, group_index, run_ends, run_starts
 from mcaptrack.transforms.retrack.appearance import Sides
 from mcaptrack.transforms.retrack.motion_model import MotionModel, StateRows, Trajectories, update
 
@@ -91,7 +90,8 @@ def resolve_swaps(
     begin = trajectories.first[:-1] - trajectories.step[trajectories.first[:-1]]
     swaps: dict[int, list[tuple[int, int, int]]] = {}  # of each encounter that is changed: steps, and both tracks
     gain = np.zeros(len(i))
-    for part in _batches(high - low + 1):
+    by_length = np.argsort(high - low, kind="stable")
+    for part in (by_length[span] for span in batches((high - low + 1)[by_length], _CELLS)):
         steps = low[part, None] + np.arange(int((high - low)[part].max()) + 1)
         inside = steps <= high[part, None]
         row_i = np.where(inside, steps + begin[i[part]][:, None], 0)
@@ -123,17 +123,6 @@ def _exchanged(trajectories: Trajectories, track: Ints, swaps: list[tuple[int, i
             first, last = trajectories.first[number : number + 2]
             owner[first + step - trajectories.step[first] : last] = now[number]
     return owner
-
-
-def _batches(length: Ints) -> Iterator[Ints]:
-    """Batches of encounters of similar length; each encounter is in one."""
-    order = np.argsort(length, kind="stable")
-    first = 0
-    while first < len(order):
-        cells = np.arange(1, len(order) - first + 1) * length[order[first:]]  # those that are shorter are padded
-        last = first + max(int(np.searchsorted(cells, _CELLS, "right")), 1)
-        yield order[first:last]
-        first = last
 
 
 def find_encounters(trajectories: Trajectories) -> Encounters:

@@ -139,10 +139,10 @@ def _keep_ids(
 ) -> Iterator[tuple[Frame, ...]]:
     """For each frame tracks that are linked in the picture, if the method does that; the input and its predictions."""
     settings = options.predictor, options.horizon_s, options.min_history, options.rate_hz
-    forecaster = Forecaster(*settings, adapt=options.follows_log)
+    forecaster = Forecaster(*settings, adapt=options.adapt)
     linked: Iterator[Rows] | None = None
     stored: Iterator[Rows] = repeat(APPEARANCE.empty())
-    if options.drawn_worlds:
+    if options.worlds:
         warn(
             "`worlds=` finds nothing to write: without a measured ground plane tracks are not decided",
             "option-not-used",

@@ -177,17 +177,13 @@ def filtered(model: MotionModel, trajectories: Trajectories) -> tuple[State, Sta
     return forward, backward
 
 
-def smooth(model: MotionModel, trajectories: Trajectories) -> State:
-    """The state of every row from past, present and future (RTS smoother).
+def smooth(model: MotionModel, trajectories: Trajectories, noise_m: Floats | None = None) -> State:
+    """The state of every row from past, present and future (RTS smoother). ``noise_m`` (N,) is the model's by default.
 
     Source: Rauch, Tung, Striebel 1965.
     """
-    return _smoothed(model, trajectories, np.full(len(trajectories.step), model.noise_m))
-
-
-def _smoothed(model: MotionModel, trajectories: Trajectories, noise_m: Floats) -> State:
-    """The state of every row from all of its track, with the noise of each, (N,)."""
     steps = _Steps.of(trajectories.first)
+    noise_m = np.full(len(trajectories.step), model.noise_m) if noise_m is None else noise_m
     xy_m = trajectories.xy_m.T.take(steps.forward, axis=1)
     forward = _states(_filter(model, xy_m, noise_m[steps.forward], steps.bounds), steps.forward)
     rows = StateRows(*(np.ascontiguousarray(part[steps.backward].T) for part in forward))
@@ -244,7 +240,7 @@ def smooth_in_log(model: MotionModel, trajectories: Trajectories, is_noise_known
     usual_m = model.noise_m / faster**2
     of_track = np.maximum(level_m, np.minimum(usual_m, _DOUBT * level_m))
     model = replace(model, speed_m_per_s=_ANY_SPEED_M_PER_S)
-    return _smoothed(model, trajectories, np.repeat(of_track, np.diff(trajectories.first))).mean[:, :2]
+    return smooth(model, trajectories, np.repeat(of_track, np.diff(trajectories.first))).mean[:, :2]
 
 
 def _usual_speed(trajectories: Trajectories, step_s: float) -> float:

@@ -52,8 +52,6 @@ from mcaptrack.transforms.to_video_rate import move_rows
 
 #: Tracks in metres were confirmed by the scores of their detections: they may be shorter by this factor.
 _CONFIRMED_SHARE: Final = 0.25
-#: Tracks with samples in a smaller share of their steps are as long as they were seen at once.
-_SPARSE: Final = 0.25
 #: The log odds of tracks that are left out because they are too short are no larger.
 _SHORT: Final = -0.05
 
@@ -202,7 +200,7 @@ def offline_tracks(
     out[""] = rows_by_step(taken(rows, left), samples, shown_m, options.ground_planes, steps, times_ns)
     if DECISIONS in options.writes.values():
         decided = Decided(tracks, log_odds, kept, hypotheses_of(log, tracks, is_final=True))
-        if options.drawn_worlds:
+        if options.worlds:
             out[WORLDS_OUTPUT] = world_rows(_worlds(log, decided), decided.hypotheses, model.step_s, steps)
         out["decisions"] = decision_rows(decided, model, samples, steps)
     if (stored := options.stored_looks) is not None:
@@ -262,8 +260,7 @@ def _people(log: WholeLog, tracks: Tracks, rows: TrackRows, paths: Trajectories)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
     is_fixed |= np.isin(ids, log.answers.persons(tracks, yes=True))
     is_clutter = np.isin(ids, log.answers.persons(tracks, yes=False)) & ~is_fixed
-    of_row = group_index(np.diff(paths.first))
-    is_short = _are_short(of_row, rows.is_sample, len(ids), round(log.least_s * options.rate_hz) + 1)
+    is_short = np.diff(paths.first) <= round(log.least_s * options.rate_hz)
     smoothed = smooth(log.model, paths)
     if movers.on_ground:
         odds = scored_log_odds(
@@ -283,25 +280,12 @@ def _people(log: WholeLog, tracks: Tracks, rows: TrackRows, paths: Trajectories)
     return np.where(is_fixed, np.inf, odds), is_fixed | is_likely
 
 
-def _are_short(of_row: Ints, is_sample: Bools, count: int, least: int) -> Bools:
-    """Which of so many tracks have fewer than ``least`` rows (R,); in a row, if they were hardly seen in between.
-
-    What flickers at one place, as leaves do, is joined to long tracks with a sample now and then.
-    """
-    length, seen = np.bincount(of_row, minlength=count), np.bincount(of_row[is_sample], minlength=count)
-    starts = np.flatnonzero(run_starts(of_row, is_sample))
-    lasts = np.where(is_sample[starts], np.diff(np.append(starts, len(of_row))), 0)
-    longest = np.zeros(count, np.int64)
-    np.maximum.at(longest, of_row[starts], lasts)
-    return np.asarray(np.where(seen < _SPARSE * length, longest, length) < least)
-
-
 def _worlds(log: WholeLog, decided: Decided) -> Worlds:
     """The worlds of what was decided; those of each class have a seed of their own."""
     options, tracks, first = log.options, decided.tracks, decided.hypotheses.tracklets.first
     of_class = int(column(log.run.samples, "class_id")[0])
     least_steps = round(log.least_s * options.rate_hz)
-    worlds = draw_worlds(options.drawn_worlds, decided, options.link_confidence, least_steps, of_class)
+    worlds = draw_worlds(options.worlds, decided, options.link_confidence, least_steps, of_class)
     if options.fixed_ids:
         for track in worlds.track:
             whole = tracks._replace(track=track[decided.hypotheses.tracklets.of])

@@ -1,9 +1,8 @@
 """Online tracking by likelihood: data association step by step, from the past alone.
 
 Every track is a Kalman filter. An observation is assigned to the track that makes it likely, and the input's track ids
-count as evidence: much where a person walks alone, little in a crowd, where trackers confuse people. A track without
-an observation is coasting: its filter predicts on until the track terminates. Tracks that are occluded stay alive while
-they are merged into one detection with another track.
+count as evidence. A track without an observation is coasting: its filter predicts on until the track terminates. Tracks
+that are occluded stay alive while they are merged into one detection with another track.
 
 The numbers of tracks are rows of arrays, with a column for each track. A step has few tracks, so what takes time is the
 number of operations on arrays. Letters: K tracks, N observations of one step, P pairs of both, L lost tracks.
@@ -21,7 +20,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.hull import GrowingHull
-from mcaptrack.geometry.neighbours import Pairing, near_pairs
+from mcaptrack.geometry.neighbours import Pairing
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, StateRows, update
 
@@ -250,49 +249,27 @@ class OnlineLinks:
 _NOTHING: Final = np.empty(0, np.intp), np.empty(0, np.intp)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Association:
-    """The evidence for and against pairs of tracks and observations, in squared standard deviations.
-
-    That is twice a log likelihood ratio. ``same_id`` and ``same_id_crowded`` count for a pair if the observation has
-    the input id that the track had last: alone, and with another observation within ``crowd_m``. ``new_id`` counts
-    against an input id that was never seen before if the track missed nothing. ``unmatched`` is the cost of leaving a
-    pair unmatched, and ``gate`` the largest squared Mahalanobis distance of a pair. ``extra_noise_m`` is added to the
-    noise of positions. Two tracks may be merged into one detection that lies within ``merge_distance_m`` of both, for
-    at most ``merge_timeout_s``, if the middle between them makes it likelier by ``merge_evidence`` than the position of
-    the track that has it: otherwise a missed detection beside another person would be taken for a merged one. Tracks
-    that are merged stay so without it, because the detection soon draws the track that has it to the middle.
-    """
-
-    same_id: float
-    same_id_crowded: float
-    merge_distance_m: float
-    merge_timeout_s: float
-    merge_evidence: float = 4.0
-    unmatched: float = 26.0
-    gate: float = 40.0
-    crowd_m: float = 1.7
-    new_id: float = 4.0
-    extra_noise_m: float = 0.1
+# The evidence for pairs of tracks and observations is in squared standard deviations: twice a log likelihood ratio.
+#
+# Two tracks may be merged into one detection if the middle between them makes it likelier, by ``_MERGE_EVIDENCE``, than
+# the position of the track that has it: otherwise a missed detection beside another person would be taken for a merged
+# one. Tracks that are merged stay so without it, because the detection soon draws the track that has it to the middle.
 
 
-class Step(NamedTuple):
-    """The tracks alive after a step.
-
-    ``tracks`` (6, K) are their whole numbers (``IDS`` to ``MERGED``), ``mean`` (4, K) and ``cov`` (3, K) are their
-    states, as in ``StateRows``.
-    """
-
-    tracks: Ints
-    mean: Floats
-    cov: Floats
+#: The cost of leaving a pair unmatched, and the largest squared Mahalanobis distance of a pair.
+_UNMATCHED, _GATE = 26.0, 40.0
+#: What counts against an input id that was never seen before if the track missed nothing; and what is added to the
+#: noise of positions, in metres.
+_NEW_ID, _EXTRA_NOISE_M = 4.0, 0.1
+_MERGE_EVIDENCE: Final = 4.0
 
 
 class Alive(NamedTuple):
     """The tracks alive at each of F steps, R in all, laid end to end.
 
     ``steps`` (F,) are the numbers of the steps, ``passed`` (F,) is by how many time advanced to each, and ``tick`` (R,)
-    the index of the step of each track, rising. ``tracks`` (6, R) are as in ``Step``, ``state`` (R,) are their states.
+    the index of the step of each track, rising. ``tracks`` (6, R) are their whole numbers (``IDS`` to ``MERGED``),
+    ``state`` (R,) their states.
     """
 
     steps: Ints
@@ -312,12 +289,15 @@ class OnlineTracker:
     """The tracks that are alive. Ages are in steps.
 
     Tracks are tentative before ``confirm_hits`` observations; they terminate after ``max_age`` steps without one,
-    tentative ones after ``max_age_tentative``. ``noise_m`` is the noise of positions: that of the model, or as it was
-    estimated so far.
+    tentative ones after ``max_age_tentative``. ``same_id`` counts for a pair if the observation has the input id that
+    the track had last. Two tracks may be merged into one detection that lies within ``merge_distance_m`` of both, for
+    at most ``merge_timeout_s``. ``noise_m`` is the noise of positions: that of the model, or as estimated so far.
     """
 
     model: MotionModel
-    association: Association
+    same_id: float
+    merge_distance_m: float
+    merge_timeout_s: float
     max_age: int
     confirm_hits: int
     max_age_tentative: int
@@ -332,10 +312,11 @@ class OnlineTracker:
     def __post_init__(self) -> None:
         self.noise_m = self.model.noise_m
 
-    def step(self, xy_m: Floats, source: Ints, sample: Ints, passed: int) -> Step:
+    def step(self, xy_m: Floats, source: Ints, sample: Ints, passed: int) -> tuple[Ints, Floats, Floats]:
         """Advance by ``passed`` steps and associate observations at (2, N) with the input ids ``source`` (N,).
 
-        ``sample`` (N,) are the numbers of the observations in the log.
+        ``sample`` (N,) are the numbers of the observations in the log. Returns the tracks alive then: their whole
+        numbers (6, K), means (4, K) and covariances (3, K), as in ``StateRows``.
         """
         self.tracks[MISSED] += passed
         is_over = np.where(self.tracks[HITS] >= self.confirm_hits, self.max_age, self.max_age_tentative)
@@ -356,7 +337,7 @@ class OnlineTracker:
             free = is_free.nonzero()[0]
             self._start(xy_m[:, free], source[free], sample[free])
         self.known_sources.update(source.tolist())
-        return Step(self.tracks.copy(), self.state.mean.copy(), self.state.cov.copy())
+        return self.tracks.copy(), self.state.mean.copy(), self.state.cov.copy()
 
     def _merge(self, track: Ints, observed: Floats, passed: int) -> Ints:
         """Update lost tracks that are merged into one detection with another track (occlusion).
@@ -366,16 +347,16 @@ class OnlineTracker:
         about either track once they separate. ``observed`` (2, P) are the observations of the tracks ``track`` (P,).
         Returns the indices into ``track`` of those that occlude others.
         """
-        tracks, limits, (p, _, _) = self.tracks, self.association, self.state.cov
+        tracks, (p, _, _) = self.tracks, self.state.cov
         is_confirmed = tracks[HITS] >= self.confirm_hits
-        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < limits.merge_timeout_s)
+        is_lost = is_confirmed & (tracks[MERGED] * self.model.step_s < self.merge_timeout_s)
         is_lost[track] = False
         lost, confirmed = is_lost.nonzero()[0], is_confirmed[track].nonzero()[0]
         if not len(lost) or not len(confirmed):
             return np.empty(0, np.int64)
         seen, expected = observed[:, confirmed], self.state.mean[:2, lost]
         distance_m, nearest = _nearest(expected, seen)
-        is_near = distance_m < limits.merge_distance_m
+        is_near = distance_m < self.merge_distance_m
         lost, expected, host = lost[is_near], expected[:, is_near], confirmed[nearest[is_near]]
         seen, owner = observed[:, host], track[host]
         own, noise = self.state.mean[:2, owner], self.noise_m**2
@@ -383,10 +364,10 @@ class OnlineTracker:
         alone, together = p[owner] + noise, (p[owner] + p[lost]) / 4 + noise  # the middle of two: a quarter of both
         evidence = to_own / alone - to_middle / together + 2 * np.log(alone / together)
         was_merged = (tracks[MERGED, lost] > 0) | (tracks[SOURCE, lost] == -1)  # they may take turns at having it
-        is_merged = (to_middle < to_own) & (was_merged | (evidence > limits.merge_evidence))
+        is_merged = (to_middle < to_own) & (was_merged | (evidence > _MERGE_EVIDENCE))
         lost, host = lost[is_merged], host[is_merged]
         state = self.state.take(lost)
-        update(state, observed[:, host], limits.merge_distance_m / 2)
+        update(state, observed[:, host], self.merge_distance_m / 2)
         self.state.mean[:, lost], self.state.cov[:, lost] = state
         tracks[MISSED, lost] = np.maximum(tracks[MISSED, lost] - passed, 1)
         tracks[MERGED, lost] += passed
@@ -395,7 +376,7 @@ class OnlineTracker:
     def _update(self, track: Ints, xy_m: Floats, source: Ints, occluder: Ints) -> None:
         """Update tracks (P,) with their observations (2, P); those of ``occluder`` are merged with others."""
         state, noise_m = self.state.take(track), np.full(len(track), self.noise_m)
-        noise_m[occluder] = self.association.merge_distance_m / 2
+        noise_m[occluder] = self.merge_distance_m / 2
         if self.estimate_noise:
             self._adapt_noise(state, xy_m, (self.tracks[HITS, track] >= self.confirm_hits) & (noise_m == self.noise_m))
         update(state, xy_m, noise_m)
@@ -418,22 +399,21 @@ class OnlineTracker:
 
     def _assigned(self, xy_m: Floats, source: Ints) -> tuple[Ints, Ints]:
         """Tracks and observations that belong together, (P,) each."""
-        association, tracks = self.association, self.tracks
+        tracks = self.tracks
         if tracks.shape[1] == 0 or len(source) == 0:
             return _NOTHING
-        s = self.state.cov[0] + self.noise_m**2 + association.extra_noise_m**2
-        pairs = Pairing(self.state.mean[:2], xy_m, np.sqrt(association.gate * s))
+        s = self.state.cov[0] + self.noise_m**2 + _EXTRA_NOISE_M**2
+        pairs = Pairing(self.state.mean[:2], xy_m, np.sqrt(_GATE * s))
         squared = _squared(pairs.of_second(xy_m) - pairs.of_first(self.state.mean[:2]))
         squared /= pairs.of_first(s)
-        gain = association.unmatched - squared
+        gain = _UNMATCHED - squared
         gain -= pairs.of_first(2 * np.log(s))
-        bonus = np.where(_is_crowded(xy_m, association.crowd_m), association.same_id_crowded, association.same_id)
-        gain += (pairs.of_first(tracks[SOURCE]) == pairs.of_second(source)) * pairs.of_second(bonus)
+        gain += self.same_id * (pairs.of_first(tracks[SOURCE]) == pairs.of_second(source))
         names = source.tolist()
         if not self.known_sources.issuperset(names):
             is_new = np.array([name not in self.known_sources for name in names])
-            gain -= association.new_id * (pairs.of_second(is_new) & pairs.of_first(tracks[MISSED] == 1))
-        gain = np.where(squared <= association.gate, np.round(gain, 6), -1.0)
+            gain -= _NEW_ID * (pairs.of_second(is_new) & pairs.of_first(tracks[MISSED] == 1))
+        gain = np.where(squared <= _GATE, np.round(gain, 6), -1.0)
         if gain.ndim == 2:
             return assign_by_gain(gain)
         return assign_pairs_by_gain(pairs.chosen(gain > 0), gain[gain > 0], pairs.shape)[0]
@@ -448,16 +428,6 @@ class OnlineTracker:
         self.tracks = np.concatenate([self.tracks, born], axis=1)
         new = self.model.initial(xy_m, self.noise_m)
         self.state = StateRows(*(np.concatenate(both, axis=1) for both in zip(self.state, new, strict=True)))
-
-
-def _is_crowded(xy_m: Floats, crowd_m: float) -> Bools:
-    """Whether others are nearer than ``crowd_m`` to each position (2, N)."""
-    count = xy_m.shape[1]
-    if count * count > LARGE_TABLE:
-        pairs = np.concatenate(near_pairs(np.zeros(count, np.int64), xy_m.T, crowd_m))
-        return np.bincount(pairs, minlength=count) > 0
-    near = _squared(xy_m[:, :, None] - xy_m[:, None]) < crowd_m**2
-    return np.asarray(near.sum(axis=0) > 1)
 
 
 def _nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Final, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Final, Literal
 
 import numpy as np
 
@@ -109,7 +109,7 @@ class RetrackOptions:
     speed_m_per_s: float = setting(1.75, least=0.0, theme=_MOTION)
     drift_m_per_s: float = setting(0.12, least=0.0, theme=_MOTION)
     drift_ratio: float = setting(0.08, least=0.0, theme=_MOTION)
-    same_id_bonus: float = setting(12.0, least=0.0, theme=_ASSOCIATION)
+    same_id_bonus: float = setting(4.0, least=0.0, theme=_ASSOCIATION)
     max_age_s: float = option(2.0, least=0.0, theme=_LIFE)
     interpolated: bool = setting(False, theme=_ASSOCIATION)
     min_track_s: float = setting(2.0, least=0.0, theme=_LIFE)
@@ -141,12 +141,12 @@ class RetrackOptions:
     # compared, and if it is stored; the number of worlds that are drawn.
     links_in_picture: ClassVar[bool] = False
     filled_s: ClassVar[float] = 0.0
-    follows_log: ClassVar[bool] = True
+    adapt: ClassVar[bool] = True
     follows_speed: ClassVar[bool] = False
     shares_samples: ClassVar[bool] = False
     looks: ClassVar[Descriptors | None] = None
     stored_looks: ClassVar[Descriptors | None] = None
-    drawn_worlds: ClassVar[int] = 0
+    worlds: ClassVar[int] = 0
 
     @property
     def bridged_s(self) -> float:
@@ -178,16 +178,13 @@ class RetrackOptions:
         return "no track is likely enough to be a person (track_confidence)"
 
 
-Value = TypeVar("Value")
-
-
-class _OfOutputs(Generic[Value]):
+class _OfOutputs:
     """A value for each output: on the class for all outputs, on an object for those that it writes."""
 
-    def __init__(self, of_all: Mapping[str, Value]) -> None:
+    def __init__(self, of_all: Mapping[str, Any]) -> None:
         self._of_all = MappingProxyType(of_all)
 
-    def __get__(self, options: LikelihoodOptions | None, _: type) -> Mapping[str, Value]:
+    def __get__(self, options: LikelihoodOptions | None, _: type) -> Mapping[str, Any]:
         if options is None:
             return self._of_all
         is_asked = {APPEARANCE_OUTPUT: options.store_appearance, WORLDS_OUTPUT: options.worlds > 0}
@@ -240,10 +237,6 @@ class LikelihoodOptions(RetrackOptions):
         """The longest gap that is filled where tracks are only linked in the picture; the longest link."""
         return min(self.link_s, MAX_LINK_IN_PICTURE_S)
 
-    @property
-    def follows_log(self) -> bool:  # type: ignore[override]
-        return self.adapt
-
     follows_speed: ClassVar[bool] = True
 
     merge_distance_m: float = setting(1.0, least=0.0, theme=_ASSOCIATION)
@@ -251,10 +244,10 @@ class LikelihoodOptions(RetrackOptions):
     confirm_s: float = setting(1.2, least=0.0, theme=_LIFE)
     coast_s: float = setting(1.2, least=0.0, theme=_LIFE)
     adapt_online: bool = setting(True, theme=_LIFE)
-    adapt: bool = setting(True, ADAPT_HELP, theme=_PREDICTIONS)
+    adapt: bool = setting(True, ADAPT_HELP, theme=_PREDICTIONS)  # type: ignore[misc]
     appearance: bool | None = option(None, theme=_OFFLINE)
     store_appearance: bool = option(False, theme=_OFFLINE)
-    worlds: int = option(0, least=0, most=1000, theme=_OFFLINE)
+    worlds: int = option(0, least=0, most=1000, theme=_OFFLINE)  # type: ignore[misc]
     descriptors: Descriptors | None = context(lambda: None, is_recorded=False)
 
     @property
@@ -264,10 +257,6 @@ class LikelihoodOptions(RetrackOptions):
     @property
     def stored_looks(self) -> Descriptors | None:  # type: ignore[override]
         return self.descriptors if self.store_appearance else None
-
-    @property
-    def drawn_worlds(self) -> int:  # type: ignore[override]
-        return self.worlds
 
 
 @dataclass(frozen=True, kw_only=True)

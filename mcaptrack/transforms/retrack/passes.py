@@ -38,7 +38,6 @@ from mcaptrack.transforms.retrack.online_tracker import (
     IDS,
     SAMPLE,
     Alive,
-    Association,
     OnlineLinks,
     OnlineTracker,
     ShownTracks,
@@ -213,12 +212,9 @@ class LikelihoodPass(OnlinePass):
         noise = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m / movers.unit_m
         self._tracker = OnlineTracker(
             model=motion_model(options, noise, movers),
-            association=Association(
-                same_id=options.same_id_bonus,
-                same_id_crowded=options.same_id_bonus / 3,
-                merge_distance_m=options.merge_distance_m / movers.unit_m,
-                merge_timeout_s=options.merge_timeout_s,
-            ),
+            same_id=options.same_id_bonus,
+            merge_distance_m=options.merge_distance_m / movers.unit_m,
+            merge_timeout_s=options.merge_timeout_s,
             max_age=max_age,
             confirm_hits=confirm_hits,
             max_age_tentative=min(confirm_hits, max_age),
@@ -227,9 +223,7 @@ class LikelihoodPass(OnlinePass):
         self._shown = ShownTracks(confirm_hits, round(options.coast_s * rate), max_age, options.adapt_online)
         self._links = OnlineLinks(self._tracker.model, options.link_s, options.link_confidence, confirm_hits)
         self._online = FrameCollector(TRACKS)
-        self._forecasts = OnlineForecasts(
-            options.predictor, options.horizon_s, rate, options.follows_log, movers.unit_m
-        )
+        self._forecasts = OnlineForecasts(options.predictor, options.horizon_s, rate, options.adapt, movers.unit_m)
         self._recent = Histories(self._forecasts.past)  # of tracks, in m
         for low, high in spans_of(frames.ends, _SAMPLES):
             self._track(join_frames(TRACKS, frames, low, high), frames.numbers[low:high], slice(low, high))
@@ -253,7 +247,7 @@ class LikelihoodPass(OnlinePass):
             for (low, high), by in zip(bounds, passed.tolist(), strict=True)
         ]
         tracks, mean, cov = (np.concatenate(all_, axis=-1) for all_ in zip(*results, strict=True))
-        tick = group_index([result.tracks.shape[1] for result in results])
+        tick = group_index([numbers.shape[1] for numbers, *_ in results])
         self._write(Alive(steps, passed, tick, tracks, State(mean.T, cov.T)), part, numbers, first)
 
     def _write(self, alive: Alive, part: JoinedFrames, numbers: Ints, first: int) -> None:
@@ -320,7 +314,7 @@ class KeptIds(OnlinePass):
             options.rate_hz,
             options.class_names,
             options.class_limits,
-            adapt=options.follows_log,
+            adapt=options.adapt,
         )
         source = column(frames, "track_id")
         ids, first, which = np.unique(source, return_index=True, return_inverse=True)

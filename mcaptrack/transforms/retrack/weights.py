@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from mcaptrack.geometry.arrays import Floats
 
 WEIGHTS: Final = Path(__file__).with_name("weights.json")
-_FILE: Final[Mapping[str, Any]] = json.loads(WEIGHTS.read_text(encoding="utf-8"))
+FILE: Final[Mapping[str, Any]] = json.loads(WEIGHTS.read_text(encoding="utf-8"))
 
 
 class Logistic(NamedTuple):
@@ -33,7 +33,7 @@ class Logistic(NamedTuple):
     @classmethod
     def of(cls, model: str) -> Logistic:
         """The model of this name in the file."""
-        entry = _FILE[model]
+        entry = FILE[model]
         return cls(tuple(entry["weights"]), np.array([*entry["weights"].values()]), float(entry["bias"]), entry)
 
     def log_odds(self, features: Floats) -> Floats:
@@ -62,13 +62,8 @@ class Choices(NamedTuple):
     usual_comes: Floats
 
     @classmethod
-    def of(cls, model: str) -> Choices:
-        """The model of this name in the file."""
-        return cls.from_entry(_FILE[model])
-
-    @classmethod
-    def from_entry(cls, entry: Mapping[str, Any]) -> Choices:
-        """The model of an entry of such a file."""
+    def of(cls, entry: Mapping[str, Any]) -> Choices:
+        """The model of an entry of the file."""
         terms, end_terms = tuple(next(iter(entry["links"].values()))), tuple(entry["leaves"])
         links = [[weights[name] for name in terms] for weights in entry["links"].values()]
         ends = [[entry[side][name] for name in end_terms] for side in ("leaves", "comes")]
