@@ -23,7 +23,7 @@ LINKS = FITTED["links"]["weights"]
 LINK_NAMES = ("miss", "misfit to noise", "gap", "misfit or stay by gap", "turn", "stay and speed", "misfit and speed")
 LINK_WEIGHTS = [LINKS[name] for name in LINK_NAMES]
 LINK_BIAS, LINK_USUAL, LINK_LEAST = (FITTED["links"][name] for name in ("bias", "usual", "least"))
-MEET_M, MARGIN, EXCHANGE_COST, SAME_ID, LEAST_COST, LEAST_GAIN = 2.0, 10, 2.0, 1.0, 1.0, 1.0
+MEET_M, MARGIN, EXCHANGE_COST, LEAST_GAIN = 2.0, 10, 2.5, 1.0
 DRIFTS = (0.05, 0.15, 0.4, 1.2)
 
 
@@ -203,7 +203,7 @@ class Survivor:
 
 
 def course_of(
-    apart: list[np.ndarray | None], cost: list[float], motion: Motion, drift: float, evidence: float = 0.0
+    apart: list[np.ndarray | None], motion: Motion, drift: float, evidence: float = 0.0
 ) -> tuple[list[bool], float, float]:
     """The likeliest hypothesis of swaps (Viterbi), its gain over no swap, and its log likelihood.
 
@@ -229,14 +229,14 @@ def course_of(
                 max(
                     (
                         (one, at, one.score + one.likelihood(at, noise) - fee, False)
-                        for one, fee in ((kept, 0.0), (crossed, cost[step]))
+                        for one, fee in ((kept, 0.0), (crossed, EXCHANGE_COST))
                     ),
                     key=lambda each: each[2],
                 ),
                 max(
                     (
                         (one, -at, one.score + one.likelihood(-at, noise) - fee, True)
-                        for one, fee in ((crossed, 0.0), (kept, cost[step]))
+                        for one, fee in ((crossed, 0.0), (kept, EXCHANGE_COST))
                     ),
                     key=lambda each: each[2],
                 ),
@@ -272,28 +272,13 @@ def encounters(paths: dict[int, Path]) -> list[tuple[int, int, int, int, int, in
     return out
 
 
-def exchange_costs(a: dict[int, int], b: dict[int, int], low: int, high: int) -> list[float]:
-    """The cost of a swap at each step, by the input ids of the two tracks."""
-    costs, last_a, last_b = [], None, None
-    for step in range(low, high + 1):
-        now_a, now_b = a.get(step), b.get(step)
-        same = (now_a is not None and now_a == last_a) + (now_b is not None and now_b == last_b)
-        crossed = (now_a is not None and now_a == last_b) + (now_b is not None and now_b == last_a)
-        costs.append(max(EXCHANGE_COST + SAME_ID * (same - crossed), LEAST_COST))
-        last_a, last_b = last_a if now_a is None else now_a, last_b if now_b is None else now_b
-    return costs
-
-
-def exchanged(
-    motion: Motion, paths: dict[int, Path], ids: dict[int, dict[int, int]]
-) -> tuple[dict[int, dict[int, int]], int]:
+def exchanged(motion: Motion, paths: dict[int, Path]) -> tuple[dict[int, dict[int, int]], int]:
     """For each track the one to which each step belongs after identity swaps, and how many encounters were changed."""
     decided = []
     for a, b, low, high, *_ in encounters(paths):
         steps = range(low, high + 1)
         apart = [np.subtract(paths[a][s], paths[b][s]) if s in paths[a] and s in paths[b] else None for s in steps]
-        costs = exchange_costs(ids[a], ids[b], low, high)
-        course, gain, _ = max((course_of(apart, costs, motion, d) for d in DRIFTS), key=lambda each: each[2])
+        course, gain, _ = max((course_of(apart, motion, d) for d in DRIFTS), key=lambda each: each[2])
         if gain >= LEAST_GAIN:
             decided.append((gain, a, b, low, high, course))
 

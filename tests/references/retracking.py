@@ -140,8 +140,7 @@ def offline(claims: Claims, samples: list[list[Row]], steps: list[int], options,
         for track, (_, step, row) in zip(swept(motion, held, o.link_s, o.link_confidence), places, strict=True):
             paths.setdefault(track, {})[step] = row
     if o.resolve_swaps:
-        ids = {track: {step: row["track_id"] for step, row in path.items()} for track, path in paths.items()}
-        owner, _ = exchanged(motion, places_of(paths), ids)
+        owner, _ = exchanged(motion, places_of(paths))
         changed: dict[int, dict[int, Row]] = {}
         for track, path in paths.items():
             for step, row in path.items():

@@ -30,11 +30,8 @@ _MARGIN: Final = 10
 #: Errors of the expected relative position have Student's distribution with so many degrees of freedom: people also
 #: turn round, and a normal distribution would then believe in a swap against all other evidence.
 _FREEDOM: Final = 6.0
-#: Cost of a swap as a log likelihood; how much more it costs for each of the two tracks that keeps its input id there
-#: (and less for each that takes over the input id of the other); and what it costs at least.
-_SWAP_COST: Final = 2.0
-_SAME_ID_COST: Final = 1.0
-_LEAST_COST: Final = 1.0
+#: Cost of a swap as a log likelihood. Input ids count no more: trackers exchange them where people exchange places.
+_SWAP_COST: Final = 2.5
 #: Steps of encounters that are computed with at once.
 _CELLS: Final = 2**16
 #: The least gain in log likelihood of swaps over none.
@@ -70,18 +67,13 @@ class Encounters(NamedTuple):
     part_ways: Ints
 
 
-def resolve_swaps(
-    model: MotionModel, trajectories: Trajectories, row: Ints, source: Ints, seen: Sides | None = None
-) -> tuple[Ints, int]:
+def resolve_swaps(model: MotionModel, trajectories: Trajectories, seen: Sides | None = None) -> tuple[Ints, int]:
     """The track that each row of the trajectories belongs to (N,), and the number of encounters that were changed.
 
-    ``row`` are the rows with an observation, and ``source`` the input id of each. An encounter stays as it is if a
-    better one changes one of its tracks at the same time. ``seen`` compares what the tracks look like before and after
-    an encounter.
+    An encounter stays as it is if a better one changes one of its tracks at the same time. ``seen`` compares what the
+    tracks look like before and after an encounter.
     """
     track = group_index(np.diff(trajectories.first))
-    input_id = np.full(len(track), -1)
-    input_id[row] = source
     encounters = find_encounters(trajectories)
     if len(encounters.i) == 0:
         return track, 0
@@ -97,9 +89,7 @@ def resolve_swaps(
         row_i = np.where(inside, steps + begin[i[part]][:, None], 0)
         row_j = np.where(inside, steps + begin[j[part]][:, None], 0)
         relative = np.where(inside[..., None], trajectories.xy_m[row_i] - trajectories.xy_m[row_j], np.nan)
-        id_i, id_j = np.where(inside, input_id[row_i], -1), np.where(inside, input_id[row_j], -1)
-        cost = np.maximum(_SWAP_COST + _SAME_ID_COST * _continuity(id_i, id_j), _LEAST_COST)
-        paths, gain[part] = find_swaps(model, relative, cost, evidence[part])
+        paths, gain[part] = find_swaps(model, relative, evidence[part])
         for at, path, length in zip(part.tolist(), paths, (high - low)[part].tolist(), strict=True):
             if gain[at] >= _MIN_GAIN:
                 changes = low[at] + np.flatnonzero(np.diff(path[: length + 1], prepend=False))
@@ -146,28 +136,12 @@ def find_encounters(trajectories: Trajectories) -> Encounters:
     return Encounters(i, j, low, high, when[begin], when[end])
 
 
-def _continuity(id_i: Ints, id_j: Ints) -> Floats:
-    """The number of tracks (C, T) of an encounter that keep their input id, minus those that take over the other's."""
-
-    def before(ids: Ints) -> Ints:
-        at = np.maximum.accumulate(np.where(ids >= 0, np.arange(ids.shape[1]), 0), axis=1)
-        return np.concatenate([np.full((len(ids), 1), -1), np.take_along_axis(ids, at, axis=1)[:, :-1]], axis=1)
-
-    last_i, last_j = before(id_i), before(id_j)
-    same = ((id_i == last_i) & (id_i >= 0)).astype(float) + ((id_j == last_j) & (id_j >= 0))
-    crossed = ((id_i == last_j) & (id_i >= 0)).astype(float) + ((id_j == last_i) & (id_j >= 0))
-    return np.asarray(same - crossed)
-
-
-def find_swaps(
-    model: MotionModel, relative_m: Floats, swap_cost: Floats, evidence: Floats | None = None
-) -> tuple[Bools, Floats]:
+def find_swaps(model: MotionModel, relative_m: Floats, evidence: Floats | None = None) -> tuple[Bools, Floats]:
     """At which steps of encounters the identities are swapped, (C, T), and how much more likely that is than no swap.
 
     ``relative_m`` (C, T, 2) is the position of one track relative to the other, NaN where one of them was not observed.
-    ``swap_cost`` (C, T) is the cost of a swap between a step and the one before, as a log likelihood. The identities of
-    the first step stand. ``evidence`` (C,) is the log likelihood ratio that they are swapped at the last step, by what
-    else is known. The gain (C,) is a difference of log likelihoods.
+    The identities of the first step stand. ``evidence`` (C,) is the log likelihood ratio that they are swapped at the
+    last step, by what else is known. The gain (C,) is a difference of log likelihoods.
     """
     swapped = np.zeros(len(relative_m)) if evidence is None else evidence
     drifts = len(DRIFTS_M_PER_S)  # all at once: a step of few encounters takes as long as one of many
@@ -175,16 +149,13 @@ def find_swaps(
     paths, gain, likelihood = _viterbi(
         replace(model, drift_m_per_s=drift, drift_ratio=0.0, noise_m=np.sqrt(2) * model.noise_m),
         np.tile(relative_m, (drifts, 1, 1)),
-        np.tile(swap_cost, (drifts, 1)),
         np.tile(swapped, drifts),
     )
     best = np.argmax(likelihood.reshape(drifts, -1), axis=0) * len(relative_m) + np.arange(len(relative_m))
     return paths[best], gain[best]
 
 
-def _viterbi(
-    model: MotionModel, relative_m: Floats, swap_cost: Floats, is_swapped: Floats
-) -> tuple[Bools, Floats, Floats]:
+def _viterbi(model: MotionModel, relative_m: Floats, is_swapped: Floats) -> tuple[Bools, Floats, Floats]:
     """Swaps (C, T), their gain (C,) and log likelihood (C,) with the noise and drift of relative positions."""
     count, steps = relative_m.shape[:2]
     # hypotheses: as labelled, swapped, and never swapped at all
@@ -208,7 +179,7 @@ def _viterbi(
         like = -(_FREEDOM / 2 + 1) * np.log1p((off**2).sum(0) / s[..., None] / _FREEDOM) - np.log(s)[..., None]
         like = np.where(go[..., None], like, 0.0)
         stay = total[:, :2] + np.stack([like[:, 0, 0], like[:, 1, 1]], axis=1)
-        change = total[:, 1::-1] + np.stack([like[:, 1, 0], like[:, 0, 1]], axis=1) - swap_cost[:, step, None]
+        change = total[:, 1::-1] + np.stack([like[:, 1, 0], like[:, 0, 1]], axis=1) - _SWAP_COST
         came_swapped[step] = jumped = (change > stay) & go
         total = np.concatenate([np.where(jumped, change, stay), (total[:, 2] + like[:, 2, 0])[:, None]], axis=1)
         source = np.concatenate([np.where(jumped, [1, 0], [0, 1]), np.full((count, 1), 2)], axis=1)

@@ -250,7 +250,7 @@ def _without_swaps(log: WholeLog, tracks: Tracks) -> Tracks:
     """Undo swaps of tracks that met."""
     ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
     seen = None if log.appearance is None else log.appearance.between(tracks)
-    owner, _ = resolve_swaps(log.model, trajectories, row, tracks.source, seen)
+    owner, _ = resolve_swaps(log.model, trajectories, seen)
     return tracks._replace(track=ids[owner[row]])
 
 
