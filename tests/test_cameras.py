@@ -121,7 +121,7 @@ def label(path: Path, topic: str) -> None:
             writer.add_message(number, *message)
 
 
-@pytest.mark.parametrize(("pictures", "boxes", "truth"), one_in(4, LAYOUTS))
+@pytest.mark.parametrize(("pictures", "boxes", "truth"), one_in(8, LAYOUTS))
 def test_recorded_detections_and_pictures_are_one_camera(tmp_path, pictures, boxes, truth):
     path = tmp_path / "boxes.mcap"
     write_log(path, pictures, boxes=boxes)

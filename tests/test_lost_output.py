@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from tests.commands import GROUP
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 
 #: Forks a process for each line of JSON on stdin, and prints its exit code. What streams become is as a shell does it.
 _SERVER = """
@@ -138,6 +138,7 @@ def test_an_answer_that_is_lost_is_said(server, tmp_path, template, line):
     _check(server, tmp_path, line, template)
 
 
-@pytest.mark.parametrize("line", one_in(len(EVERY), EVERY))
+@pytest.mark.parametrize("line", EVERY)
+@thorough
 def test_of_every_command(server, tmp_path, line):
     _check(server, tmp_path, line, None)

@@ -248,7 +248,7 @@ def test_who_comes_back_where_expected_keeps_the_id():
 
 
 @given(seed=SEEDS, link_s=st.sampled_from([4.0, 20.0]), confidence=st.sampled_from([0.2, 0.5, 0.9]))
-@settings(max_examples=6, phases=QUICK)
+@settings(max_examples=3, phases=QUICK)
 def test_online_links_equal_the_reference(seed, link_s, confidence):
     rng = np.random.default_rng(seed)
     transform = Retrack(**(PLAIN | {"link_s": link_s}), link_confidence=confidence, predictor="cv", horizon_s=2.0)

@@ -83,7 +83,7 @@ JUMPS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "gap", "beside_m"), one_in(2, JUMPS.values()), ids=JUMPS)
+@pytest.mark.parametrize(("name", "gap", "beside_m"), one_in(4, JUMPS.values()), ids=JUMPS)
 def test_the_longest_jump_that_a_track_follows(name, gap, beside_m):
     def sources(rows) -> list[tuple[int, int]]:
         return [(int(row["track_id"]), int(row["source_id"])) for row in rows]
@@ -166,7 +166,7 @@ def ours_exchanged(paths: dict[int, Path], ids: dict[int, dict[int, int]]) -> bo
 
 
 @pytest.mark.parametrize(
-    ("gap", "named"), one_in(2, product([0, 4], ["follow the people", "follow the labels", "are new"]))
+    ("gap", "named"), one_in(5, product([0, 4], ["follow the people", "follow the labels", "are new"]))
 )
 def test_the_least_distance_at_which_swapped_ids_are_noticed(named, gap):
     """Two stand beside each other, and their ids are swapped: the nearer they are, the smaller the evidence."""

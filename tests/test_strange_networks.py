@@ -312,7 +312,7 @@ def test_a_network_that_breaks_its_process_is_named(use):
     assert refused(use, LOOP(USES[use][1])) == "strange.onnx can't be run: the process that ran it was ended by SIGSEGV"
 
 
-@pytest.mark.parametrize(("number", "use"), one_in(3, product([signal.SIGINT, signal.SIGKILL, signal.SIGTERM], USES)))
+@pytest.mark.parametrize(("number", "use"), one_in(6, product([signal.SIGINT, signal.SIGKILL, signal.SIGTERM], USES)))
 def test_signals_end_a_command_and_its_network(use, number, template, folder):
     log = shutil.copyfile(template, folder / "log.mcap")
     Path("strange.onnx").write_bytes(LOOP(USES[use][1]))

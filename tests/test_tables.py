@@ -348,7 +348,7 @@ def same(path, form, table):
     return read.column("track_id").to_pylist() == table.column("track_id").to_pylist()
 
 
-@pytest.mark.parametrize("form", one_in(2, tables.FORMATS))
+@pytest.mark.parametrize("form", one_in(4, tables.FORMATS))
 def test_killed_at_any_byte_or_call_the_file_is_the_old_one_or_the_new_one(tmp_path, monkeypatch, form):
     path, (old, new) = tmp_path / "t", two_tables()
     tables.write(path, new, {}, (), form)
