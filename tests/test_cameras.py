@@ -89,6 +89,7 @@ def test_a_stage_does_not_replace_the_source_of_its_input(path):
     done("sample", path, "--topic", "/camera/retracks", "--to", "/camera/sampled", "-q")
 
 
+@thorough
 def test_stages_do_not_replace_channels_of_other_stages(path):
     before = path.read_bytes()
     names = {"video", "truth", "ground_plane", *(stage.output_topic for stage in STAGES.values())}

@@ -19,7 +19,7 @@ from tests.commands import call
 from tests.extension_cases import needs
 from tests.logs import provenance_of, recorder
 from tests.ros_messages import pixels, ros_writer
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 from tests.worlds import small_scene
 
 TOPIC = "/cam/image_raw"
@@ -223,6 +223,7 @@ def test_forms_of_the_same_pictures_are_one_camera(tmp_path, form):
 
 
 @needs("fuse")
+@thorough
 def test_the_eyes_of_a_stereo_camera_are_two_cameras(tmp_path):
     path = written(tmp_path / "a.mcap", {"/stereo/left/image_raw": USUAL, "/stereo/right/image_raw": USUAL}, 2.0)
     assert set(mcaptrack.run(path, tables=False, fuse=False).cameras) == {"stereo/left", "stereo/right"}

@@ -125,7 +125,7 @@ def leave_nothing_undone(work: Work, tmp_path: Path, step: int) -> None:
     assert kills >= 3
 
 
-@pytest.mark.parametrize("name", one_in(2, sorted(WORKS.keys() - {"run with another re-tracker"})))
+@pytest.mark.parametrize("name", one_in(4, sorted(WORKS.keys() - {"run with another re-tracker"})))
 def test_killed_at_some_calls_the_next_command_completes_what_is_owed(name, tmp_path):
     leave_nothing_undone(WORKS[name], tmp_path, WORKS[name].step)
 

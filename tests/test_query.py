@@ -23,6 +23,7 @@ from mcaptrack.tables.export import ALWAYS, default_folder, export
 from mcaptrack.tables.sql import Database
 from tests.commands import GROUP, Outcome, Terminal, call
 from tests.logs import write_channels
+from tests.tiers import thorough
 from tests.worlds import ns, tracks_at
 
 PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
@@ -375,6 +376,7 @@ def test_a_given_file_is_a_table(known, tmp_path):
     assert "end with" in refusal(known, query, "--with", f"zones={known}")
 
 
+@thorough
 def test_ctrl_c_ends_a_query_and_the_database_stays_usable(known):
     program = (
         "import os, signal, sys, threading\n"

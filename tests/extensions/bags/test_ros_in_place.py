@@ -29,7 +29,7 @@ from tests.commands import call, done
 from tests.extensions.bags.bags import MOT, T0, bag1, bag2, record
 from tests.logs import recorder
 from tests.space_logs import WAYS, Robot, write
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 
 Raw = tuple[str, int, bytes]
 
@@ -217,6 +217,7 @@ def copied(tracked, tmp_path) -> Path:
     return tmp_path / "drive" / "drive.mcap"
 
 
+@thorough
 def test_a_recording_of_several_files_is_counted_as_a_whole(copied):
     other = copied.with_name("drive_1.mcap")
     done("track", other, "--topic", "/lidar/boxes", "--in-place")

@@ -28,6 +28,7 @@ from mcaptrack.schema import DECISIONS, TRACKS, Frame
 from mcaptrack.transforms import Retrack
 from tests.browser import browser, needs_browser
 from tests.commands import call, done, printed
+from tests.tiers import thorough
 from tests.worlds import crossing_tracks, noisy_tracks, ns, replace_channel, tracked, write_channels
 
 QUICK = [Phase.explicit, Phase.generate]
@@ -243,6 +244,7 @@ def seen(finished, tmp_path_factory):
     return path
 
 
+@thorough
 def test_a_judge_weighs_where_there_are_pictures_and_is_never_certain(seen, tmp_path, monkeypatch):
     own = shutil.copyfile(seen, tmp_path / "walk.mcap")
     (tmp_path / "alike.py").write_text(
