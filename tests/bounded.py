@@ -14,7 +14,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, suppress
+from io import StringIO
 from pathlib import Path
 from shutil import rmtree
 from typing import NamedTuple
@@ -141,9 +142,12 @@ def faults(
 def _serve(lines: Iterable[str]) -> None:
     from mcaptrack import pipeline  # noqa: F401
     from mcaptrack.__main__ import main
-    from mcaptrack.cli import app  # noqa: F401
+    from mcaptrack.cli import app
     from mcaptrack.sources.ingest import ingest  # noqa: F401
     from mcaptrack.tables import export  # noqa: F401
+
+    with suppress(SystemExit), redirect_stderr(StringIO()):
+        app(["info", "none.mcap"])  # loads what every command needs
 
     for line in lines:
         words, moment = json.loads(line)

@@ -46,7 +46,7 @@ def inputs(command: str, *names: str) -> list[str]:
     return list(names)
 
 
-@pytest.mark.parametrize("command", one_in(6, sorted(SEVERAL & READING.keys() - COMBINING)))
+@pytest.mark.parametrize("command", one_in(12, sorted(SEVERAL & READING.keys() - COMBINING)))
 def test_a_broken_input_does_not_stop_the_others(command, folder):
     bad = ["missing.mcap"] if command == "check" else ["broken.mcap", "missing.mcap"]  # check tells what is broken
     *bad, good = inputs(command, *bad, "a.mcap")

@@ -89,6 +89,7 @@ def test_a_stage_does_not_replace_the_source_of_its_input(path):
     done("sample", path, "--topic", "/camera/retracks", "--to", "/camera/sampled", "-q")
 
 
+@thorough
 def test_stages_do_not_replace_channels_of_other_stages(path):
     before = path.read_bytes()
     names = {"video", "truth", "ground_plane", *(stage.output_topic for stage in STAGES.values())}
@@ -121,7 +122,7 @@ def label(path: Path, topic: str) -> None:
             writer.add_message(number, *message)
 
 
-@pytest.mark.parametrize(("pictures", "boxes", "truth"), one_in(4, LAYOUTS))
+@pytest.mark.parametrize(("pictures", "boxes", "truth"), one_in(8, LAYOUTS))
 def test_recorded_detections_and_pictures_are_one_camera(tmp_path, pictures, boxes, truth):
     path = tmp_path / "boxes.mcap"
     write_log(path, pictures, boxes=boxes)

@@ -15,6 +15,7 @@ from mcaptrack.evaluation.forecasts import find_forecast_errors
 from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import STAGES
 from tests.logs import write_stock
+from tests.tiers import one_in
 
 HOUR_NS = 3_600 * 10**9
 YEARS_NS = 56 * 365 * 24 * HOUR_NS
@@ -64,7 +65,7 @@ def results(transform, frames, after_ns):
     return outputs, ids
 
 
-@pytest.mark.parametrize("name", TRANSFORMS)
+@pytest.mark.parametrize("name", one_in(3, TRANSFORMS))
 @settings(max_examples=2, deadline=None)
 @example(YEARS_NS)
 @given(JUMPS_NS)
@@ -79,7 +80,7 @@ def test_results_depend_on_no_jump_beyond_an_hour(name, jump_ns):
         assert not before & after, "a track goes on after the jump"
 
 
-@pytest.mark.parametrize("name", TRANSFORMS)
+@pytest.mark.parametrize("name", one_in(3, TRANSFORMS))
 @settings(max_examples=2, deadline=None)
 @given(JUMPS_NS)
 def test_before_a_jump_results_are_those_of_this_part_alone(name, jump_ns):

@@ -29,7 +29,7 @@ from mcaptrack.sources.foreign.flatten import flattener, message_type_of
 from tests.box_reading import boxes_in
 from tests.commands import call
 from tests.logs import recorder
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 from tests.undefined import T0, message, names_no_definitions, package, store_of
 
 #: How one type is written: ROS 2, ROS 1, IDL, DDS, Python, and with what writers put before it.
@@ -144,7 +144,7 @@ def rows(path: Path) -> list:
         return [re.sub(r"'\w+': |[{}]", "", repr([*read(found.payload).values()])) for found in opened.messages("/t")]
 
 
-@pytest.mark.parametrize("kind", one_in(2, ASKS))
+@pytest.mark.parametrize("kind", one_in(4, ASKS))
 def test_a_type_is_the_same_in_every_spelling(tmp_path, kind):
     """For everything that asks for a type, and for every way in which its definition is written."""
     name, asked = ASKS[kind]
@@ -237,7 +237,7 @@ DISTRIBUTIONS = [store for store in Stores if store.value.startswith("ros2_")]
 
 @pytest.mark.parametrize(
     ("distribution", "name"),
-    one_in(5, product(DISTRIBUTIONS, ["visualization_msgs/MarkerArray", "vision_msgs/Detection2DArray"])),
+    one_in(9, product(DISTRIBUTIONS, ["visualization_msgs/MarkerArray", "vision_msgs/Detection2DArray"])),
 )
 def test_the_definition_is_taken_that_the_messages_fit(tmp_path, name, distribution):
     """As the distribution has it that wrote them, whatever the newest one has: each field has the value it had."""
@@ -256,6 +256,7 @@ def test_the_definition_is_taken_that_the_messages_fit(tmp_path, name, distribut
     assert "which fits its messages" in warnings[0].message
 
 
+@thorough
 def test_of_definitions_that_fit_alike_that_of_the_distribution_is_taken():
     """Messages without any boxes fit each definition: the guess is said, with the others."""
     empty = b"\0\1\0\0" + bytes(4)

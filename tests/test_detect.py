@@ -18,7 +18,7 @@ from mcaptrack.schema import Frame
 from mcaptrack.sources.demo import SyntheticScene, pairs_scene
 from mcaptrack.transforms import STAGES, KnnDetector, MedianDetector
 from mcaptrack.transforms.detect.background import Registration, _BackgroundModel, _PersonHeight, clear_border, halve
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 from tests.worlds import ns, small_scene
 
 
@@ -277,6 +277,7 @@ def test_pictures_of_another_size_begin_another_view(name, stabilise):
             np.testing.assert_array_equal(columns_to_boxes(late.rows), columns_to_boxes(frame.rows))
 
 
+@thorough
 def test_leaves_that_sway_do_not_pass_for_people_far_away():
     """A tree gives more outlines than three pairs who cross the square; of its height there are no people."""
     scene = replace(pairs_scene(10), fps=5)

@@ -222,7 +222,7 @@ KNOWN: dict[str, Seen] = {}
 
 
 @pytest.mark.parametrize(
-    ("command", "option"), one_in(13, [(name, option) for name, known in CASES.items() for option in known])
+    ("command", "option"), one_in(41, [(name, option) for name, known in CASES.items() for option in known])
 )
 def test_an_option_has_an_effect(command, option, see):
     case = CASES[command][option]
@@ -260,7 +260,7 @@ USES = {
 
 
 @pytest.mark.parametrize(
-    ("command", "base"), one_in(9, [(name, base) for name, bases in USES.items() for base in bases])
+    ("command", "base"), one_in(17, [(name, base) for name, bases in USES.items() for base in bases])
 )
 def test_an_option_without_effect_is_a_warning(command, base, see):
     before, silent = KNOWN.get(base) or see(base), []

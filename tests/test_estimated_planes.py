@@ -250,6 +250,7 @@ def test_a_camera_that_moves_is_refused(tmp_path):
     assert made.parameters == {"refused": "the camera moves"}
 
 
+@thorough
 def test_tracks_of_other_trackers_give_a_plane_too(tmp_path):
     frames = []
     for number, some in enumerate(BOXES):

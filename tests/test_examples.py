@@ -10,7 +10,7 @@ from typing import Any
 import nbformat
 import pytest
 
-from tests.tiers import one_in
+from tests.tiers import thorough
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
@@ -36,7 +36,8 @@ def own_jupyter(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
-@pytest.mark.parametrize("path", one_in(3, NOTEBOOKS), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@thorough
 def test_a_notebook_prints_what_stands_in_it(path, tmp_path, own_jupyter):
     notebook = nbformat.read(path, as_version=4)
     kept = printed(notebook)

@@ -39,6 +39,7 @@ from mcaptrack.testing import LawError
 from tests.commands import call, done
 from tests.distributions import package
 from tests.logs import provenance_of, recorder
+from tests.tiers import thorough
 from tools import pages
 
 #: A command and a class of an extension; of the core, where there is no extension.
@@ -1034,6 +1035,7 @@ def test_a_package_makes_a_scene_of_cameras(site, monkeypatch):
     done("retrack", "a.mcap", "--camera", "world")
 
 
+@thorough
 def test_a_package_that_fails_at_making_a_scene_is_named_and_the_cameras_are_run(site, monkeypatch):
     add(site, "scene", "meeting", MEETING.replace("        how = ", "        how = 1 / 0\n        how = "))
     parts = Finishers()

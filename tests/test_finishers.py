@@ -70,13 +70,20 @@ def test_the_command_line_and_python_have_the_options_of_a_finisher(site, path):
         assert not ended.returncode, ended.stderr
         return ended.stdout
 
-    assert "--crowded N" in said("-m", "mcaptrack", "run", "--help-all")
     count = crowded(path, 2)
     assert 0 < count < crowded(path, 1)
-    made = json.loads(said("-m", "mcaptrack", "run", str(path), "--no-tables", "--crowded", "2", "--json"))
-    assert made["results"][0]["crowded"] == {TOPIC: count}
-    code = f"import mcaptrack; r = mcaptrack.run({str(path)!r}, crowded=1, tables=False); print(r.stages, r.crowded)"
-    assert said("-c", code).split("\n")[0] == str(("crowded",)) + f" {{{TOPIC!r}: {crowded(path, 1)}}}"
+    code = f"""
+import json, mcaptrack
+from tests.commands import done
+print("--crowded N" in done("run", "--help-all").out)
+print(json.dumps(json.loads(done("run", {str(path)!r}, "--no-tables", "--crowded", "2", "--json").out)))
+result = mcaptrack.run({str(path)!r}, crowded=1, tables=False)
+print(result.stages, result.crowded)
+"""
+    listed, made, again = said("-c", code).splitlines()
+    assert listed == "True"
+    assert json.loads(made)["results"][0]["crowded"] == {TOPIC: count}
+    assert again == str(("crowded",)) + f" {{{TOPIC!r}: {crowded(path, 1)}}}"
 
 
 def test_later_runs_do_it_again_and_one_line_says_where_nothing_can(site, path, run):  # noqa: F811

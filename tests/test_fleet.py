@@ -24,7 +24,7 @@ from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
 from mcaptrack.fleet.worker import Reply, Request
 from tests import fleet_tasks
 from tests.awaiting import is_running, until
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
@@ -152,6 +152,7 @@ def test_logs_that_harm_their_worker_are_named_and_the_others_are_done(folder):
     assert not list(folder.glob(".*"))
 
 
+@thorough
 def test_logs_that_exceed_a_limit_are_ended_and_named(folder):
     """What exceeds a limit never ends; the log that does is the only one with a limit of time, which others may miss."""
     (folder / "eat.mcap").write_text("eat")
@@ -179,6 +180,7 @@ class TestASecondTime:
         assert run().counts == {"skipped": 2, "done": 1, "failed": 1}
         assert run(add="-").counts == {"done": 3, "failed": 1}
 
+    @thorough
     def test_a_ledger_that_was_cut_or_is_of_another_command_does_no_harm(self, folder):
         ledger = folder / "ledger.jsonl"
         fleet.run(fleet_tasks.touch, folder, {"add": "+"}, ledger=ledger)

@@ -24,6 +24,7 @@ def scheduler(tmp_path_factory) -> Iterator[fleet_cluster.Running]:
         yield running
 
 
+@thorough
 def test_a_cluster_does_what_processes_do_until_its_scheduler_is_lost(scheduler, tmp_path, monkeypatch):
     address, process = scheduler
     monkeypatch.chdir(tmp_path)

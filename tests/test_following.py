@@ -20,6 +20,7 @@ from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from tests.commands import call, done
 from tests.logs import provenance_of
 from tests.places import write_parts
+from tests.tiers import thorough
 
 FPS, FRAMES = 10, 210
 #: The first frame of each of three parts.
@@ -159,6 +160,7 @@ def test_a_second_run_has_nothing_to_do_until_the_log_before_changes(parts, tmp_
     assert provenance_of(paths[1], "/camera/tracks").continued == {}
 
 
+@thorough
 def test_the_command_line_takes_logs_in_their_order(parts, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for old in parts[:2]:
@@ -226,6 +228,7 @@ def several(tmp_path) -> list[Path]:
     return write_parts(tmp_path)
 
 
+@thorough
 def test_a_camera_that_the_log_before_lacks_begins_and_others_go_on(several):
     mcaptrack.drop(several[0], ["/south/detections", "/south/ground_plane"])
     with collected():

@@ -72,6 +72,7 @@ def stamped(part: Any) -> int:
     return stamp.sec * 10**9 + stamp.nanosec if hasattr(stamp, "sec") else stamp.ToNanoseconds()
 
 
+@thorough
 def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
     before = content(robot)
     for words in (("detect", "--topic", IMAGES), ("track",), ("retrack",)):

@@ -29,6 +29,7 @@ from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.ground import GroundTracker
 from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
 from tests.memory import held
+from tests.tiers import one_in
 
 RECTANGLES = st.lists(st.tuples(*[st.integers(0, 12)] * 2, *[st.integers(0, 9)] * 2, st.integers(0, 2)), max_size=14)
 
@@ -110,7 +111,7 @@ def scores(truth: list[Frame], tracks: list[Frame], similarity: str):
     return located, counts, identity(compared), people.hits.sum(), people.matched.tolist(), people.switches.tolist()
 
 
-@pytest.mark.parametrize("name", SMALL)
+@pytest.mark.parametrize("name", one_in(3, SMALL))
 def test_results_are_the_same_with_and_without_tables_of_all_pairs(name, request):
     wanted = SMALL[name]()
     request.getfixturevalue("no_tables")
@@ -137,7 +138,7 @@ LARGE = {
 }
 
 
-@pytest.mark.parametrize("name", LARGE)
+@pytest.mark.parametrize("name", one_in(3, LARGE))
 def test_twice_the_boxes_of_a_frame_take_twice_the_memory(name):
     """A table of 3000 x 3000 alone takes 72 MB, four times as much for twice the boxes."""
     LARGE[name](100)()  # what is imported, and made once

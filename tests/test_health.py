@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from importlib import metadata
 from pathlib import Path
@@ -133,18 +130,19 @@ def test_a_plug_in_that_cant_be_imported_is_a_warning(tmp_path, monkeypatch):
     assert [warning["message"] for warning in said["warnings"]] == [why]
 
 
-def test_packages_that_bring_the_same_module_are_named(tmp_path):
+def test_packages_that_bring_the_same_module_are_named(tmp_path, monkeypatch):
     """As opencv-python does beside opencv-python-headless, whatever of them was installed last."""
     info = tmp_path / "opencv_python-9.8.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: opencv-python\nVersion: 9.8\n")
 
+    monkeypatch.syspath_prepend(str(tmp_path))
+
     def doctor(record: str) -> tuple[int, str, str]:
-        """What `doctor` says in a process of its own, with a package that has this file."""
+        """What `doctor` says with a package that has this file."""
         (info / "RECORD").write_text(f"{record},,\n")
-        command, paths = [sys.executable, "-m", "mcaptrack", "doctor", "-q"], {"PYTHONPATH": str(tmp_path)}
-        outcome = subprocess.run(command, env=os.environ | paths, capture_output=True, text=True, check=False)
-        return outcome.returncode, outcome.stdout, outcome.stderr
+        code, out, err = call("doctor", "-q")
+        return code, out, err
 
     assert doctor("cv2/data/__init__.py") == (0, "", "")
     own = metadata.version("opencv-python-headless")

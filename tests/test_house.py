@@ -19,6 +19,7 @@ import yaml
 
 from mcaptrack.installed import declared
 from tests.extension_cases import of_extensions
+from tests.tiers import one_in, thorough
 
 TESTS = Path(__file__).parent
 ROOT = TESTS.parent
@@ -105,7 +106,7 @@ def ask(folder: Path, *, core: bool) -> dict[str, Any]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize("gone", [*EXTENSIONS, "all"])
+@pytest.mark.parametrize("gone", ["all", *one_in(len(EXTENSIONS), EXTENSIONS)])
 def test_without_an_extension_the_rest_works_and_what_is_missing_is_named(gone, tmp_path):
     missing = EXTENSIONS if gone == "all" else [gone]
     house_without(missing, tmp_path)
@@ -131,6 +132,7 @@ def test_without_an_extension_the_rest_works_and_what_is_missing_is_named(gone, 
 
 
 @pytest.mark.parametrize("gone", EXTENSIONS[:1])
+@thorough
 def test_entry_points_of_a_folder_that_is_gone_do_not_count(gone, tmp_path):
     house_without([gone], tmp_path)
     info = tmp_path / "mcaptrack-1.dist-info" / "entry_points.txt"
@@ -226,7 +228,7 @@ def test_extensions_use_public_names_of_public_modules(extension):
     assert deep == {*modules.split()}
 
 
-@pytest.mark.parametrize(("command", "option"), [("run", "zones"), ("zones", "topic")])
+@pytest.mark.parametrize(("command", "option"), one_in(2, [("run", "zones"), ("zones", "topic")]))
 def test_a_setting_of_a_missing_extension_is_named_with_it(command, option, tmp_path):
     house_without(["zones"], tmp_path)
     (tmp_path / "own.toml").write_text(f'[{command}]\n{option} = "a"\n')

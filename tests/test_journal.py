@@ -18,6 +18,7 @@ from mcaptrack.log.byte_source import OpenFile
 from mcaptrack.log.journal import journal_of
 from tests.interrupted import add_results, everything, interrupt
 from tests.logs import SCHEMA, write_log
+from tests.tiers import one_in
 
 SOME = [("abc"[n % 3], n, n, bytes([n]) * 3000) for n in range(100)]
 AS_ROOT = os.geteuid() == 0
@@ -99,7 +100,7 @@ def look(path: Path) -> None:
             list(opened.messages(topic))
 
 
-@pytest.mark.parametrize("thing", THINGS)
+@pytest.mark.parametrize("thing", one_in(3, THINGS))
 def test_what_is_no_proof_is_said_in_a_line_and_never_used(path, tmp_path, thing):
     make, words = THINGS[thing]
     make(journal_of(path))
@@ -121,7 +122,7 @@ def test_what_is_no_proof_is_said_in_a_line_and_never_used(path, tmp_path, thing
     assert out.exists()
 
 
-@pytest.mark.parametrize("thing", THINGS)
+@pytest.mark.parametrize("thing", one_in(3, THINGS))
 def test_what_lies_in_the_way_is_refused_and_the_command_that_is_proposed_removes_it(tmp_path, thing):
     path = tmp_path / "a b.mcap"
     write_log(path, SOME, "media")

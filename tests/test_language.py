@@ -26,7 +26,8 @@ NAME_PARTS = {"what", "who", "whom", "whose", "how", "said", "told", "foretold",
 
 
 def words_of(text: str) -> list[str]:
-    return [f"{number}: {line.strip()}" for number, line in enumerate(text.splitlines(), 1) if WORDS.search(line)]
+    lines = enumerate(text.splitlines(), 1) if WORDS.search(text) else ()
+    return [f"{number}: {line.strip()}" for number, line in lines if WORDS.search(line)]
 
 
 def riddles(text: str) -> Iterator[str]:

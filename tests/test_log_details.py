@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 from mcap.opcode import Opcode
-from mcap.opcode import Opcode as StockOpcode
 from mcap.reader import make_reader
 from mcap.records import Channel
 from mcap.stream_reader import StreamReader, breakup_chunk
@@ -29,10 +28,6 @@ from tests.extension_cases import of_extensions
 from tests.logs import FORTY, SCHEMA, SOME, STOCK_OPTIONS, our_messages, recorder, write_stock
 
 MIB = 2**20
-
-
-def test_opcodes_are_those_of_the_stock_library():
-    assert {one.name: one.value for one in Opcode} == {one.name: one.value for one in StockOpcode}
 
 
 def summary_of(path: Path):

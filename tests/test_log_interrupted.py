@@ -53,7 +53,7 @@ class Change(NamedTuple):
     make: Callable[[Path], None]
 
 
-@pytest.fixture(scope="module", params=one_in(2, [*CHANGES, "has two names"]))
+@pytest.fixture(scope="module", params=one_in(len(CHANGES) + 1, [*CHANGES, "has two names"]))
 def change(request, tmp_path_factory) -> Change:
     """A log before and after a change that is made in place, in several pieces."""
     path = tmp_path_factory.mktemp("whole") / "a.mcap"

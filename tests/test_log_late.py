@@ -25,6 +25,7 @@ from tests.extension_cases import of_extensions
 from tests.interrupted import everything
 from tests.log_mutants import CHUNK, parts, without_summary
 from tests.logs import READING, SCHEMA, SOME, STOCK_OPTIONS, our_messages, stock_messages, write_stock
+from tests.tiers import one_in
 from tests.worlds import tracks_at
 
 LATE = [
@@ -115,7 +116,7 @@ def ours(request, early, tmp_path_factory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", sorted(READING))
+@pytest.mark.parametrize("command", one_in(3, sorted(READING)))
 def test_every_command_keeps_them_or_refuses_in_a_line(command, ours, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = everything(ours.parent)
@@ -137,7 +138,7 @@ def test_a_clock_start_that_can_t_be_computed_with_is_none():
     assert {text: parse_ns(text) for text in wanted} == wanted
 
 
-@pytest.mark.parametrize("shared", [3, 1000], ids=["some share a time", "all share a time"])
+@pytest.mark.parametrize("shared", one_in(2, [3, 1000]), ids=["some share a time", "all share a time"])
 def test_messages_may_share_a_time(early, tmp_path, monkeypatch, shared):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "same" / "a.mcap"

@@ -19,6 +19,7 @@ from mcaptrack.transforms import KnnDetector, MedianDetector
 from mcaptrack.transforms.detect.median import Background
 from mcaptrack.transforms.detect.people import Learner, Person, Separator, closed
 from tests.drawn import HEIGHT, WIDTH, figure, film, walk
+from tests.tiers import thorough
 from tests.worlds import ns, small_scene
 
 STEADY = MedianDetector(stabilise=False)
@@ -69,6 +70,7 @@ def test_three_who_stand_side_by_side_get_three_boxes_and_one_region_without_sep
     assert all(hits(seen, [(93.6, 40, 32.8, 40)]) == 1 for seen in joined)
 
 
+@thorough
 def test_boxes_of_several_people_carry_how_many_they_are():
     frames = film(three_side_by_side)
     for separate, wanted in ((True, [1, 1, 1, 1]), (False, [1, 3])):
@@ -164,6 +166,7 @@ def test_grey_pictures_are_taken_too_and_shadows_stay_there():
     assert all(hits(seen, [(13.6 + 7.5 * (n % 28), 110, 12.8, 40)]) == 1 for n, seen in enumerate(found))
 
 
+@thorough
 def test_a_log_that_knn_made_keeps_knn(fresh):
     mcaptrack.detect(fresh, detector="knn")
     with log.read(fresh) as opened:

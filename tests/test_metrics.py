@@ -355,7 +355,7 @@ def test_combined_scores_equal_trackeval(sequences, threshold):
 
 
 @given(made())
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_counts_of_boxes_equal_motmetrics(sequence):
     import motmetrics
 

@@ -25,6 +25,7 @@ from mcaptrack.transforms.retrack.motion_model import (
 from tests.memory import held
 from tests.references.hypotheses import Claim, Scene, gains_of, swept
 from tests.references.offline import DRIFTS, Motion, course_of, exchanged, smoothed_in_log, usual
+from tests.tiers import thorough
 
 SEEDS = st.integers(0, 2**32 - 1)
 Paths = dict[int, dict[int, tuple[float, float]]]
@@ -133,6 +134,7 @@ def test_who_is_who_equals_the_reference(seed):
 
 @given(seed=SEEDS)
 @settings(max_examples=25)
+@thorough
 def test_links_are_the_same_without_a_table_of_all_pairs_and_in_batches_of_any_size(seed):
     rng = np.random.default_rng(seed)
     model, _ = models(rng)

@@ -37,6 +37,7 @@ from tests.onnx_graphs import (
     tensor,
     value,
 )
+from tests.tiers import thorough
 
 SIZE = (160, 128)
 #: A picture as large as the input, with a block on a cell of the grid; and the box of the block.
@@ -413,6 +414,7 @@ class TestInLogs:
         done("run", log, "--detector", f"onnx:{path}", "--force", "--no-tables", "--quiet")
         assert "other weights" not in call("run", log, "--force", "--no-tables").err
 
+    @thorough
     def test_another_file_is_another_detector(self, network, log):
         first, second = network(name="a.onnx"), network("ultralytics", name="b.onnx")
         done("run", log, "--detector", f"onnx:{first}", "--no-tables", "--quiet")

@@ -117,7 +117,7 @@ def test_every_parameter_of_a_stage_arrives_in_the_provenance(stage, folder):
 
 
 # Motion is made by run only where it is needed.
-@pytest.mark.parametrize("stage", one_in(2, [stage for stage in STAGES if stage.command != "motion"]), ids=named)
+@pytest.mark.parametrize("stage", one_in(4, [stage for stage in STAGES if stage.command != "motion"]), ids=named)
 def test_parameters_reach_the_stages_that_run_makes(stage, folder):
     """``run --force`` applies them where the channel exists; without it a warning says that they are not applied."""
     values = as_settings(stage.others(), stage.transform) | dict(stage.chosen)

@@ -15,6 +15,7 @@ from mcaptrack.notices import collected
 from mcaptrack.pipeline.planes import without_unseen
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from tests.commands import done
+from tests.tiers import thorough
 from tests.worlds import write_clip
 
 SIZE = (320, 240)
@@ -92,6 +93,7 @@ def sway(frame: int) -> float:
     return 70 * float(1 - np.cos(2 * np.pi * frame / 30))
 
 
+@thorough
 def test_who_leaves_a_picture_that_sways_has_no_row_until_he_is_back(tmp_path: Path, monkeypatch):
     """The first person leaves the picture again and again, the second one is missed for a while inside of it."""
     monkeypatch.chdir(tmp_path)

@@ -30,6 +30,7 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import cameras as cameras_of
 from tests.commands import done
 from tests.logs import recorder
+from tests.tiers import thorough
 from tests.worlds import write_clip
 
 DTYPES = ["f8", ">f4", "f2", "i8", ">i4", "i2", "i1", "u8", "u4", "u2", "u1", "?"]
@@ -106,6 +107,7 @@ class TestRoundTrip:
                 assert_equal([getattr(row, name) for row in theirs[t_ns]], part[name])
 
     @given(tables())
+    @thorough
     def test_in_a_recording_of_ros_2_rows_are_messages_that_rosbags_reads(self, rows):
         with folder() as place:
             path = ros_recording(place / "a.mcap")

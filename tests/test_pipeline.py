@@ -26,6 +26,7 @@ from mcaptrack.transforms import (
     Retrack,
     Sort,
 )
+from tests.tiers import thorough
 
 
 def run_all(path: Path) -> tuple[pipeline.Report, list[str]]:
@@ -140,6 +141,7 @@ def test_a_log_of_many_channels_is_refused_in_few_words(tmp_path):
         assert len(str(error.value)) < 1000
 
 
+@thorough
 def test_what_an_older_version_made_is_left_as_it_is_until_all_is_made_again(fresh, monkeypatch):
     written = Provenance.to_metadata
     with monkeypatch.context() as before:

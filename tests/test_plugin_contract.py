@@ -121,7 +121,7 @@ REPLACED = [
 ]
 
 
-@pytest.mark.parametrize(("begin", "kind", "name"), one_in(4, REPLACED))
+@pytest.mark.parametrize(("begin", "kind", "name"), one_in(12, REPLACED))
 def test_outputs_may_be_missing_or_more_and_go_with_their_class(logs, place, begin, kind, name):
     """Each command takes the log, a second run has nothing to do, and the built-in class gives the usual log again."""
     command, main, built_in = COMMANDS[kind]

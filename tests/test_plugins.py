@@ -25,6 +25,7 @@ from tests.commands import call, done, made_log
 from tests.distributions import package
 from tests.extension_cases import needs
 from tests.logs import provenance_of
+from tests.tiers import thorough
 
 MODULE = """
 from dataclasses import dataclass
@@ -215,6 +216,7 @@ def test_an_entry_point_that_another_package_has_now_is_not_the_same(place):
     assert "tracker single (own 1.5) made it; the tracker of that name is now that of thief" in refused.err
 
 
+@thorough
 def test_of_two_packages_with_one_name_a_run_takes_the_one_that_made_the_channel(place):
     done("track", "a.mcap", "--tracker", "single", "-q")
     before = made("/camera/tracks")
@@ -367,6 +369,7 @@ class TestOptionsOfPredictors:
         assert refused.code == 1
         assert "predictor spread (own 1.5) can't have a parameter horizon_s: that is one of predict" in refused.err
 
+    @thorough
     def test_a_log_that_hides_its_predictor_has_no_module_imported(self, place):
         (place / "beside_the_log.py").write_text(MODULE)
         done("predict", "a.mcap", "--predictor", "beside_the_log:Spread", "-q")

@@ -54,7 +54,7 @@ class Work(NamedTuple):
     prepare: Callable[[Path], object]
     do: Callable[[Path], object]
     again: Callable[[Path], object]
-    step: int = 41
+    step: int = 61
 
 
 def ingest_once(folder: Path) -> None:
@@ -125,7 +125,7 @@ def leave_nothing_undone(work: Work, tmp_path: Path, step: int) -> None:
     assert kills >= 3
 
 
-@pytest.mark.parametrize("name", one_in(2, sorted(WORKS.keys() - {"run with another re-tracker"})))
+@pytest.mark.parametrize("name", one_in(4, sorted(WORKS.keys() - {"run with another re-tracker"})))
 def test_killed_at_some_calls_the_next_command_completes_what_is_owed(name, tmp_path):
     leave_nothing_undone(WORKS[name], tmp_path, WORKS[name].step)
 
@@ -217,7 +217,7 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize(("names", "form"), one_in(7, product(PAIRS, ["parquet", "csv", "jsonl", "arrow"])))
+@pytest.mark.parametrize(("names", "form"), one_in(12, product(PAIRS, ["parquet", "csv", "jsonl", "arrow"])))
 def test_tables_of_another_log_are_never_replaced_unasked(names, form, tmp_path):
     one, other = (log_of(tmp_path / name, offset) for offset, name in enumerate(names))
     folder = tmp_path / "T"
@@ -233,7 +233,7 @@ def test_tables_of_another_log_are_never_replaced_unasked(names, form, tmp_path)
     assert str(other) in locations(folder)
 
 
-@pytest.mark.parametrize(("one", "other"), one_in(2, PAIRS))
+@pytest.mark.parametrize(("one", "other"), one_in(6, PAIRS))
 def test_logs_that_are_used_together_have_names_of_their_own_or_are_refused(one, other, tmp_path):
     logs = [log_of(tmp_path / name, offset) for offset, name in enumerate((one, other))]
     for log in logs:
@@ -313,7 +313,7 @@ WRITTEN: dict[str, Callable[[Path, Path], object]] = {
 } | of_extensions("WRITTEN")
 
 
-@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize("name", one_in(3, WRITTEN))
 def test_what_has_no_room_is_named_and_leaves_nothing(name, finished, tmp_path):
     with (
         limited(resource.RLIMIT_FSIZE, 1000),

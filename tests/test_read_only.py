@@ -47,7 +47,7 @@ def test_every_command_has_a_case():
     assert READING.keys() | of_extensions("READING").keys() | OTHERS == set(GROUP.commands)
 
 
-@pytest.mark.parametrize("command", one_in(2, sorted(READING)))
+@pytest.mark.parametrize("command", one_in(6, sorted(READING)))
 def test_a_half_written_log_stays_as_it_is_and_is_read_as_it_was(command, half, whole, out):
     before = everything(half.parent)
     words = READING[command](half, out)
@@ -137,7 +137,7 @@ SURROUNDINGS = {"nothing": None, "noise": os.urandom(4096), "emptiness": b""}
 
 @pytest.mark.usefixtures("never_waits")
 @pytest.mark.parametrize(
-    ("beside", "command"), one_in(3, product(SURROUNDINGS, sorted(READING.keys() | {"docs", "doctor"})))
+    ("beside", "command"), one_in(7, product(SURROUNDINGS, sorted(READING.keys() | {"docs", "doctor"})))
 )
 def test_commands_that_read_change_nothing(command: str, beside: str, template: Path, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)

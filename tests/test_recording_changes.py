@@ -23,6 +23,7 @@ from tests.commands import done
 from tests.extension_cases import needs
 from tests.logs import SCHEMA, some_log
 from tests.test_log_changed import KINDS, overwrite, replace, write_value
+from tests.tiers import thorough
 
 #: What each method gives, in a form that can be compared.
 LOOKS: dict[str, Callable[[Any], object]] = {
@@ -339,6 +340,7 @@ print("done")
 """
 
 
+@thorough
 def test_a_forked_process_reads_by_itself(tmp_path):
     path = some_log(tmp_path / "a.mcap")
     command = [sys.executable, "-W", "ignore", "-c", FORK, path]

@@ -18,7 +18,7 @@ from mcaptrack.transforms.retrack import Retracking, passes
 from tests.references.algorithm1 import Algorithm1
 from tests.references.online import OnlineTracker
 from tests.references.retracking import Undecided, constant_velocity
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 from tests.worlds import assert_same_rows, crossing_tracks, ids, noisy_tracks, places, walk
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -248,7 +248,7 @@ def test_who_comes_back_where_expected_keeps_the_id():
 
 
 @given(seed=SEEDS, link_s=st.sampled_from([4.0, 20.0]), confidence=st.sampled_from([0.2, 0.5, 0.9]))
-@settings(max_examples=6, phases=QUICK)
+@settings(max_examples=3, phases=QUICK)
 def test_online_links_equal_the_reference(seed, link_s, confidence):
     rng = np.random.default_rng(seed)
     transform = Retrack(**(PLAIN | {"link_s": link_s}), link_confidence=confidence, predictor="cv", horizon_s=2.0)
@@ -260,6 +260,7 @@ def test_online_links_equal_the_reference(seed, link_s, confidence):
         compare(transform, frames, reference)
 
 
+@thorough
 def test_links_with_equal_odds_do_not_depend_on_how_many_steps_are_read_at_once(monkeypatch):
     """All are at one place."""
     frames = passers(np.random.default_rng(5))

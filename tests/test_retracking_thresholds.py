@@ -82,7 +82,7 @@ JUMPS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "gap", "beside_m"), one_in(2, JUMPS.values()), ids=JUMPS)
+@pytest.mark.parametrize(("name", "gap", "beside_m"), one_in(4, JUMPS.values()), ids=JUMPS)
 def test_the_longest_jump_that_a_track_follows(name, gap, beside_m):
     def sources(rows) -> list[tuple[int, int]]:
         return [(int(row["track_id"]), int(row["source_id"])) for row in rows]

@@ -55,6 +55,7 @@ def test_recorded_boxes_are_decoded_once_in_a_run(passed, tmp_path, monkeypatch)
     assert decoded[2:] == [("/lidar/boxes", "base_link")]
 
 
+@thorough
 def test_the_summary_names_the_frame_in_which_boxes_in_space_were_tracked(passed, tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(passed.read_bytes())

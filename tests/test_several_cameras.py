@@ -18,6 +18,7 @@ from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.provenance import Provenance
 from tests.commands import call, done
 from tests.places import CAMERAS, HEIGHT, WIDTH, ran_copy, said, topics, write_log
+from tests.tiers import thorough
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +164,7 @@ class TestWithoutScenes:
         assert result.not_fused == (missing_extension("fuse") or "nothing that is installed makes such a scene")
         assert f"no scene is made of the cameras: {result.not_fused}" in result.notes
 
+    @thorough
     def test_a_scene_is_tracked_and_is_said_to_be_out_of_date(self, path: Path) -> None:
         rows = DETECTIONS.rows(x_m=[1.0, 5.0], y_m=[2.0, 2.0], score=[0.9, 0.9], class_id=[1, 1])
         frames = [Frame(10**9 + number * 5 * 10**8, number, rows) for number in range(12)]

@@ -58,7 +58,7 @@ def folder(template, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("number", one_in(3, range(len(MOMENTS))), ids=[" ".join(moment) for moment in MOMENTS])
+@pytest.mark.parametrize("number", one_in(6, range(len(MOMENTS))), ids=[" ".join(moment) for moment in MOMENTS])
 def test_a_signal_ends_a_command_and_leaves_the_files_unchanged(number, commands, folder):
     command, deed = MOMENTS[number]
     where = ELSEWHERE.get(command, folder)

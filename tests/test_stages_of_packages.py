@@ -16,6 +16,7 @@ from mcaptrack.schema import TRACKS
 from tests.commands import call, done
 from tests.logs import provenance_of
 from tests.test_extensions import add, one_line, site  # noqa: F401  # a fixture
+from tests.tiers import thorough
 
 #: A stage that counts the marks and the tracks of the first frame.
 COUNTS = """
@@ -85,6 +86,7 @@ def test_the_speed_of_the_page_is_that_of_the_positions(path):
     assert provenance_of(path, "/camera/speed").plugins["transform"][:3] == ("speed", "speed:Speed", "my-trackers")
 
 
+@thorough
 def test_run_makes_its_channel_again_and_never_first(site, path, monkeypatch):  # noqa: F811
     assert "/camera/speed" not in mcaptrack.run(path, tables=False).channels
     mcaptrack.stage("speed", path, max_gap_s=0.5)

@@ -17,6 +17,7 @@ from mcaptrack.schema import DETECTIONS, VIDEO
 from mcaptrack.transforms import STAGES, OnnxDetector
 from mcaptrack.transforms.protocol import Suited, traits_of
 from tests.logs import provenance_of
+from tests.tiers import thorough
 
 BOX = {"x_px": [10.0], "y_px": [10.0], "w_px": [8.0], "h_px": [20.0]}
 
@@ -58,6 +59,7 @@ def run(path: Path, **options) -> tuple[str, list[str]]:
     return tracker_of(path), [note for note in result.notes if "suits" in note]
 
 
+@thorough
 def test_another_detector_brings_its_tracker(log):
     assert run(log, detector=Plain(), tracker="bytetrack")[0] == "bytetrack"
     assert run(log, detector=Choosy())[0] == "ocsort"

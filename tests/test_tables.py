@@ -40,7 +40,7 @@ from tests.commands import call
 from tests.logs import flat_table, write_channels
 from tests.memory import held
 from tests.strategies import columns
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 from tests.worlds import ns, table_to_frames, tracks_at
 
 ROOT = Path(__file__).parent.parent
@@ -124,6 +124,7 @@ def test_rows_and_empty_frames_survive_files_to_the_bit(tmp_path_factory, data):
 @given(st.lists(st.tuples(TIMES, DOUBLES, st.none() | DOUBLES), min_size=1, max_size=12))
 @example([(0, 0.0, None), (2**63 - 1, 0.0, None)])
 @settings(max_examples=20)
+@thorough
 def test_other_libraries_read_the_same_bits_and_nanoseconds(tmp_path_factory, given_rows):
     path = tmp_path_factory.mktemp("t") / "t.parquet"
     frames = []
@@ -348,7 +349,7 @@ def same(path, form, table):
     return read.column("track_id").to_pylist() == table.column("track_id").to_pylist()
 
 
-@pytest.mark.parametrize("form", one_in(2, tables.FORMATS))
+@pytest.mark.parametrize("form", one_in(4, tables.FORMATS))
 def test_killed_at_any_byte_or_call_the_file_is_the_old_one_or_the_new_one(tmp_path, monkeypatch, form):
     path, (old, new) = tmp_path / "t", two_tables()
     tables.write(path, new, {}, (), form)

@@ -54,7 +54,7 @@ def variants() -> list[tuple[str, Transform]]:
     out += [("track", kind()) for kind in TRACKERS.values()]
     out += [("track", kind(max_age_frames=9, min_hits_frames=3, cost="metres", **plane)) for kind in TRACKERS.values()]
     out += [("track", TRACKERS["sort"](cost="pixels", min_score=0.4, class_id=1))]
-    return out
+    return [each for number, each in enumerate(out) if each not in out[:number]]
 
 
 def describe(value: object) -> str:

@@ -91,11 +91,14 @@ CHECKERS = pytest.mark.parametrize(
         pytest.param(
             checker,
             id=checker.__name__,
-            marks=pytest.mark.skipif(
-                importlib.util.find_spec(checker.__name__) is None, reason=f"{checker.__name__} isn't installed"
-            ),
+            marks=[
+                pytest.mark.skipif(
+                    importlib.util.find_spec(checker.__name__) is None, reason=f"{checker.__name__} isn't installed"
+                ),
+                *marks,
+            ],
         )
-        for checker in (mypy, pyright)
+        for checker, marks in ((mypy, [thorough]), (pyright, []))
     ],
 )
 

@@ -21,6 +21,7 @@ from tests.commands import done
 from tests.extension_cases import needs
 from tests.reader import Reader
 from tests.test_serving import ask
+from tests.tiers import thorough
 from tests.worlds import ns, write_eventful
 
 pytestmark = needs("report", "Player")  # the pages that it shows
@@ -68,6 +69,7 @@ def test_the_first_page_leads_to_all_others_and_no_other_origin_may_read_them(ev
         assert {event["topic"] for event in data["events"]} == {event.topic for event in server.events}
 
 
+@thorough
 def test_the_report_is_about_the_log_as_it_is_now(pictures):
     def digest() -> str:
         reader = inside(server, data["pages"]["report"])

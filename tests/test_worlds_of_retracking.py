@@ -44,7 +44,7 @@ def rows_of(frames: list[Frame]) -> list[tuple]:
 
 
 @given(seed=SEEDS)
-@settings(max_examples=4, phases=QUICK)
+@settings(max_examples=2, phases=QUICK)
 def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_change_no_other_output(seed):
     frames = scene(seed)
     five, again = outputs_of(frames, worlds=5), outputs_of(frames, worlds=5)
@@ -58,7 +58,7 @@ def test_worlds_are_the_same_again_fewer_are_the_first_ones_and_change_no_other_
 
 
 @given(seed=SEEDS)
-@settings(max_examples=6, phases=QUICK)
+@settings(max_examples=4, phases=QUICK)
 def test_each_sample_has_one_track_in_each_world_and_no_track_is_at_two_places_at_once(seed):
     """The tracklets of a track follow each other, and those of an input id have no more samples than it has."""
     frames = scene(seed)
@@ -83,7 +83,7 @@ def test_each_sample_has_one_track_in_each_world_and_no_track_is_at_two_places_a
 
 
 @given(seed=SEEDS)
-@settings(max_examples=6, phases=QUICK)
+@settings(max_examples=4, phases=QUICK)
 def test_without_noise_a_world_is_what_was_decided(seed):
     frames = scene(seed)
     with pytest.MonkeyPatch.context() as patch:

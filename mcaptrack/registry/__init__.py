@@ -28,6 +28,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from traceback import extract_tb
@@ -36,7 +37,7 @@ from typing import Any, Final, Literal, TypeVar, get_args
 
 from mcaptrack import _MODULES, __version__
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.installed import Point, declared, distribution_of, entry_points, missing_extension
+from mcaptrack.installed import Declared, Point, declared, distribution_of, entry_points, missing_extension
 from mcaptrack.registry.guard import Guard, contained_import
 
 __all__ = ["Entry", "blamed", "find", "of_type", "others"]
@@ -228,9 +229,14 @@ def own(kind: Kind) -> dict[str, str]:
     return {**BUILT_IN[kind], **{point.name: point.value for point in sorted(points(kind)) if point.is_own}}
 
 
-def points(kind: Kind) -> list[Point]:
+def points(kind: Kind) -> tuple[Point, ...]:
     """The entry points of a kind; those with a name that is taken don't count."""
-    return [point for point, owner in _owners(kind) if not owner]
+    return _points(kind, declared())
+
+
+@lru_cache(maxsize=64)
+def _points(kind: Kind, _: Declared) -> tuple[Point, ...]:
+    return tuple(point for point, owner in _owners(kind) if not owner)
 
 
 def ignored(kind: Kind) -> dict[str, str]:

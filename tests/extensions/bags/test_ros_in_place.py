@@ -29,6 +29,7 @@ from tests.commands import call, done
 from tests.extensions.bags.bags import MOT, T0, bag1, bag2, record
 from tests.logs import recorder
 from tests.space_logs import WAYS, Robot, write
+from tests.tiers import one_in, thorough
 
 Raw = tuple[str, int, bytes]
 
@@ -124,7 +125,7 @@ def check_whole(path: Path, recorded: list[Raw]) -> None:
 RUNS = {"pictures": (record, ("--detector", "knn")), "boxes": (drive, ("--topic", "/lidar/boxes"))}
 
 
-@pytest.fixture(scope="module", params=RUNS)
+@pytest.fixture(scope="module", params=one_in(len(RUNS), RUNS))
 def ran(request, tmp_path_factory) -> dict[str, Any]:
     """Two copies of a recording, with ground truth and results in it and beside it. Not to be changed."""
     make, words = RUNS[request.param]
@@ -216,6 +217,7 @@ def copied(tracked, tmp_path) -> Path:
     return tmp_path / "drive" / "drive.mcap"
 
 
+@thorough
 def test_a_recording_of_several_files_is_counted_as_a_whole(copied):
     other = copied.with_name("drive_1.mcap")
     done("track", other, "--topic", "/lidar/boxes", "--in-place")

@@ -94,6 +94,7 @@ class TestCorrections:
         assert found["b"].after.pairs == found["b"].before.pairs > 200
         assert {name for name, one in found.items() if one.model} == {"b"}
 
+    @thorough
     def test_a_plane_that_is_off_by_less_than_a_step_stays(self) -> None:
         at, off = walks(9), np.array([[1, 0, 0.12], [0, 1, -0.1], [0, 0, 1.0]])
         found = refined([watched("a", at), watched("b", at, off), watched("c", at)])
@@ -286,6 +287,7 @@ class TestLogs:
             assert "/east/ground_plane/refined" in opened.channels
             assert camera_at(opened, "/east").ground_plane == "/east/ground_plane"
 
+    @thorough
     def test_a_correction_that_no_longer_holds_is_dropped_and_a_dry_run_says_so(
         self, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path
     ) -> None:
@@ -307,6 +309,7 @@ class TestLogs:
         with log.read(path) as opened:
             assert topic not in opened.channels
 
+    @thorough
     def test_fuse_proposes_to_calibrate_where_a_plane_is_too_far_off_to_compare(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "far.mcap", CAMERAS[:3], moved_m={"east": 3.0})
         told = done("fuse", path).err

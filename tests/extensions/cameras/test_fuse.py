@@ -28,6 +28,7 @@ from mcaptrack.testing import check_transform
 from tests.commands import call
 from tests.places import CAMERAS, HEIGHT, NS, PEOPLE, SECONDS, WIDTH, errors, fused, said, write_log
 from tests.references.joining import joined
+from tests.tiers import thorough
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,7 @@ class TestFaults:
         assert abs(count - people) <= 0.05 * people
         assert np.median(away) < 0.15
 
+    @thorough
     def test_an_offset_that_is_given_is_not_estimated(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "late.mcap", late_s={"south": 0.3})
         assert not said(mcaptrack.fuse(path, clock_offset_s={"south": 0.3}), "clock")
@@ -122,6 +124,7 @@ class TestInput:
             mcaptrack.fuse(path, **options)  # type: ignore[arg-type]
         assert path.read_bytes() == before
 
+    @thorough
     def test_a_run_tracks_the_scene_by_what_suits_it(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "scene.mcap", CAMERAS[:3])
         mcaptrack.fuse(path)
@@ -569,6 +572,7 @@ def test_a_fuser_of_a_module_makes_the_scene_and_is_recorded(path: Path) -> None
     assert channel.plugins["transform"]["implementation"] == NAME
 
 
+@thorough
 def test_a_later_run_uses_the_same_fuser_if_it_may(path: Path) -> None:
     made = FUSION.make(NAME, cell_m=2.0)
     mcaptrack.fuse(path, fuser=made)

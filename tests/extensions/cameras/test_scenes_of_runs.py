@@ -14,6 +14,7 @@ from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS
 from tests.commands import done
 from tests.places import CAMERAS, NS, PEOPLE, ran_copy, said, topics, walk, write_log, write_parts
+from tests.tiers import thorough
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,7 @@ def test_the_scene_is_tracked(ran: tuple[Path, RunResult]) -> None:
     assert lines["fused"].split(maxsplit=1)[1] == "world, the scene"
 
 
+@thorough
 def test_named_cameras_are_run_and_fused_alone_and_others_join_later(path: Path) -> None:
     with collected():
         result = mcaptrack.run(path, camera=["east", "south"], tables=False, predictor="cv")
@@ -66,6 +68,7 @@ def test_a_tracker_of_boxes_is_for_the_cameras(path: Path) -> None:
     assert [(made[f"/{name}/tracks"] or {})["tracker"] for name in ("east", "world")] == ["ocsort", "ground"]
 
 
+@thorough
 def test_cameras_of_different_places_are_not_fused(tmp_path: Path) -> None:
     path = write_log(tmp_path / "rooms.mcap", CAMERAS[:2], moved_m={"east": 2.0})
     with collected():

@@ -28,6 +28,7 @@ from mcaptrack.viewing.painting import draw, message_at
 from tests.commands import call, done, printed
 from tests.logs import recorder
 from tests.robots import write_log
+from tests.tiers import thorough
 
 GREY = np.full((100, 200, 3), 100, np.uint8)
 
@@ -280,6 +281,7 @@ def test_a_video_of_which_no_picture_can_be_decoded_is_named(template, tmp_path)
     assert list(tmp_path.iterdir()) == [path]
 
 
+@thorough
 def test_the_video_of_a_log_in_a_store_is_written_here(store, template):
     done("render", store.put("night/a.mcap", template))
     assert (os.listdir(), store.names()) == (["a.mp4"], ["night/a.mcap"])

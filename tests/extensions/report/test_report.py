@@ -45,6 +45,7 @@ from tests import robots
 from tests.commands import call, done, printed
 from tests.logs import add_rows, write_channels
 from tests.reader import Reader
+from tests.tiers import thorough
 from tests.worlds import ns, tracks_at, walk
 
 PACKAGE = "mcaptrack.extensions.report"
@@ -645,6 +646,7 @@ def test_a_result_is_shown_in_a_line():
     assert repr(page) == f"ReportResult({str(page.page)!r}, 12 bytes)"
 
 
+@thorough
 def test_a_recording_with_boxes_of_other_software_has_tracks_on_its_page(tmp_path):
     path = tmp_path / "boxes.mcap"
     robots.write_log(path, "/front/image_raw", boxes="/front/detections")

@@ -28,6 +28,7 @@ from mcaptrack.schema import DECISIONS, TRACKS, Frame
 from mcaptrack.transforms import Retrack
 from tests.browser import browser, needs_browser
 from tests.commands import call, done, printed
+from tests.tiers import thorough
 from tests.worlds import crossing_tracks, noisy_tracks, ns, replace_channel, tracked, write_channels
 
 QUICK = [Phase.explicit, Phase.generate]
@@ -62,7 +63,7 @@ def obeys(solved: Solved, question: asking.Question, yes: bool) -> bool:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=5, phases=QUICK, deadline=None)
+@settings(max_examples=2, phases=QUICK, deadline=None)
 def test_an_answer_binds_and_one_that_agrees_with_what_was_decided_changes_nothing(seed):
     frames = scene(seed)
     plain = solved_with(frames)
@@ -76,7 +77,7 @@ def test_an_answer_binds_and_one_that_agrees_with_what_was_decided_changes_nothi
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=5, phases=QUICK, deadline=None)
+@settings(max_examples=3, phases=QUICK, deadline=None)
 def test_the_same_log_has_the_same_questions_fewer_are_the_first_and_answered_ones_are_not_asked_again(seed):
     frames = scene(seed)
     solved = solved_with(frames)
@@ -243,6 +244,7 @@ def seen(finished, tmp_path_factory):
     return path
 
 
+@thorough
 def test_a_judge_weighs_where_there_are_pictures_and_is_never_certain(seen, tmp_path, monkeypatch):
     own = shutil.copyfile(seen, tmp_path / "walk.mcap")
     (tmp_path / "alike.py").write_text(

@@ -1,11 +1,8 @@
 """Cases of ``zones`` for the tests of the core."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 import mcaptrack
 from mcaptrack import log
@@ -13,8 +10,6 @@ from mcaptrack.evaluation.intervals import WorldInterval
 from mcaptrack.extensions.zones.counting import finished
 from mcaptrack.extensions.zones.visits import ZoneInWorlds, ZoneTotals
 from mcaptrack.pipeline import Summary
-from mcaptrack.schema import ZONE_COUNTS, ZONE_VISITS, Schema
-from tests.extensions.zones.shapes import ZONES
 
 #: A zone that both people of ``made_log`` walk through, and a line that one of them crosses.
 _ZONES = (
@@ -61,40 +56,6 @@ def _of_topic(path: Path, topic: str, folder: Path) -> Any:
         return {name: tuple(opened.times(name).tolist()) for name in opened.channels}
 
 
-# What docs/extensions/zones.md asks for
-
-DOCUMENTED_RUN = {"zones": ZONES}
-
-
-def _of_all(seven: Any, schema: Schema) -> Iterator[tuple[str, list[tuple[int, Any]]]]:
-    """The topic of the tracks of each channel of a schema, and its rows with their times."""
-    for topic, channel in sorted(seven.opened.channels.items()):
-        if channel.schema_name == schema.name:
-            yield topic, seven.rows(topic.removeprefix("/camera/"), schema)
-
-
-def _visits(seven: Any) -> list[list[Any]]:
-    out = []
-    for topic, rows in _of_all(seven, ZONE_VISITS):
-        for number, name in ((2, "ring"), (1, "square")):
-            stays_s = [row["dwell_s"] for _, row in rows if row["zone_id"] == number]
-            out.append([topic, name, len(stays_s), np.mean(stays_s)])
-    return out
-
-
-def _most_inside(seven: Any) -> list[list[Any]]:
-    most: dict[tuple[str, str, int], int] = {}
-    for topic, rows in _of_all(seven, ZONE_COUNTS):
-        for t_ns, row in rows:
-            key = (topic, ("square", "ring", "gate")[row["zone_id"] - 1], t_ns // 10_000_000_000 * 10)
-            most[key] = max(most.get(key, 0), int(row["inside"]))
-    return [[*key, count] for key, count in sorted(most.items())]
-
-
-QUERIES = {
-    ("docs/extensions/zones.md", "zone_visits"): _visits,
-    ("docs/extensions/zones.md", "zone_counts"): _most_inside,
-}
 TOPICS = {"zones": ("tracks", _of_topic)}
 PROPOSALS = {
     "extensions/zones/counting.py:make:run": lambda s: s.without("/camera/*tracks*", "/camera/truth*").says(

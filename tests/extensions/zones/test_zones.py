@@ -29,6 +29,7 @@ from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call, done
 from tests.extensions.zones.shapes import HOLED, LINE, SQUARE, ZONES, collection, feature
+from tests.tiers import thorough
 from tests.worlds import ns, walk
 
 # A slow implementation, one person at a time
@@ -382,6 +383,7 @@ class TestRun:
         assert result.zones["/camera/truth"] == before.zones["/camera/truth"]
         assert mcaptrack.run(path, tables=False).is_up_to_date
 
+    @thorough
     def test_other_zones_replace_those_of_before(self, place):
         path = place / "a.mcap"
         one = mcaptrack.zones(path, zones={"type": "LineString", "coordinates": LINE, "units": "m"})
