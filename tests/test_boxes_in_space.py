@@ -418,7 +418,7 @@ def test_boxes_in_a_root_are_told_why_nothing_is_above_it(tmp_path, monkeypatch)
     path = log_of(tmp_path, lambda _: "lidar")
     zeros, once = np.zeros((1, 3)), np.array([START_NS])
     useless = [Recorded("base_link", "lidar", True, PoseSamples(once, once, zeros, np.zeros((1, 4))))]
-    monkeypatch.setattr("mcaptrack.sources.fixed_frame.transforms_of", lambda _: TransformTree(useless))
+    monkeypatch.setattr("mcaptrack.sources.fixed_frame.transforms_of", lambda *_: TransformTree(useless))
     found, warnings = read(path)
     assert found.frame_id == "lidar"
     words = "transforms: base_link -> lidar: 1 pose without a rotation or a position are left out"

@@ -406,6 +406,16 @@ class TestReading:
         assert poses.translation[0, 0] == pytest.approx(5.5)
         assert [one.code for one in warnings] == ["clock"]
 
+    def test_robots_with_namespaces_have_transforms_of_their_own(self, tmp_path):
+        """As navigation of several robots is set up in ROS 2: frames have the same names, topics don't."""
+        kind, _ = MESSAGES["FrameTransform"]
+        of_robots = (("/a/tf_static", 10.0), ("/b/tf_static", -10.0))
+        channels = [(topic, kind, [(START_NS, packed("odom", "lidar", START_NS, x))]) for topic, x in of_robots]
+        shared = ("/tf_static", kind, [(START_NS, packed("map", "odom", START_NS, 1.0))])
+        with log.read(write(tmp_path / "a.mcap", *channels, shared)) as opened:
+            for topic, x in (("/a/lidar/boxes", 11.0), ("/b/camera/image", -9.0)):
+                assert fixed_frame.poses_at(opened, topic, "map", "lidar", at(0.5), at(0.5)).translation[0, 0] == x
+
     def test_a_log_without(self, tmp_path):
         kind, _ = MESSAGES["FrameTransform"]
         with log.read(write(tmp_path / "a.mcap", ("/tf", kind, []))) as opened:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 import mcaptrack
 from mcaptrack import log
@@ -138,6 +139,31 @@ DEFINITIONS = {
         RadarTrack="uint16 track_id; geometry_msgs/Point position; geometry_msgs/Vector3 velocity; "
         "geometry_msgs/Vector3 acceleration; geometry_msgs/Vector3 size; string classification",
     ),
+    "autoware_perception_msgs/DynamicObjectArray": package(
+        "autoware_perception_msgs",
+        DynamicObjectArray="std_msgs/Header header; DynamicObject[] objects",
+        DynamicObject="unique_identifier_msgs/UUID id; Semantic semantic; State state; Shape shape",
+        Semantic="uint8 UNKNOWN=0; uint8 CAR=1; uint8 PEDESTRIAN=6; uint32 type; float64 confidence",
+        State="geometry_msgs/PoseWithCovariance pose_covariance; bool orientation_reliable; "
+        "geometry_msgs/TwistWithCovariance twist_covariance; bool twist_reliable",
+        Shape="uint8 type; geometry_msgs/Vector3 dimensions; geometry_msgs/Polygon footprint",
+    )
+    + BAR
+    + "MSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n",
+    # Laid out as osi3.GroundTruth of the Open Simulation Interface.
+    "osi_msgs/GroundTruth": package(
+        "osi_msgs",
+        GroundTruth="std_msgs/Header header; StationaryObject[] stationary_object; MovingObject[] moving_object",
+        StationaryObject="Identifier id; BaseStationary base",
+        MovingObject="uint8 TYPE_UNKNOWN=0; uint8 TYPE_PERSON=1; uint8 TYPE_VEHICLE=2; "
+        "Identifier id; BaseMoving base; uint8 type",
+        Identifier="uint64 value",
+        BaseStationary="Dimension3d dimension; geometry_msgs/Vector3 position; Orientation3d orientation",
+        BaseMoving="Dimension3d dimension; geometry_msgs/Vector3 position; Orientation3d orientation; "
+        "geometry_msgs/Vector3 velocity",
+        Dimension3d="float64 length; float64 width; float64 height",
+        Orientation3d="float64 roll; float64 pitch; float64 yaw",
+    ),
     "obstacle_detector/Obstacles": package(
         "obstacle_detector",
         Obstacles="std_msgs/Header header; SegmentObstacle[] segments; CircleObstacle[] circles",
@@ -256,6 +282,25 @@ IN_SPACE = {
             },
         },
         "uuid score v size heading",
+    ),
+    "autoware_perception_msgs/DynamicObjectArray": (
+        "objects",
+        {
+            "semantic": {"type": 6, "confidence": 0.75}, "shape": {"dimensions": SIZE}, "id": {"uuid": [1] * 16},
+            "state": {"pose_covariance": {"pose": POSE}, "twist_covariance": {"twist": {"linear": {"x": 0.25, "y": -0.5}}}},
+        },
+        "uuid score v size heading",
+    ),
+    "osi_msgs/GroundTruth": (
+        "moving_object",
+        {
+            "id": {"value": 7}, "type": 1,
+            "base": {
+                "position": AT, "velocity": FAST, "orientation": {"yaw": np.pi / 2},
+                "dimension": {"length": 0.5, "width": 0.25, "height": 1.75},
+            },
+        },
+        "id v size heading",
     ),
     "obstacle_detector/Obstacles": ("circles", {"center": AT, "velocity": FAST, "radius": 0.25}, "v round nothing"),
     **dict.fromkeys(
@@ -426,6 +471,58 @@ def test_boxes_in_pictures_are_as_the_message_states_them(name, encoding, tmp_pa
     assert codes == (["units"] if "hri" in name else ["fields"] if name.startswith("lab") else [])
     with log.read(path) as opened:
         assert foreign.holds_boxes(opened, "/humans/body", in_space=False)
+
+
+def test_enumerations_of_protobuf_name_classes_without_what_all_values_begin_with(tmp_path):
+    """As style guides of protobuf have it: enum ObjectType { OBJECT_TYPE_UNSPECIFIED = 0; OBJECT_TYPE_PERSON = 1; }."""
+    file = descriptor_pb2.FileDescriptorProto(name="a.proto", package="lab", syntax="proto3")
+    kinds = file.enum_type.add(name="ObjectType").value
+    for number, name in enumerate(("UNSPECIFIED", "PERSON", "FORK_LIFT")):
+        kinds.add(name=f"OBJECT_TYPE_{name}", number=number)
+    thing = descriptor_pb2.FieldDescriptorProto
+    of_type = {"x_m": thing.TYPE_DOUBLE, "y_m": thing.TYPE_DOUBLE, "kind": thing.TYPE_ENUM}
+    fields = file.message_type.add(name="Thing").field
+    for number, (name, kind) in enumerate(of_type.items(), 1):
+        fields.add(
+            name=name, number=number, type=kind, label=1, type_name=".lab.ObjectType" if name == "kind" else None
+        )
+    things = file.message_type.add(name="Frame").field
+    things.add(name="objects", number=1, type=thing.TYPE_MESSAGE, label=3, type_name=".lab.Thing")
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    frame = message_factory.GetMessageClass(pool.FindMessageTypeByName("lab.Frame"))()
+    for number in range(3):
+        frame.objects.add(x_m=1.0, y_m=float(number), kind=number)
+    definition = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    with recorder(tmp_path / "a.mcap") as writer:
+        channel = writer.add_channel("/seen", ("lab.Frame", "protobuf", definition), "protobuf")
+        writer.add_message(channel, START_NS, frame.SerializeToString(), START_NS)
+    found, _ = read(tmp_path / "a.mcap")
+    names = {0: "", 1: "person"} | found.classes
+    assert [names[row["class_id"]] for row in found.frames[0].rows] == ["", "person", "fork_lift"]
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding"), [("visualization_msgs/MarkerArray", "cdr"), ("lab_msgs/WalkerList", "json")]
+)
+def test_channels_that_begin_without_things_are_read(name, encoding, tmp_path):
+    """A detector that sees nobody for a minute: what its channel holds is in a later message."""
+    unstamped = HEAD | {"stamp": {"sec": 0, "nanosec": 0}}
+    drawn = {"type": 1, "header": unstamped, "pose": POSE, "scale": SIZE, "ns": "person"}
+    where, thing = ("markers", drawn) if encoding == "cdr" else ("walkers", {"uid": 7, "pos_x": 1.5, "pos_y": -2.25})
+    messages = [{where: [thing] if number >= 60 else []} for number in range(70)]
+    found, _ = read(write(tmp_path / "a.mcap", {"/seen": (name, messages)}, encoding))
+    assert [row["x_m"] for frame in found.frames for row in frame.rows] == [1.5] * 10
+
+
+def test_json_needs_no_schema(tmp_path):
+    with recorder(tmp_path / "a.mcap") as writer:
+        thing = {"label": "person", "score": 0.5, "pos_x": 1.5, "pos_y": -2.25}
+        payload = json.dumps({"objects": [thing]}).encode()
+        writer.add_message(writer.register_channel("/seen", "json", 0), START_NS, payload, START_NS)
+    found, said = read(tmp_path / "a.mcap")
+    assert found.frames[0].rows["x_m"].tolist() == [1.5]
+    assert "messages of JSON are read by the names of their fields" in dict(said)["fields"]
 
 
 POSES = [{"position": {"x": float(n), "y": 2.0, "z": 0.0}, "orientation": {"w": 1.0}} for n in range(3)]

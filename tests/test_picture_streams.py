@@ -269,6 +269,25 @@ def test_pictures_that_can_not_be_read_are_named_with_their_cause_and_exit_code_
         next(opened.frames(TOPIC))
 
 
+@pytest.mark.parametrize("kind", ["image", "video"])
+def test_a_message_without_data_costs_only_its_own_picture(tmp_path, kind):
+    """Drivers publish empty messages where a frame was lost."""
+    payloads = encoded("h264") if kind == "video" else [cv2.imencode(".png", image)[1].tobytes() for image in images()]
+    at = 13
+    path = written(
+        tmp_path / "a.mcap", kind, "h264" if kind == "video" else "png", [*payloads[:at], b"", *payloads[at:]]
+    )
+    result = mcaptrack.detect(path, detector="knn")
+    (said,) = [notice.message for notice in result.warnings if notice.code == "lost"]
+    assert f"1 of {COUNT + 1} pictures can't be decoded and are left out" in said
+    assert f"{TOPIC} at {10**18 + at * 10**8} ns: frame {at}: " in said
+    with mcaptrack.open(path) as opened:
+        t_ns = [picture.t_ns for picture in opened.frames(TOPIC, times=[10**18 + (at + 5) * 10**8])]
+        assert t_ns == [10**18 + (at + 5) * 10**8]
+        seen = [frame.t_ns for frame in opened.frames("detections")]
+    assert sorted({10**18 + number * 10**8 for number in range(COUNT + 1)} - {*seen}) == [10**18 + at * 10**8]
+
+
 BEGINNINGS = [b"", b"\0\0\1\x67", b"\0\0\0\1\x40\x01", b"\0\0\0\x02\x67", b"\1\x64\0\x0a\xff\xe1\0\2\x67\x64\1\0\1\x68"]
 BEGINNINGS += [
     b"\xff\xd8\xff",

@@ -138,7 +138,7 @@ class RobotPath(NamedTuple):
 
 def robot_path(opened: log.Log, prefix: str, view: str, t_ns: Ints) -> RobotPath | None:
     """Return the path of the robot that recorded the boxes of a view; None if none moves in its frame."""
-    fixed, tree = _frame_of(opened, view), transforms_of(opened)
+    fixed, tree = _frame_of(opened, view), transforms_of(opened, view)
     if not fixed or tree is None:
         return None
     sources = recorded_sources(opened, camera_at(opened, prefix).topics)

@@ -238,7 +238,7 @@ class _Planner:
                 text = f"{camera.pictures} has depths ({depth}), in which people are not detected"
                 raise McaptrackError(f"{self.opened.path}: {text}; `topic=` looks for them there all the same")
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
-            if camera.boxes:
+            if camera.boxes and camera.boxes not in self.sources.values():
                 self._notes.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
             for topic, name in uncertain_boxes(self.opened).items():
                 self._notes.append(f"{topic} ({name}) has positions that may be of people; `topic=` takes them instead")

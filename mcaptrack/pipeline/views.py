@@ -144,7 +144,7 @@ class _Work:
         self.planes = moved_planes(planes, self.path)
         self.frame_id = _Current(state, shown).frame_id()
         is_framed = bool(self.frame_id) or any(channel.frame_id for channel in shown.values())
-        self.tree = transforms_of(opened) if is_framed else None
+        self.tree = transforms_of(opened, tracks_topic(prefix)) if is_framed else None
         solid_in = next((channel.frame_id for channel in shown.values() if channel.is_solid()), "")
         self.calibrated = calibrated_cameras(opened, solid_in) if solid_in and self.tree else {}
         self.members = Scenes().members(state)

@@ -139,7 +139,7 @@ def see_ground(opened: log.Log, camera: Camera, frame: str = "", ground_frame: s
     log_ns, stamp_ns, frame_id = _headers(opened, sources)
     topic, fitted = _fitting(opened, sources[0], frame_id, camera.pictures)
     eye = fitted[0][1].frame_id or frame_id
-    tree = transforms_of(opened)
+    tree = transforms_of(opened, sources[0])
     if tree is None:
         raise McaptrackError(f"there are no transforms, which say where the camera of {topic} is")
     if eye not in tree.frames():

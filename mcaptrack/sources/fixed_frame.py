@@ -34,7 +34,7 @@ from mcaptrack.geometry.transform_tree import (
 from mcaptrack.notices import warn
 from mcaptrack.schema import DETECTIONS, Frame, Rows
 from mcaptrack.schema.classes import UNKNOWN
-from mcaptrack.schema.names import plain_name
+from mcaptrack.schema.names import plain_name, shared_parts
 from mcaptrack.schema.provenance import Provenance, frame_id_of, input_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.foreign.boxes import (
@@ -479,9 +479,9 @@ def holds_transforms(channel: log.Channel) -> bool:
     return is_recorded and plain_name(channel.schema_name) in TRANSFORMS_READ
 
 
-def transforms_of(opened: log.Log) -> TransformTree | None:
+def transforms_of(opened: log.Log, topic: str = "") -> TransformTree | None:
     """Return the transforms of a log as a tree over time; None if it has none. See ``read_frames``."""
-    return read_frames(opened).tree
+    return read_frames(opened, topic).tree
 
 
 def warn_of_remarks(opened: log.Log, tree: TransformTree | None, target: str, source: str) -> None:
@@ -498,7 +498,7 @@ def poses_at(
     If no stamp is within the transforms, and log times are, the stamps are of another clock than those of the
     transforms: poses are looked up by log time. Poses that aren't known are counted in a warning, as those of ``what``.
     """
-    tree, _, unread = read_frames(opened)
+    tree, _, unread = read_frames(opened, topic)
     tree = tree or TransformTree([])
     for text in unread:
         warn(text, "lost")
@@ -518,14 +518,47 @@ def poses_at(
     return poses
 
 
+def read_frames(opened: log.Log, topic: str = "") -> FramesRead:
+    """Read the transforms of a log. Messages that can't be read are left out, and counted in ``unread``.
+
+    Robots with a namespace each (/robot1/tf) may have frames of the same names. For a channel of ``topic`` the poses of
+    a frame are those of the most similar topics of transforms; without a topic all count together.
+    """
+    read = _read_transforms(opened)
+    ranks = [(shared_parts(source, topic), topic.startswith(f"{source.rpartition('/')[0]}/")) for source in read.topics]
+    nearest: dict[str, tuple[int, bool]] = {}
+    for edge in read.edges:
+        nearest[edge.child] = max(nearest.get(edge.child, (0, False)), ranks[edge.topic])
+    is_near = tuple(not topic or ranks[edge.topic] == nearest[edge.child] for edge in read.edges)
+    return FramesRead(_tree(opened, is_near), read.topics, read.unread)
+
+
+class _Edge(NamedTuple):
+    """A frame and its parent, whether their topic is of transforms that don't change, and its number."""
+
+    parent: str
+    child: str
+    is_latched: bool
+    topic: int
+
+
+class _TransformsRead(NamedTuple):
+    """All transforms (N,) of a log: the number of the edge of each, the poses, and what ``FramesRead`` has besides."""
+
+    edges: tuple[_Edge, ...]
+    of_edge: Ints
+    poses: PoseSamples | None
+    topics: tuple[str, ...]
+    unread: tuple[str, ...]
+
+
 @log.kept
-def read_frames(opened: log.Log) -> FramesRead:
-    """Read all transforms of a log. Messages that can't be read are left out, and counted in ``unread``."""
-    edges: dict[tuple[str, str, bool], int] = {}
+def _read_transforms(opened: log.Log) -> _TransformsRead:
+    edges: dict[_Edge, int] = {}
     of_edge, samples = list[int](), list[PoseSamples]()
     topics = [topic for topic, channel in sorted(opened.channels.items()) if holds_transforms(channel)]
     problems: list[str] = []
-    for topic in topics:
+    for number, topic in enumerate(topics):
         try:
             log_ns, parts, unread = read_channel(opened, topic, _transforms, _FIELDS)
         except McaptrackError as error:
@@ -534,14 +567,28 @@ def read_frames(opened: log.Log) -> FramesRead:
         problems += [str(unread)] if str(unread) else []
         for which, read in parts:
             names = zip(read.parent, read.child, strict=True)
-            of_edge += [edges.setdefault((*pair, topic.endswith(LATCHED)), len(edges)) for pair in names]
+            of_edge += [edges.setdefault(_Edge(*pair, topic.endswith(LATCHED), number), len(edges)) for pair in names]
             times = log_ns[which[read.message]]
             samples.append(PoseSamples(read.stamp_ns, times, read.translation, read.quaternion))
-    if not edges:
-        return FramesRead(None, tuple(topics), tuple(problems))
-    poses, order = joined(samples), _groups(np.array(of_edge), np.arange(len(of_edge)))
-    recorded = [Recorded(*edge, taken(poses, which)) for edge, (_, which) in zip(edges, order, strict=True)]
-    return FramesRead(TransformTree(recorded), tuple(topics), tuple(problems))
+    poses = joined(samples) if samples else None
+    return _TransformsRead(tuple(edges), np.array(of_edge, np.int64), poses, tuple(topics), tuple(problems))
+
+
+@log.kept
+def _tree(opened: log.Log, is_near: tuple[bool, ...]) -> TransformTree | None:
+    """The tree of some of the edges of a log; None if there is none. Edges of several topics are one."""
+    read = _read_transforms(opened)
+    if read.poses is None or not any(is_near):
+        return None
+    numbers: dict[tuple[str, str, bool], int] = {}
+    merged = [
+        numbers.setdefault(edge[:3], len(numbers)) if near else -1
+        for edge, near in zip(read.edges, is_near, strict=True)
+    ]
+    group = np.array(merged)[read.of_edge]
+    return TransformTree(
+        [Recorded(*edge, taken(read.poses, np.flatnonzero(group == number))) for edge, number in numbers.items()]
+    )
 
 
 #: The fields of transforms of all schemas.
@@ -600,7 +647,7 @@ def named_detections(opened: log.Log, topic: str, frame_id: str = "") -> foreign
         name = opened.channel(topic).schema_name or "no schema"
         raise McaptrackError(f"{opened.path}: {topic} holds {name}, not detections; {', '.join(BOXES_READ)} are read")
     if reading.known is None and reading.fields is not None and not choice_for(opened, topic).fields:
-        text = f"messages of {opened.channel(topic).schema_name} are read by the names of their fields"
+        text = f"messages of {opened.channel(topic).schema_name or 'JSON'} are read by the names of their fields"
         warn(f"{opened.path}: {topic}: {text} ({reading.fields}); `map=` names others", "fields")
     return _in_space(opened, topic, reading, frame_id) if reading.in_space else named_boxes(opened, topic, reading)
 
@@ -679,7 +726,7 @@ def _fixed_frame(opened: log.Log, topic: str, boxes: Recorded3d, wanted: str) ->
     """The frame that boxes are brought to. Raises McaptrackError if there is no such frame."""
     counts = Counter(boxes.frame.tolist())
     usual = boxes.names[counts.most_common(1)[0][0]] if counts else ""
-    tree = transforms_of(opened)
+    tree = transforms_of(opened, topic)
     frames = set(tree.frames() if tree else ()) | set(boxes.names)
     if wanted:
         if boxes.names and wanted not in frames:
@@ -732,7 +779,7 @@ def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[
         if not mine.any():
             continue
         if name == fixed:
-            warn_of_remarks(opened, transforms_of(opened), fixed, name)
+            warn_of_remarks(opened, transforms_of(opened, topic), fixed, name)
             continue
         # Boxes of a message have the same pose, mostly.
         stamps = np.where(boxes.stamp_ns > 0, boxes.stamp_ns, boxes.log_ns)[mine]
@@ -744,14 +791,14 @@ def _poses(opened: log.Log, topic: str, boxes: Recorded3d, fixed: str) -> tuple[
         rotation[mine], shift[mine] = poses.rotation[place], poses.translation[place]
     if count and not is_known.any():
         raise McaptrackError(
-            f"{opened.path}: the pose of no box of {topic} in {fixed} is known; {_connected(opened, boxes)} "
+            f"{opened.path}: the pose of no box of {topic} in {fixed} is known; {_connected(opened, topic, boxes)} "
             "`frame=` names another frame, such as that of the boxes"
         )
     return is_known, rotation, shift
 
 
-def _connected(opened: log.Log, boxes: Recorded3d) -> str:
-    transforms = transforms_of(opened)
+def _connected(opened: log.Log, topic: str, boxes: Recorded3d) -> str:
+    transforms = transforms_of(opened, topic)
     frames = list_names(transforms.frames() if transforms else [], _LISTED)
     return f"boxes are in {list_names(boxes.names, _LISTED)}, and transforms have {frames};"
 

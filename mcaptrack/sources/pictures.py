@@ -55,7 +55,7 @@ def picture_size(opened: log.Log, topic: str | None) -> tuple[int, int] | None:
 
 def size_of(pictures: Iterable[EncodedPicture]) -> tuple[int, int] | None:
     """Return width and height in pixels of the first picture that can be decoded; None if none can."""
-    first = next(decode_gray(pictures), None)
+    first = next(decode_gray(pictures, unreadable=[]), None)
     return None if first is None else (first.rows.shape[1], first.rows.shape[0])
 
 
@@ -175,6 +175,8 @@ class Pictures:
         while end > 0:
             start = max(0, end - step)
             for at, picture in reversed(list(self._read(start, end))):
+                if picture.error:
+                    continue
                 head = read_head(picture.format, picture.data)
                 is_key |= head.is_key
                 if is_key and head.has_parameter_sets:
@@ -194,7 +196,7 @@ class Pictures:
                 yield picture
                 continue
             head = read_head(picture.format, picture.data)
-            begins = number > start and head.is_key and head.has_parameter_sets
+            begins = number > start and not picture.error and head.is_key and head.has_parameter_sets
             if begins and not picture.is_video:
                 waiting.clear()
             elif begins and waiting:

@@ -203,7 +203,7 @@ def video_formats(opened: log.Log) -> dict[str, str]:
         if not foreign.holds_pictures(channel) or not channel.messages:
             continue
         try:
-            _, first = next(iter(foreign.pictures(opened, topic)))
+            first = next(picture for _, picture in foreign.pictures(opened, topic) if not picture.error)
         except (McaptrackError, StopIteration):
             continue  # viewers say so themselves
         if is_video_codec(first.format):

@@ -14,10 +14,10 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import lru_cache
-from itertools import islice
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from mcap.well_known import MessageEncoding
 
 from mcaptrack import log
 from mcaptrack.contracts import is_in_space
@@ -64,8 +64,9 @@ BOXES_READ: Final = (
     "vision_msgs/Detection3DArray",
     "messages of boxes or positions by their fields",
 )
-#: Messages of a channel in which boxes are looked for.
+#: Messages of a channel in which boxes are looked for; if these have none, longer ones in so many bytes are tried.
 _TRIED: Final = 50
+_SEARCHED_BYTES: Final = 50_000_000
 _LISTED: Final = 8
 _WHOLE_NUMBER: Final = re.compile(r"[0-9]{1,10}")
 _NAME: Final = re.compile(r"[^\W\d_]")
@@ -186,7 +187,7 @@ def reading_of(opened: log.Log, topic: str) -> Reading | None:
 def _reading(opened: log.Log, topic: str, choice: BoxesChoice) -> Reading | None:
     channel = opened.channel(topic)
     is_ours = channel.schema is not None or Provenance.from_metadata(channel.metadata)  # views are drawings, too
-    if not channel.schema_name or is_ours:
+    if is_ours or not (channel.schema_name or channel.message_encoding == MessageEncoding.JSON):
         return None
     kind, words = message_type_of(opened, channel.topic), re.findall("[a-z]+", channel.topic.lower())
     person = _PERSON if any(PEOPLE.fullmatch(word) for word in words) else ""
@@ -194,7 +195,8 @@ def _reading(opened: log.Log, topic: str, choice: BoxesChoice) -> Reading | None
     try:
         if not choice.fields and (special := _special(name)):
             if name in BUILT_IN[_KIND]:
-                return _of_drawings(special, _samples(opened, channel.topic, _single(special.read)), words, person)
+                drawn = _samples(opened, channel.topic, _single(special.read), is_enough=_has_boxes)
+                return _of_drawings(special, drawn, words, person)
             return special
     except McaptrackError as error:
         warn(f"{error}; messages of {channel.topic} are not read", "other")
@@ -202,7 +204,10 @@ def _reading(opened: log.Log, topic: str, choice: BoxesChoice) -> Reading | None
     if NO_THINGS.fullmatch(name) and not choice.fields:
         return None
     try:
-        shape = shape_of_type(kind) or shape_of_message(_samples(opened, channel.topic))._replace(count=None)
+        shape = shape_of_type(kind)
+        if shape is None:
+            read = _samples(opened, channel.topic, is_enough=_has_things)
+            shape = shape_of_message(read[-_TRIED:])._replace(count=None)
         reader = fields_reader(name, shape, choice.fields)
     except McaptrackError as error:
         if choice.fields:
@@ -211,7 +216,7 @@ def _reading(opened: log.Log, topic: str, choice: BoxesChoice) -> Reading | None
     if reader is None:
         return None
     if reader.fields.in_picture and reader.in_space:  # of both the one that is filled in
-        samples = _samples(opened, channel.topic, _single(reader.in_frame))
+        samples = _samples(opened, channel.topic, _single(reader.in_frame), is_enough=_has_boxes)
         centres = [seen.boxes.centre for seen in samples if len(seen.boxes.centre)]
         reader.in_space = not centres or bool(np.concatenate(centres).any())
     known = KNOWN.get(name)
@@ -236,17 +241,44 @@ def _single(read: Callable[[Things], Any]) -> Callable[[Any], Any]:
 
 
 def _samples(
-    opened: log.Log, topic: str, convert: Callable[[Any], Any] = lambda message: message, most: int = _TRIED
+    opened: log.Log,
+    topic: str,
+    convert: Callable[[Any], Any] = lambda message: message,
+    most: int = _TRIED,
+    is_enough: Callable[[Any], bool] = lambda _: True,
 ) -> list[Any]:
-    """The first messages of a channel, converted, up to one that can't be read."""
-    out = []
+    """The first messages of a channel, converted, up to one that can't be read.
+
+    If none of them is enough, as where a scene is empty at first, longer ones of those after them follow, up to one
+    that is.
+    """
+    out, longest, size, has_enough = list[Any](), 0, 0, False
     try:
         decode = decoder_with_errors(message_type_of(opened, topic), convert)
-        for message in islice(opened.timed(topic), most):
-            out.append(decode(message.payload))  # noqa: PERF401  # what was read before an error stays
+        for number, message in enumerate(opened.timed(topic)):
+            length, is_first = len(message.payload), number < most
+            size += length
+            if not is_first and (has_enough or size > _SEARCHED_BYTES):
+                break
+            if is_first or length > longest:
+                out.append(decode(message.payload))
+                longest, has_enough = max(longest, length), has_enough or is_enough(out[-1])
     except McaptrackError:
         pass  # reading the channel says why
     return out
+
+
+def _has_boxes(seen: Seen3d) -> bool:
+    return len(seen.boxes.message) > 0
+
+
+def _has_things(message: Any) -> bool:
+    """Whether a message of JSON has things in its lists, or no list at all."""
+    shape = shape_of_message(message)
+    inside = [inner for _, inner in shape.fields]
+    inside += [below for inner in inside if inner.is_struct for _, below in inner.fields]
+    kinds = {inner.kind for inner in inside if inner.count is not None} - {"number", "text"}
+    return not kinds or "struct" in kinds
 
 
 @lru_cache(maxsize=256)

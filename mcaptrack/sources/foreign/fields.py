@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, reduce
-from itertools import count
+from itertools import count, takewhile
 from math import nan
 from typing import Any, Final, NamedTuple
 
@@ -158,15 +158,16 @@ _JUDGED: Final = 50
 _PLACES, _VELOCITIES, _SIZES, _PICTURED, _HEADINGS, _IDS, _CLASSES, _SCORES = (
     words.split()
     for words in (
-        "pose position center centre posewithcovariance initialposewithcovariance pos centroid location point "
-        "kinematics state bbox bbox3d boundingbox boundingbox3d box bodypose",
-        "velocity vel twist twistwithcovariance initialtwistwithcovariance linear linearvelocity kinematics state",
-        "size dimensions dimension extent extents scale bbox bbox3d boundingbox boundingbox3d box shape",
+        "pose position center centre posewithcovariance posecovariance initialposewithcovariance pos centroid location "
+        "point kinematics state base bbox bbox3d boundingbox boundingbox3d box bodypose",
+        "velocity vel twist twistwithcovariance twistcovariance initialtwistwithcovariance linear linearvelocity "
+        "kinematics state base",
+        "size dimensions dimension extent extents scale bbox bbox3d boundingbox boundingbox3d box shape base",
         "bbox boundingbox boundingbox2d bbox2d box box2d roi rect region regionofinterest face body",
         "heading yaw theta orientation rotationy",
         "trackid trackingid objectid personid instanceid uuid uid id",
         "classname classlabel class label category objectclass objectname objectlabel classification objecttype "
-        "classid labelid type",
+        "classid labelid type kind semantic",
         "score confidence existenceprobability probability reliability likelihood conf c",
     )
 )
@@ -191,7 +192,8 @@ _FLAT_VELOCITIES: Final = [
     for form in ("v{}", "vel{}", "velocity{}", "{}vel", "{}velocity")
 ]
 _FLAT_SIZES: Final = (
-    *(f"length={at}length width={at}width height={at}height" for at in ("", "dimensions.", "dimension.", "size.")),
+    *(f"length={at}length width={at}width height={at}height"
+      for at in ("", "dimensions.", "dimension.", "size.", "base.dimension.")),
     "length=sizex width=sizey height=sizez", "radius=radius", "width=width height=height",
 )  # fmt: skip
 #: Words in the names of types and lists of people and other things that move; and of what isn't.
@@ -227,8 +229,8 @@ class ThingFields:
         The path of the list of things, ending with "[]"; () if the message itself is one.
     paths : dict of str to list of tuple of str
         Paths from a thing on, by what they hold; of several the first that isn't 0 throughout.
-    names : dict of int to str
-        Names of classes that are numbers, from constants of the definition.
+    names : dict of int or str to str
+        Names of classes that are numbers, or constants, from the constants of the definition.
     class_name : str
         The class of all things, by the name of their type; "" if it doesn't say.
     is_certain : bool
@@ -239,7 +241,7 @@ class ThingFields:
 
     things: Path
     paths: Mapping[str, Sequence[Path]]
-    names: Mapping[int, str] = field(default_factory=dict)
+    names: Mapping[int | str, str] = field(default_factory=dict)
     class_name: str = ""
     is_certain: bool = True
     has_zero: bool = False
@@ -396,8 +398,10 @@ def _position(shape: FieldShape, inside: Path) -> dict[str, Path]:
             at = path[:-1] if path and _word(path[-1]) == "position" else path
             owner = shape.at(at) or _NOTHING
             turn, heading = _member(owner, "orientation"), _fact(owner, _HEADINGS, "number", deepest=0)
-            if turn[1].is_struct:
+            if "w" in _members(turn[1]):
                 return {"position": path, "orientation": (*at, *turn[0])}
+            if angle := _fact(turn[1], ["yaw"], "number", deepest=0):
+                heading = (*turn[0], *angle)
             heading = (*at, *heading) if heading else _fact(shape, _HEADINGS, "number", deepest=0)
             return {"position": path} | ({"heading": heading} if heading else {})
     flat = {} if inside else _form(shape, _FLAT_PLACES)
@@ -432,7 +436,7 @@ def _id_below(shape: FieldShape) -> Path | None:
     """The path of an id in the field of an id: number, text, or the bytes of a UUID; None if there is none."""
     if shape.kind in ("number", "text") and shape.count in (None, 16):
         return ()
-    return _member(shape, "uuid")[0] if "uuid" in _members(shape) else None
+    return next((_member(shape, word)[0] for word in ("uuid", "value") if word in _members(shape)), None)
 
 
 def _guess(shape: FieldShape) -> dict[str, Path]:
@@ -447,8 +451,11 @@ def _guess(shape: FieldShape) -> dict[str, Path]:
     return {}
 
 
-def _names_of(each: FieldShape, path: Path) -> dict[int, str]:
-    """The names of classes that are numbers, by the constants beside their field."""
+def _names_of(each: FieldShape, path: Path) -> dict[int | str, str]:
+    """The names of classes that are numbers, by the constants beside their field, and by the names of these.
+
+    What all constants begin with (OBJECT_TYPE_CAR, OBJECT_TYPE_BUS), as enumerations of protobuf do, is left out.
+    """
     owner, kind = each.at(path[:-1]) or _NOTHING, each.at(path) or _NOTHING
     if kind.kind != "number":
         return {}
@@ -457,7 +464,9 @@ def _names_of(each: FieldShape, path: Path) -> dict[int, str]:
         named = named or tuple((name[len(prefix) :], own) for name, own in owner.constants if name.startswith(prefix))
     numbers = [name for name, inner in owner.fields if inner == _NUMBER and _word(name) not in _SCORES]
     named = named or (owner.constants if numbers == [path[-1]] else ())
-    return {own: plain_class(name) for name, own in named}
+    same = takewhile(lambda letters: len(set(letters)) == 1, zip(*(name for name, _ in named), strict=False))
+    start = "".join(letters[0] for letters in same).rfind("_") + 1 if len(named) > 2 else 0
+    return {key: plain_class(name[start:]) for name, own in named for key in (own, name)}
 
 
 def _picture(shape: FieldShape, depth: int = 0) -> dict[str, Path]:
@@ -775,7 +784,8 @@ class FieldReader:
             return self.fields.class_name
         if not isinstance(value, str):
             return self.fields.names.get(integer(value), str(integer(value)))
-        return plain_class(value) if self.fields.names else value.strip()  # enumerations of protobuf are by name
+        # Enumerations of protobuf are by name.
+        return self.fields.names.get(value, plain_class(value)) if self.fields.names else value.strip()
 
     def _likeliest(self, things: Things, path: Path) -> tuple[Floats, list[Any]]:
         """The highest score of guesses that is a number, and the class with it; NaN and None if there is no guess."""
@@ -795,7 +805,7 @@ class FieldReader:
 
 def plain_class(name: str) -> str:
     """The class of a constant: its name in lower case, "" for what says that it is unknown."""
-    return "" if name.lower() == "unknown" else name.lower()
+    return "" if name.lower() in ("unknown", "unspecified") else name.lower()
 
 
 def identity(value: Any) -> int | str | None:

@@ -104,6 +104,11 @@ def _autoware(things: Things, boxes: Boxes3d) -> Boxes3d:
     return boxes._replace(centre=centre, size=size, velocity=velocity, has_heading=is_turned, score=score)
 
 
+def _along_heading(_: Things, boxes: Boxes3d) -> Boxes3d:
+    """Velocities along the axes of the object, as those of Autoware before kinematics had a message of their own."""
+    return boxes._replace(velocity=rotated(boxes.orientation, boxes.velocity))
+
+
 _AUTOWARE: Final = Known(
     "",
     ",car,truck,bus,trailer,motorcycle,bicycle,pedestrian,animal,hazard,over_drivable,under_drivable",
@@ -166,6 +171,10 @@ KNOWN: Final[Mapping[str, Known]] = {
     "leg_tracker/PersonArray": Known(),
     "leg_tracker/LegArray": Known(),
     "radar_msgs/RadarTracks": Known(),
+    "autoware_msgs/DetectedObjectArray": Known(adjust=_along_heading),
+    "autoware_perception_msgs/DynamicObjectArray": Known(
+        "", ",car,truck,bus,bicycle,motorbike,pedestrian,animal", _along_heading
+    ),
     "zed_interfaces/ObjectsStamped": _ZED,
     "zed_msgs/ObjectsStamped": _ZED,
     **{

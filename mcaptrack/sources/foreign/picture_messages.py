@@ -68,7 +68,7 @@ class Picture(NamedTuple):
 
     ``stamp_ns`` is the stamp in the message, in nanoseconds since 1970. ``pixels`` is the pixel format of what a still
     image holds, "" for usual ones, and ``span`` has the values that become black and white. ``is_depth``: the message
-    says that values are distances.
+    says that values are distances. ``error`` is why a message can't be read, which then has nothing else.
     """
 
     stamp_ns: int
@@ -78,12 +78,15 @@ class Picture(NamedTuple):
     pixels: str = ""
     span: Span | None = None
     is_depth: bool = False
+    error: str = ""
 
     def encoded(self, t_ns: int, number: int, where: str) -> EncodedPicture:
         """The picture for decoders: with its time, its number and its place for errors."""
         from mcaptrack.sources.video import EncodedPicture
 
-        return EncodedPicture(t_ns, number, self.format, self.data, self.layout, where, self.span, self.pixels)
+        return EncodedPicture(
+            t_ns, number, self.format, self.data, self.layout, where, self.span, self.pixels, self.error
+        )
 
 
 def holds_pictures(channel: log.Channel) -> bool:
@@ -152,16 +155,13 @@ def depth_of(opened: log.Log, topic: str) -> str:
 
 
 def pictures(opened: log.Log, topic: str) -> Iterator[tuple[log.Message, Picture]]:
-    """The messages of a channel with their pictures.
-
-    Raises McaptrackError, with topic and time, for messages that can't be read.
-    """
+    """The messages of a channel with their pictures. Raises McaptrackError if their type is not supported."""
     read = picture_reader(opened, topic)
     return ((message, read(message)) for message in opened.timed(topic))
 
 
 def picture_reader(opened: log.Log, topic: str) -> Callable[[log.Message], Picture]:
-    """A function that decodes messages of a channel to pictures; both raise errors as ``pictures`` does."""
+    """A function that decodes messages of a channel to pictures; it raises errors as ``pictures`` does."""
     return _reader(opened, topic, facts_of(opened, topic))
 
 
@@ -172,7 +172,7 @@ def _reader(opened: log.Log, topic: str, facts: SharedFacts) -> Callable[[log.Me
         try:
             return decode(message.payload)
         except McaptrackError as error:
-            raise McaptrackError(f"{opened.path}: {topic} at {message.t_ns} ns: {error}") from None
+            return Picture(message.t_ns, "", b"", error=str(error))
 
     return read
 
@@ -195,10 +195,9 @@ def facts_of(opened: log.Log, topic: str) -> SharedFacts:
     read = _reader(opened, topic, facts)
     first: Picture | None = None
     for message in islice(opened.messages(topic), _SEARCHED):
-        try:
-            picture = read(message)
-        except McaptrackError:
-            continue  # who reads them says so
+        picture = read(message)
+        if picture.error:
+            continue  # decoding says so
         first = first or picture
         if facts.recogniser.is_settled or picture.layout:
             break

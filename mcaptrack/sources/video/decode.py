@@ -39,6 +39,7 @@ class EncodedPicture(NamedTuple):
 
     ``where`` names the picture in errors; by default its number does. ``span`` are the values that become black and
     white where samples have more than 8 bits, and ``pixels`` is the pixel format of a still image, "" for usual ones.
+    ``error`` says why a message holds no picture.
     """
 
     t_ns: int
@@ -49,6 +50,7 @@ class EncodedPicture(NamedTuple):
     where: str = ""
     span: Span | None = None
     pixels: str = ""
+    error: str = ""
 
     @property
     def is_video(self) -> bool:
@@ -113,11 +115,12 @@ def decode_gray(
             continue
         else:
             try:
+                _check_readable(picture)
                 pixels = _raw(picture, is_grey) if picture.layout else _still(picture, is_grey)
             except McaptrackError as cause:
                 named = picture.name in str(cause)
                 error = cause if named else McaptrackError(f"{picture.name}: {cause}")
-                if unreadable is None or (len(unreadable) == _MOST_UNREADABLE and not is_any_readable):
+                if unreadable is None or (len(unreadable) == _MOST_UNREADABLE and not (is_any_readable or decoder)):
                     raise error from None
                 unreadable.append(error)
                 continue
@@ -131,6 +134,12 @@ def decode_gray(
 
 #: Decode pictures to BGR, as ``decode_gray`` does to gray.
 decode_bgr: Final = partial(decode_gray, is_grey=False)
+
+
+def _check_readable(picture: EncodedPicture) -> None:
+    """Raise McaptrackError if the message of a picture could not be read."""
+    if picture.error:
+        raise McaptrackError(picture.error)
 
 
 def _raw(picture: EncodedPicture, is_grey: bool) -> Image:
@@ -177,6 +186,7 @@ def wide_samples(picture: EncodedPicture) -> Samples | None:
     """
     import cv2
 
+    _check_readable(picture)
     name = picture.format if picture.layout else picture.pixels
     tile = pixel_format(name).tile if name else ""
     if picture.layout:
