@@ -12,10 +12,9 @@ import pytest
 
 from mcaptrack import log, notices, pipeline
 from mcaptrack.errors import McaptrackError
-from mcaptrack.predictors import OnClock, make, weights_sha256
+from mcaptrack.predictors import OnClock, are_covariances, make, weights_sha256
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.lstm import Lstm
-from mcaptrack.predictors.onnx import are_covariances
 from mcaptrack.predictors.red import Red
 from mcaptrack.predictors.weights import SHIPPED, Weights, load, save
 from mcaptrack.sources.ingest import IngestOptions, ingest

@@ -18,7 +18,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_gaps, last_positions
 from mcaptrack.networks import NetworkFile, NetworkLimits, OnnxNetwork, read_file
-from mcaptrack.predictors.forecast import Forecast
+from mcaptrack.predictors.forecast import Forecast, are_covariances
 from mcaptrack.predictors.linear import LinearPredictor
 
 _STEP_S: Final = 0.4
@@ -124,11 +124,3 @@ class Onnx:
         outputs = self._run(filled - now, is_known)
         cov = outputs[1] if len(outputs) > 1 else self._covariance_model.predict(xy_m, valid).cov
         return Forecast(now + outputs[0], cov)
-
-
-def are_covariances(cov: Floats) -> bool:
-    """Whether matrices (B, T, 2, 2) are symmetric and positive definite, up to the precision of 32 bits."""
-    xx, xy, yx, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
-    scale = np.sqrt(np.maximum(xx, 0)) * np.sqrt(np.maximum(yy, 0))  # the product of both may overflow
-    is_symmetric = np.abs(xy - yx) <= 1e-4 * scale
-    return bool((is_symmetric & (xx > 0) & (yy > 0) & (np.abs(xy + yx) / 2 <= scale)).all())

@@ -36,7 +36,7 @@ from typing import Any, Final, Literal, TypeVar, get_args
 
 from mcaptrack import _MODULES, __version__
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.installed import Point, declared, distribution_of, entry_points, missing_extension
+from mcaptrack.installed import Point, declared, distribution_of, entry_points, missing_extension, missing_names
 from mcaptrack.registry.guard import Guard, contained_import
 
 __all__ = ["Entry", "blamed", "find", "of_type", "others"]
@@ -251,6 +251,16 @@ def _owners(kind: Kind) -> Iterator[tuple[Point, str]]:
             yield point, f"a built-in {titled(kind, point.name)}"
         else:
             yield point, f"a {titled('command', point.name)}" if point.name in commands else ""
+
+
+def split_file(kind: Kind, name: str) -> tuple[str, str | None]:
+    """A name, and the file that it ends with: ("red", "FILE") for "red:FILE", and None for names without a file.
+
+    A name of the registry, or of an extension that isn't installed, has a file behind its colon; others are
+    ``module:Class``.
+    """
+    own, colon, file = name.partition(":")
+    return (own, file) if colon and own in (*names(kind), *missing_names(kind)) else (name, None)
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:
