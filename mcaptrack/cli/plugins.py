@@ -55,6 +55,7 @@ def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str],
 
 
 def _of_words(stage: Stage, arguments: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
+    assert stage.option
     for name in filter(None, values_of(arguments, f"--{stage.option}")):  # the parser refuses an empty one
         if stage.split(name)[0] in own(stage.option):
             continue

@@ -61,6 +61,7 @@ Kind = Literal[
     "viewer",  # on the web, which `mcaptrack view` links besides Lichtblick and Foxglove
     "name",  # in Python, such as classes of results; those of the core are in mcaptrack/__init__.py
     "scene",  # what makes a scene of several cameras (mcaptrack.pipeline.scenes)
+    "doctor_line",  # what `mcaptrack doctor` says of a part
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 T = TypeVar("T")
@@ -73,13 +74,13 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
-    "demo ingest run view info detect motion track sample predict retrack models query export cut "
+    "demo ingest run view info detect motion track sample predict retrack query export cut "
     "evaluate events check recover drop doctor"
 )
 #: Kinds that only entry points name.
 _BY_ENTRY_POINT: Final = (
     *("stage", "message_reader", "recording", "finisher", "report_section", "command", "page", "player", "viewer"),
-    *("name", "scene"),
+    *("name", "scene", "doctor_line"),
 )
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
@@ -88,10 +89,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "detector": {
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
-            "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",
-            "yolox-nano": "mcaptrack.transforms.detect.onnx.detector:YoloxNano",
-            "yolox-tiny": "mcaptrack.transforms.detect.onnx.detector:YoloxTiny",
-            "yolox-s": "mcaptrack.transforms.detect.onnx.detector:YoloxS",
         },
         "tracker": {
             "sort": "mcaptrack.transforms.sort:Sort",
@@ -107,7 +104,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "holt-cv": "mcaptrack.predictors.built_in:holt_cv",
             "kalman": "mcaptrack.predictors.built_in:kalman",
             "lstm": "mcaptrack.predictors.built_in:lstm",
-            "onnx": "mcaptrack.predictors.built_in:onnx",
         },
         "retracker": {
             "likelihood": "mcaptrack.transforms.retrack:Retrack",
