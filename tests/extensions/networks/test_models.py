@@ -158,6 +158,8 @@ class TestListing:
         (one,) = json.loads(done("models", "--json").out)["models"]
         assert one["path"] == str(model.path)
         assert model.urls[0] in done("models", "-v").out
+        quiet = done("models", "get", NAME, "-q")
+        assert (quiet.out, quiet.err) == ("", "")
 
     def test_the_folder_is_that_of_the_variable_or_one_for_caches(self, monkeypatch, tmp_path):
         monkeypatch.delenv("MCAPTRACK_MODELS", raising=False)
@@ -166,6 +168,13 @@ class TestListing:
         monkeypatch.delenv("XDG_CACHE_HOME")
         monkeypatch.setattr(Path, "home", lambda: tmp_path)
         assert catalogue.folder().parent.parent.parent == tmp_path
+
+    def test_doctor_says_where_weights_are_kept_and_whether_they_can_be(self, monkeypatch, tmp_path):
+        monkeypatch.setenv("MCAPTRACK_MODELS", str(tmp_path / "a" / "b"))
+        assert mcaptrack.doctor().parts["fetched weights"] == str(tmp_path / "a" / "b")
+        (tmp_path / "a").write_text("a file")
+        assert mcaptrack.doctor().parts["fetched weights"] == f"{tmp_path / 'a' / 'b'}, which can't be written"
+        assert "CPUExecutionProvider" in mcaptrack.doctor().parts["ONNX Runtime"]
 
 
 class TestDetecting:

@@ -22,6 +22,7 @@ from mcaptrack.extensions.networks.pictures import DetectorNetwork
 from mcaptrack.schema import Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.testing import check_transform
+from mcaptrack.transforms import STAGES
 from tests.commands import call, done
 from tests.extensions.networks import onnx_graphs
 from tests.extensions.networks.onnx_graphs import (
@@ -480,3 +481,19 @@ def test_every_option_changes_what_is_found(network, option):
 def test_every_option_is_tested_here():
     elsewhere = {"file", "layout", "max_iou", "device", "max_memory_mb"}
     assert set(EFFECTS) | elsewhere == {option.name for option in fields(OnnxDetector)}
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"min_score": 0.25}, "the network finds no person with a score of at least 0.25"),
+        ({"classes": "ALL"}, "the network finds nothing with a score of at least 0.1"),
+    ],
+)
+def test_why_nothing_came_of_it(options, reason):
+    assert OnnxDetector(**options).why_empty([], []) == reason
+
+
+def test_on_the_ground_the_tracker_that_suits_it_compares_metres():
+    suited = OnnxDetector.suits["tracker"]
+    assert STAGES["track"].make(suited.name, **suited.on_ground).cost == "metres"
