@@ -10,7 +10,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any
 
-from mcaptrack.api.declared import Argument, checked, declared
+from mcaptrack.api.declared import Argument, declared, done_by
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.extensions.networks import catalogue
@@ -67,7 +67,7 @@ def models(
     return (catalogue.find(name),) if name else tuple(catalogue.CATALOGUE.values())
 
 
-@checked
+@done_by("models get")
 def get_model(name: str, *, source: PathLike | None = None) -> Path:
     """Fetch the weights of a detector of the catalogue, once, into the user's folder of caches.
 
