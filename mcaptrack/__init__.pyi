@@ -4,9 +4,6 @@ import typing
 import mcaptrack.extensions.zones.api
 import mcaptrack.extensions.zones.visits
 import mcaptrack.transforms
-from mcaptrack.api.catalogue import Model as Model
-from mcaptrack.api.catalogue import get_model as get_model
-from mcaptrack.api.catalogue import models as models
 from mcaptrack.api.contents import ChannelInfo as ChannelInfo
 from mcaptrack.api.contents import FrameInfo as FrameInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
@@ -57,6 +54,9 @@ from mcaptrack.extensions.cameras.api import CalibrateResult as CalibrateResult
 from mcaptrack.extensions.cameras.api import CameraCorrection as CameraCorrection
 from mcaptrack.extensions.cameras.api import calibrate as calibrate
 from mcaptrack.extensions.cameras.api import fuse as fuse
+from mcaptrack.extensions.networks.api import get_model as get_model
+from mcaptrack.extensions.networks.api import models as models
+from mcaptrack.extensions.networks.catalogue import Model as Model
 from mcaptrack.extensions.notebook.api import Player as Player
 from mcaptrack.extensions.render.api import RenderResult as RenderResult
 from mcaptrack.extensions.render.api import render as render
@@ -92,6 +92,11 @@ __version__: str
 SCHEMA_VERSION: int
 
 # What extensions have beside these, for the message that names what is missing:
+# detector onnx: mcaptrack.extensions.networks
+# detector yolox-nano: mcaptrack.extensions.networks
+# detector yolox-s: mcaptrack.extensions.networks
+# detector yolox-tiny: mcaptrack.extensions.networks
+# doctor_line networks: mcaptrack.extensions.networks
 # exporter boxes-csv: mcaptrack.extensions.exchange
 # exporter coco: mcaptrack.extensions.exchange
 # exporter cvat: mcaptrack.extensions.exchange
@@ -103,6 +108,7 @@ SCHEMA_VERSION: int
 # scene fused: mcaptrack.extensions.cameras
 # exporter rosbag2: mcaptrack.extensions.bags
 # exporter rosbag2-sqlite3: mcaptrack.extensions.bags
+# predictor onnx: mcaptrack.extensions.networks
 # recording rosbag: mcaptrack.extensions.bags
 # ending .bag: mcaptrack.extensions.bags
 # ending .bag.active: mcaptrack.extensions.bags

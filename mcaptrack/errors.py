@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["DamagedError", "McaptrackError", "call", "command", "list_names", "offer"]
+__all__ = ["DamagedError", "McaptrackError", "call", "command", "did_you_mean", "list_names", "offer"]
 
 
 class McaptrackError(Exception):

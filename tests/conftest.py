@@ -133,12 +133,6 @@ def fresh(_ingested, tmp_path) -> Path:
 
 
 @pytest.fixture
-def networks_here(monkeypatch) -> None:
-    """Run networks in this process, which takes less time; tests/test_strange_networks.py has the other one."""
-    monkeypatch.setattr("mcaptrack.networks._runs_apart", lambda is_trusted: False)
-
-
-@pytest.fixture
 def never_waits() -> Iterator[None]:
     """Fail a test that waits for longer than ten minutes."""
 

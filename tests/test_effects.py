@@ -33,7 +33,6 @@ from tests.commands import GROUP, call, done, press_ctrl_c
 from tests.effects.commands import CASES
 from tests.extension_cases import of_extensions
 from tests.logs import plain
-from tests.models import DATA, stocked
 from tests.tiers import one_in
 from tests.undefined import write_undefined
 from tests.worlds import small_scene, write_eventful
@@ -91,7 +90,6 @@ def template(template, tmp_path_factory) -> Path:
             box = {"left": 10 + number, "top": 20, "right": 22 + number, "bottom": 50, "label": "7", "conf": 0.9}
             payload = json.dumps({"stamp": {"sec": 1, "nanosec": number}, "things": [box]}).encode()
             writer.add_message(channel, number * 10**8, number, payload)
-    (folder / "known.onnx").write_bytes(DATA)
     kinds = "".join(
         f"{n},{who},{9 * n},24,8,16,{kind}\n" for n in range(30) for who, kind in ((1, "person"), (2, "cart"))
     )
@@ -199,9 +197,6 @@ def see(work, tmp_path, monkeypatch) -> Callable[[str], Seen]:
     monkeypatch.setattr(Server, "serve_forever", press_ctrl_c)
     monkeypatch.setattr(secrets, "token_urlsafe", lambda _: "secret")
     monkeypatch.setattr(webbrowser, "open", lambda address: print(f"opened {address}"))
-
-    stocked(monkeypatch, tmp_path, "http://127.0.0.1:1/network.onnx")  # which can't be reached
-    monkeypatch.setenv("MCAPTRACK_MODELS", "models")
 
     def run(line: str) -> Seen:
         work.restore()

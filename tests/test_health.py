@@ -130,6 +130,22 @@ def test_a_plug_in_that_cant_be_imported_is_a_warning(tmp_path, monkeypatch):
     assert [warning["message"] for warning in said["warnings"]] == [why]
 
 
+def test_parts_say_a_line_of_their_own(tmp_path, monkeypatch):
+    points = {name: f"own_lines:{name}" for name in ("works", "fails", "counts")}
+    package(tmp_path, "own", "1.5", {"mcaptrack.doctor_lines": points})
+    (tmp_path / "own_lines.py").write_text(
+        "def works(): return {'lidar driver': 7}\ndef fails(): 1 / 0\ndef counts(): return 3\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert "\nlidar driver  " in done("doctor").out
+    said = json.loads(done("doctor", "--json").out)
+    assert said["parts"]["lidar driver"] == "7"
+    assert [warning["message"] for warning in said["warnings"]] == [
+        "doctor line counts (own 1.5) gave an int; it has to give a dict",
+        "doctor line fails (own 1.5) failed: ZeroDivisionError: division by zero (own_lines.py, line 2)",
+    ]
+
+
 def test_packages_that_bring_the_same_module_are_named(tmp_path, monkeypatch):
     """As opencv-python does beside opencv-python-headless, whatever of them was installed last."""
     info = tmp_path / "opencv_python-9.8.dist-info"

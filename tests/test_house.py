@@ -240,3 +240,31 @@ def test_a_setting_of_a_missing_extension_is_named_with_it(command, option, tmp_
         assert done.returncode == 2
         assert "zones is an extension that isn't installed; install mcaptrack again" in done.stderr
         assert len(done.stderr.splitlines()) == 1
+
+
+#: Makes channels again that parts of a missing extension made, and prints what is said.
+MAKE_AGAIN = """
+from mcaptrack.pipeline.rebuild import rebuild
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.transforms import STAGES
+
+for stage, parameters in (("detect", {"detector": "onnx", "file": "a"}), ("predict", {"predictor": "onnx:a"})):
+    try:
+        rebuild(STAGES[stage], Provenance(stage, parameters), {})
+    except Exception as error:
+        print(error)
+"""
+
+
+def test_a_part_with_a_file_of_a_missing_extension_is_named(tmp_path):
+    house_without(["networks"], tmp_path)
+
+    def said(*words: str) -> tuple[int, str]:
+        done = subprocess.run([sys.executable, *words], cwd=tmp_path, env={"PYTHONPATH": str(tmp_path), "PATH": "/usr/bin"},
+                              capture_output=True, text=True, check=False)  # fmt: skip
+        return done.returncode, done.stderr + done.stdout
+
+    why = "onnx is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/networks\n"
+    for words in ("detect a.mcap --detector onnx:a.onnx", "predict a.mcap --predictor onnx:a.onnx"):
+        assert said("-m", "mcaptrack", *words.split()) == (1, f"mcaptrack: {why}")
+    assert said("-c", MAKE_AGAIN) == (0, f"detector onnx made it; {why}{why}")

@@ -256,6 +256,7 @@ WORDS = {
     "`mcaptrack.run('a.mcap', force=True)`": "`mcaptrack run a.mcap --force`",
     "`mcaptrack.track('a.mcap', max_age_s=2.0)`": "`mcaptrack track a.mcap --max-age-s 2.0`",
     "`mcaptrack.list_tables('a.mcap')`": "`mcaptrack query a.mcap --tables`",
+    "`mcaptrack.no_such('a.mcap', size=2)`": "`mcaptrack no_such a.mcap --size 2`",
     "`mcaptrack.run(path)`": "`mcaptrack.run(path)`",
     "`mcaptrack.run(**x)`": "`mcaptrack.run(**x)`",
     "`code` stays": "`code` stays",

@@ -30,7 +30,6 @@ from mcaptrack.transforms import (
     KnnDetector,
     MedianDetector,
     OcSort,
-    OnnxDetector,
     Predict,
     Retrack,
     Sample,
@@ -520,8 +519,6 @@ def rows(count: int) -> np.ndarray:
         (Sort(), "no track of 7 detections is confirmed (min_hits_s): too few pictures a second, perhaps"),
         (MedianDetector(), "nothing in its 2 pictures differs from their median by more than the threshold"),
         (KnnDetector(), "no motion in its 2 pictures exceeds the threshold"),
-        (OnnxDetector(min_score=0.25), "the network finds no person with a score of at least 0.25"),
-        (OnnxDetector(classes="ALL"), "the network finds nothing with a score of at least 0.1"),
         (Predict(), "no track has the 1.2 s without a gap that a prediction needs (min_history)"),
         (
             Predict(rate_hz=10.0, min_history=3),

@@ -444,6 +444,16 @@ def test_wrong_options_are_refused_in_one_line(place, line, code, said):
     assert said in refused.err
 
 
+def test_a_detector_with_a_field_for_a_file_takes_it_after_its_name(place):
+    refused = call("detect", "a.mcap", "--detector", "corner:own.txt")
+    assert refused.err == "mcaptrack: detector corner (own 1.5) takes no file, so corner:own.txt names nothing\n"
+    install(text=MODULE.replace("    size_px: float", '    file: str = option("", "what")\n    size_px: float'))
+    done("detect", "a.mcap", "--detector", "corner:own.txt", "--force")
+    assert provenance_of("a.mcap", "/camera/detections").parameters["file"] == "own.txt"
+    assert "running detect again" not in done("run", "a.mcap", "--detector", "corner:own.txt", "--no-tables").err
+    assert "running detect again" in done("run", "a.mcap", "--detector", "corner:other.txt", "--no-tables").err
+
+
 @pytest.mark.parametrize("name", ["topic", "force", "help", "logs", "in_place", "no_name"])
 def test_a_parameter_with_the_name_of_an_option_is_refused_by_name(place, name):
     """Also of the other form of a switch, as in --sidecar/--in-place, or of --name/--no-name of the class itself."""

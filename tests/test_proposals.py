@@ -24,7 +24,6 @@ from mcaptrack.viewing import serving
 from tests.commands import GROUP, call, done
 from tests.extension_cases import of_extensions
 from tests.interrupted import interrupt
-from tests.models import stocked
 from tests.robots import write_log
 from tests.sources import PACKAGE, texts
 from tests.stores import Store, only_in
@@ -137,13 +136,6 @@ class Scene:
         shutil.copy("clip.mp4", self.path)
         return self.says("info", "LOG")
 
-    def with_other_weights(self) -> str:
-        """Damage the fetched file of a model."""
-        path = mcaptrack.models()[0].path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(b"damaged")
-        return self.says("detect", "LOG", "--detector", "yolox-nano")
-
     def followed(self) -> str:
         """A log without tracks, and one that follows it."""
         shutil.copy(self.path, "next.mcap")
@@ -190,14 +182,6 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "log/journal.py:recover_command:recover": Scene.damaged,
     "log/reader.py:reporting_bad_times:drop": Scene.late,
     "log/recording_files.py:not_mcap:ingest": Scene.video,
-    "transforms/detect/onnx/session.py:check:get_model": Scene.with_other_weights,
-    "transforms/detect/onnx/session.py:stored:get_model": lambda s: s.says("detect", "LOG", "--detector", "yolox-nano"),
-    "api/catalogue.py:get_model:get_model": lambda s: s.says(
-        "models", "get", "yolox-nano", "--from", "http://127.0.0.1:1/"
-    ),
-    "cli/models.py:arguments:models": lambda s: s.says("models", "get"),
-    "cli/models.py:show:models": lambda s: s.says("models"),
-    "cli/models.py:show:run": lambda s: s.says("models", "get", "yolox-nano"),
     "log/reader.py:channel:info": lambda s: s.says("export", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:info": lambda s: s.says("sample", "LOG", "--topic", "/nothing"),
     "pipeline/checks.py:_lacks:ingest": lambda s: s.ingested("truth.txt", "--as", "truth", "--fps", "10").says(
@@ -290,8 +274,9 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, reques
     monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     verb = where.rpartition(":")[2]
     verb = {"list_tables": "query", "get_model": "models"}.get(verb, verb)
-    if verb == "models" or where.startswith("cli/models"):
-        stocked(monkeypatch, tmp_path)
+    for extension, prepare in of_extensions("PREPARED").items():
+        if where.startswith(f"extensions/{extension}/"):
+            prepare(monkeypatch, tmp_path)
     if where == "api/running.py:products:export":
         store = Store()
         request.addfinalizer(store.stop)

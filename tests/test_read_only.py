@@ -19,7 +19,7 @@ from tests.logs import READING
 from tests.tiers import one_in
 
 #: Those that read no log.
-OTHERS = {"demo", "docs", "doctor", "models"}
+OTHERS = {"demo", "docs", "doctor"}
 pytestmark = pytest.mark.usefixtures("never_waits")
 
 

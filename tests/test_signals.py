@@ -21,8 +21,8 @@ SOON_S = 2
 SIGNALS = {"Ctrl-C": signal.SIGINT, "kill": signal.SIGTERM}
 #: Command lines other than on a log with all results.
 LINES = {
-    "demo": "demo", "docs": "docs tables", "doctor": "doctor", "ingest": "ingest clip.mp4", "models": "models",
-    "run": "run fresh.mcap", "view": "view a.mcap",
+    "demo": "demo", "docs": "docs tables", "doctor": "doctor", "ingest": "ingest clip.mp4",
+    "run": "run fresh.mcap", "view": "view a.mcap", **of_extensions("LINES"),
 }  # fmt: skip
 #: What is looked at of a command, where it is not the reading, and the writing and publishing of those that write.
 DEEDS = {

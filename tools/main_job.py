@@ -189,7 +189,9 @@ def extras(log: Path) -> None:
     if find_spec("onnxruntime"):
         network = log.with_name("line.onnx")
         network.write_bytes(
-            base64.b64decode(json.loads((ROOT / "tests" / "networks.json").read_text())["onnx"]["line"])
+            base64.b64decode(
+                json.loads((ROOT / "tests" / "extensions" / "networks" / "networks.json").read_text())["line"]
+            )
         )
         mcaptrack_command("predict", log, "--predictor", f"onnx:{network}", "-o", log.with_name("onnx.mcap"), "--force")
         with mcaptrack.open(log.with_name("onnx.mcap")) as opened:

@@ -39,7 +39,7 @@ from typing import (
 from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.installed import missing_extension
 
-__all__ = ["Argument", "Option", "checked", "declared"]
+__all__ = ["Argument", "Option", "checked", "declared", "done_by"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -312,6 +312,20 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
         return function(*args, **kwargs)
 
     return call
+
+
+def done_by(command_line: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Declare a function that is ``checked``, and that a command does: "models get", "query --tables".
+
+    Messages that name a call of it name that command on the command line.
+    """
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        call = checked(function)
+        vars(call).update(done_by=command_line)
+        return call
+
+    return decorate
 
 
 def declared(

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final
 
 from mcaptrack import __version__
 from mcaptrack.api.declared import Argument, declared
-from mcaptrack.environment import THREADS, cache_folder, memory_bytes, share_of_cores
+from mcaptrack.environment import THREADS, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
@@ -106,12 +106,6 @@ def free_bytes(folder: Path) -> int | None:
     return None
 
 
-def can_be_written(folder: Path) -> bool:
-    """Whether files can be made in a folder, or the folder itself."""
-    existing = next(place for place in (folder, *folder.parents) if place.exists())
-    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
-
-
 @dataclass(frozen=True)
 class DoctorResult:
     """An installation: what it has, and what it lacks.
@@ -126,8 +120,6 @@ class DoctorResult:
         The packages that each extra lacks; () for an extra that is installed.
     codecs : dict of str to str
         Why pictures of a codec can't be decoded, or encoded ("h264 encoder"); "" where they can.
-    onnx_providers : tuple of str
-        What ONNX Runtime can run networks on; () if it is not installed.
     cores : float
         How many cores this process may use; a quota may be a fraction.
     memory_bytes : int or None
@@ -138,10 +130,8 @@ class DoctorResult:
         Where temporary files are written; None if no folder for them can be written.
     temporary_bytes_free : int or None
         Free space there.
-    cache_folder : pathlib.Path
-        Where fetched weights of detectors are kept; it is made when it is first needed.
-    cache_can_be_written : bool
-        Whether it can be made and written.
+    parts : dict of str to str
+        What parts say of themselves, such as what networks can run on, by its heading.
     plugins : dict of str to str
         Parts of other packages, as "tracker nearest (my-package 1.0)", and why each can't be imported; "" where it can.
     faults : tuple of str
@@ -159,14 +149,12 @@ class DoctorResult:
     packages: dict[str, str]
     extras: dict[str, tuple[str, ...]]
     codecs: dict[str, str]
-    onnx_providers: tuple[str, ...]
     cores: float
     memory_bytes: int | None
     threads: dict[str, str]
     temporary_folder: Path | None
     temporary_bytes_free: int | None
-    cache_folder: Path
-    cache_can_be_written: bool
+    parts: dict[str, str]
     plugins: dict[str, str]
     faults: tuple[str, ...]
     store: StoreCheck | None = None
@@ -189,8 +177,7 @@ class DoctorResult:
         """
         data = asdict(self)
         del data["warnings"]
-        folder = self.temporary_folder
-        return data | {"temporary_folder": str(folder) if folder else None, "cache_folder": str(self.cache_folder)}
+        return data | {"temporary_folder": str(self.temporary_folder) if self.temporary_folder else None}
 
 
 @declared(heading="Improve and repair", printed_by="mcaptrack.cli.doctor:Doctor")
@@ -233,7 +220,6 @@ def doctor(
     >>> mcaptrack.doctor().faults
     ()
     """
-    from mcaptrack.networks import providers
     from mcaptrack.sources.video.self_test import codec_faults
 
     url = None if store is None else url_of_store(store)
@@ -262,7 +248,6 @@ def doctor(
         free = free_bytes(folder) if folder else None
         if free is not None and free < _LITTLE_BYTES:
             warn(f"{folder} has only {free / 1e6:,.0f} MB free; TMPDIR may name another folder")
-        cache = cache_folder()
         plugins = _plugins()
         checked = None if url is None else check_store(url)
         faults += checked.faults if checked else ()
@@ -273,14 +258,12 @@ def doctor(
             packages=packages,
             extras=extras,
             codecs=codecs,
-            onnx_providers=providers(),
             cores=share_of_cores(),
             memory_bytes=memory_bytes(),
             threads=_threads(broken),
             temporary_folder=folder,
             temporary_bytes_free=free,
-            cache_folder=cache,
-            cache_can_be_written=can_be_written(cache),
+            parts=_parts(),
             plugins=plugins,
             faults=tuple(faults),
             store=checked,
@@ -380,3 +363,19 @@ def _plugins() -> dict[str, str]:
                 reasons[name] = str(error)
                 warn(str(error), "other")
     return reasons
+
+
+def _parts() -> dict[str, str]:
+    """Return the lines of extensions and packages, by their headings; warn of those that can't say theirs."""
+    from mcaptrack.registry import blamed, find, names, of_type
+
+    lines: dict[str, str] = {}
+    for name in names("doctor_line"):
+        try:
+            entry = find("doctor_line", name)
+            with blamed(entry, "failed"):
+                own = entry.cls()
+            lines |= of_type(entry, own, dict, "it")
+        except McaptrackError as error:
+            warn(str(error), "other")
+    return {str(heading): str(text) for heading, text in lines.items()}

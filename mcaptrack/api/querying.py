@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.common import as_path, detail, locations_of
-from mcaptrack.api.declared import PYTHON_ONLY, Argument, Option, checked, declared
+from mcaptrack.api.declared import PYTHON_ONLY, Argument, Option, declared, done_by
 from mcaptrack.api.options import PathLike
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ class TableList:
     channels: tuple[str, ...]
 
 
-@checked
+@done_by("query --tables")
 def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, PathLike] | None = None) -> TableList:
     """List the tables that queries can name, with their columns, units and meanings.
 

@@ -296,8 +296,8 @@ def predict(
     ----------
     predictor : str or Transform, optional
         "blend" (the default: the mean of "red" and "cv"), "red", "social" (looks at other people), "kalman", "holt-cv",
-        "cv", "lstm" (less exact than "cv"), "red:FILE", "onnx:FILE", the name of an installed predictor, or
-        "module:Class"; or a transform.
+        "cv", "lstm" (less exact than "cv"), "red:FILE", the name of an installed predictor, or "module:Class"; or a
+        transform.
     **options
         Options such as ``horizon_s``; `mcaptrack predict --help-all` lists them.
 

@@ -47,14 +47,12 @@ def _lines(result: DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
         yield f"extra {extra}", install if lacking else "installed"
     for codec, why in result.codecs.items():
         yield f"codec {codec}", why or "works"
-    yield "ONNX Runtime", ", ".join(result.onnx_providers) or "not installed"
     yield "cores", f"{result.cores:g}"
     yield "memory", "unknown" if result.memory_bytes is None else f"{result.memory_bytes / 1e9:.1f} GB"
     yield "threads", ", ".join(f"{name} {number}" for name, number in result.threads.items())
     free = "" if result.temporary_bytes_free is None else f", {result.temporary_bytes_free / 1e9:.1f} GB free"
     yield "temporary files", f"{result.temporary_folder or 'no folder can be written'}{free}"
-    can = "" if result.cache_can_be_written else ", which can't be written"
-    yield "fetched weights", f"{result.cache_folder}{can}"
+    yield from result.parts.items()
     for name, why in result.plugins.items():
         yield name, why or "can be imported"
     if result.store is not None:

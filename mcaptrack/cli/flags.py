@@ -8,16 +8,13 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final
 
+import mcaptrack
 from mcaptrack.errors import command
 
 #: Typer's context of the command that runs.
 RUNNING: Final[ContextVar[Any]] = ContextVar("running", default=None)
 
 _CALL: Final = re.compile(r"`mcaptrack\.(\w+)\(([^`]*)\)`")
-#: Functions that are a command with an option, by name.
-_WITH_OPTION: Final = {"list_tables": ("query", "--tables")}
-#: Functions that are an action of a command, by name.
-_ACTIONS: Final = {"get_model": ("models", "get")}
 _PARAMETER: Final = re.compile(r"`([a-z]\w*)=([^`]*)`")
 
 
@@ -35,12 +32,13 @@ def _command(match: re.Match[str]) -> str:
         options = {keyword.arg or "": ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, AssertionError):
         return match[0]
+    parts = getattr(getattr(mcaptrack, name, None), "done_by", name).split()
     arguments_: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
     for parameter, value in options.items():
-        flag = flag_of(parameter, value, _ACTIONS.get(name, (name,))[0])
+        flag = flag_of(parameter, value, parts[0])
         arguments_ += [flag] if isinstance(value, bool) else [flag, str(value)]
-    name, *more = _WITH_OPTION.get(name, (name,))
-    return command(*_ACTIONS.get(name, (name,)), *arguments_, *more)
+    flags = [part for part in parts if part.startswith("-")]
+    return command(*(part for part in parts if part not in flags), *arguments_, *flags)
 
 
 def _option(match: re.Match[str]) -> str:

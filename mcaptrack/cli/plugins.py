@@ -24,7 +24,7 @@ from mcaptrack.cli.text import say, stdout_to_stderr
 from mcaptrack.environment import PREFIX
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import listening
-from mcaptrack.registry import BUILT_IN, names
+from mcaptrack.registry import names, own
 from mcaptrack.transforms import STAGES, Stage, Transform
 
 
@@ -55,8 +55,9 @@ def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str],
 
 
 def _of_words(stage: Stage, arguments: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
+    assert stage.option
     for name in filter(None, values_of(arguments, f"--{stage.option}")):  # the parser refuses an empty one
-        if stage.split(name)[0] in BUILT_IN[stage.option]:
+        if stage.split(name)[0] in own(stage.option):
             continue
         with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error
             yield name, stage.choose(name)
@@ -85,7 +86,7 @@ def _of_settings(stage: Stage, files: Sequence[ConfigFile], commands: Mapping[st
         plugin_names += names(kind)
     out = {}
     for name in dict.fromkeys(plugin_names):
-        if name and stage.split(name)[0] not in BUILT_IN[kind]:
+        if name and stage.split(name)[0] not in own(kind):
             with suppress(McaptrackError):
                 out[name] = stage.choose(name)
     return out

@@ -9,7 +9,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Indices
 from mcaptrack.geometry.neighbours import touching_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range
 
-__all__ = ["columns_to_boxes"]
+__all__ = ["columns_to_boxes", "parse_size"]
 
 #: From so many pairs on, finding those that can overlap first is faster; and from so many on, finding them by cells.
 _MANY = 1500

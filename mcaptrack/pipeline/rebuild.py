@@ -11,10 +11,11 @@ from dataclasses import fields
 from typing import Any, Final, get_type_hints
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 from mcaptrack.predictors import entry_of as predictor_entry
 from mcaptrack.predictors import weights_sha256
-from mcaptrack.registry import Entry, find, is_installed
+from mcaptrack.registry import Entry, find, is_installed, split_file
 from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.transforms import Stage, Transform
 from mcaptrack.transforms.protocol import member_type
@@ -100,8 +101,7 @@ def _check_weights(stage: Stage, transform: Transform, sha256: str) -> None:
 
 def _is_of_a_module(predictor: str) -> bool:
     """Return whether a predictor's name has the form ``module:Class`` and not ``NAME:FILE``."""
-    name, colon, _ = predictor.partition(":")
-    return bool(colon) and not is_installed("predictor", name)
+    return ":" in predictor and split_file("predictor", predictor)[1] is None
 
 
 def _class_of(
@@ -115,7 +115,9 @@ def _class_of(
             return stage.default
         entry = stage.find(name) if stage.kind and is_installed(stage.kind, name) else None
         if entry is None or not entry.is_built_in:
-            raise McaptrackError(f"{stage.kind} {name} made it, which this version does not have")
+            missing = missing_extension(name, stage.kind or "")
+            why = f"; {missing}" if missing else ", which this version does not have"
+            raise McaptrackError(f"{stage.kind} {name} made it{why}")
         made_by: type[Transform] = entry.cls
         return made_by
     users = named_by_user.get(stage.name)

@@ -27,11 +27,12 @@ from mcaptrack.predictors.forecast import (
     Forecast,
     PeopleSeen,
     Predictor,
+    are_covariances,
     predict_among,
     predict_together,
     uses_people,
 )
-from mcaptrack.registry import BUILT_IN, Entry, find, is_installed
+from mcaptrack.registry import Entry, find, own, split_file
 
 __all__ = [
     "NAMES",
@@ -40,6 +41,7 @@ __all__ = [
     "PeopleSeen",
     "Predictor",
     "PredictorName",
+    "are_covariances",
     "entry_of",
     "make",
     "predict_among",
@@ -50,7 +52,7 @@ __all__ = [
 ]
 
 #: A predictor by name: built-in, of an entry point, or ``module:Class``; or a network with other weights, as in
-#: ``red:FILE``, ``lstm:FILE``, ``onnx:FILE``.
+#: ``red:FILE``, ``lstm:FILE``.
 PredictorName = str
 #: The built-in predictors that need no file.
 NAMES: Final = ("blend", "cv", "holt-cv", "kalman", "lstm", "red", "social")
@@ -193,8 +195,8 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
 
     Raises McaptrackError if there is no such predictor or file.
     """
-    kind, colon, file = name.partition(":")
-    if not colon or not is_installed("predictor", kind):
+    kind, file = split_file("predictor", name)
+    if file is None:
         entry = find("predictor", name)
         if _file_of(entry) is inspect.Parameter.empty:
             if ":" in name:
@@ -205,7 +207,7 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
         return entry, None
     entry = find("predictor", kind)
     if not file or _file_of(entry) is _NO_FILE:
-        those = [kind for kind in BUILT_IN["predictor"] if _file_of(find("predictor", kind)) is not _NO_FILE]
+        those = [kind for kind in own("predictor") if _file_of(find("predictor", kind)) is not _NO_FILE]
         text = ", ".join(f"{kind}:FILE" for kind in those)
         raise McaptrackError(f"predictor is one of {', '.join(NAMES)}, or {text}, not {name}")
     if not Path(file).is_file():

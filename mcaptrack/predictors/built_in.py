@@ -13,7 +13,6 @@ from mcaptrack.predictors.linear import LinearPredictor
 if TYPE_CHECKING:
     from mcaptrack.predictors.blend import Blend
     from mcaptrack.predictors.lstm import Lstm
-    from mcaptrack.predictors.onnx import Onnx
     from mcaptrack.predictors.red import Red
     from mcaptrack.predictors.social import Social
 
@@ -63,10 +62,3 @@ def lstm(steps: int, step_s: float, file: Path | None = None) -> Lstm:
     from mcaptrack.predictors.weights import SHIPPED, load
 
     return Lstm.of(load(file or SHIPPED / "lstm.safetensors"))
-
-
-def onnx(steps: int, step_s: float, file: Path) -> Onnx:
-    """A network in ONNX format."""
-    from mcaptrack.predictors.onnx import Onnx
-
-    return Onnx.of(file)

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.predictors.forecast import Forecast, PeopleSeen, uses_people
-from mcaptrack.predictors.onnx import are_covariances
+from mcaptrack.predictors.forecast import Forecast, PeopleSeen, are_covariances, uses_people
 from mcaptrack.registry import Entry, blamed, failure
 from mcaptrack.registry.guard import Guard
 

@@ -130,6 +130,14 @@ class Predictor(AnyPredictor, Protocol):
     def weights_sha256(self) -> str | None: ...
 
 
+def are_covariances(cov: Floats) -> bool:
+    """Whether matrices (B, T, 2, 2) are symmetric and positive definite, up to the precision of 32 bits."""
+    xx, xy, yx, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
+    scale = np.sqrt(np.maximum(xx, 0)) * np.sqrt(np.maximum(yy, 0))  # the product of both may overflow
+    is_symmetric = np.abs(xy - yx) <= 1e-4 * scale
+    return bool((is_symmetric & (xx > 0) & (yy > 0) & (np.abs(xy + yx) / 2 <= scale)).all())
+
+
 def predict_among(predictor: AnyPredictor, xy_m: Floats, valid: Bools, people: PeopleSeen | None) -> Forecast:
     """The forecasts of a batch; a predictor that uses other people gets them."""
     if people is not None and uses_people(predictor):

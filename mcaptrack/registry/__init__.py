@@ -37,7 +37,15 @@ from typing import Any, Final, Literal, TypeVar, get_args
 
 from mcaptrack import _MODULES, __version__
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.installed import Declared, Point, declared, distribution_of, entry_points, missing_extension
+from mcaptrack.installed import (
+    Declared,
+    Point,
+    declared,
+    distribution_of,
+    entry_points,
+    missing_extension,
+    missing_names,
+)
 from mcaptrack.registry.guard import Guard, contained_import
 
 __all__ = ["Entry", "blamed", "find", "of_type", "others"]
@@ -62,6 +70,7 @@ Kind = Literal[
     "viewer",  # on the web, which `mcaptrack view` links besides Lichtblick and Foxglove
     "name",  # in Python, such as classes of results; those of the core are in mcaptrack/__init__.py
     "scene",  # what makes a scene of several cameras (mcaptrack.pipeline.scenes)
+    "doctor_line",  # what `mcaptrack doctor` says of a part
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 T = TypeVar("T")
@@ -74,13 +83,13 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
-    "demo ingest run view info detect motion track sample predict retrack models query export cut "
+    "demo ingest run view info detect motion track sample predict retrack query export cut "
     "evaluate events check recover drop doctor"
 )
 #: Kinds that only entry points name.
 _BY_ENTRY_POINT: Final = (
     *("stage", "message_reader", "recording", "finisher", "report_section", "command", "page", "player", "viewer"),
-    *("name", "scene"),
+    *("name", "scene", "doctor_line"),
 )
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
@@ -89,10 +98,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
         "detector": {
             "median": "mcaptrack.transforms.detect.median:MedianDetector",
             "knn": "mcaptrack.transforms.detect.background:KnnDetector",
-            "onnx": "mcaptrack.transforms.detect.onnx.detector:OnnxDetector",
-            "yolox-nano": "mcaptrack.transforms.detect.onnx.detector:YoloxNano",
-            "yolox-tiny": "mcaptrack.transforms.detect.onnx.detector:YoloxTiny",
-            "yolox-s": "mcaptrack.transforms.detect.onnx.detector:YoloxS",
         },
         "tracker": {
             "sort": "mcaptrack.transforms.sort:Sort",
@@ -108,7 +113,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(
             "holt-cv": "mcaptrack.predictors.built_in:holt_cv",
             "kalman": "mcaptrack.predictors.built_in:kalman",
             "lstm": "mcaptrack.predictors.built_in:lstm",
-            "onnx": "mcaptrack.predictors.built_in:onnx",
         },
         "retracker": {
             "likelihood": "mcaptrack.transforms.retrack:Retrack",
@@ -257,6 +261,16 @@ def _owners(kind: Kind) -> Iterator[tuple[Point, str]]:
             yield point, f"a built-in {titled(kind, point.name)}"
         else:
             yield point, f"a {titled('command', point.name)}" if point.name in commands else ""
+
+
+def split_file(kind: Kind, name: str) -> tuple[str, str | None]:
+    """A name, and the file that it ends with: ("red", "FILE") for "red:FILE", and None for names without a file.
+
+    A name of the registry, or of an extension that isn't installed, has a file behind its colon; others are
+    ``module:Class``.
+    """
+    own, colon, file = name.partition(":")
+    return (own, file) if colon and own in (*names(kind), *missing_names(kind)) else (name, None)
 
 
 def find(kind: Kind, name: str, distribution: str = "") -> Entry:

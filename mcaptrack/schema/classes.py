@@ -25,7 +25,7 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import Frame, Rows, Schema
 from mcaptrack.schema.provenance import read_texts
 
-__all__ = ["PEOPLE", "PERSON", "UNKNOWN", "class_name", "class_names", "is_person"]
+__all__ = ["COCO", "PEOPLE", "PERSON", "UNKNOWN", "class_name", "class_names", "is_person"]
 
 #: The class of what is not known, and of people.
 UNKNOWN: Final = 0

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mcaptrack.predictors import AnyPredictor, PeopleSeen, predict_among
-from mcaptrack.predictors.onnx import are_covariances
+from mcaptrack.predictors import AnyPredictor, PeopleSeen, are_covariances, predict_among
 from mcaptrack.testing.formats import check_command, check_exporter, check_label_format, check_message_reader
 from mcaptrack.testing.transforms import LAWS, LawError, check_transform, same_process, sample_frames
 

@@ -2,7 +2,6 @@ from collections.abc import Mapping
 
 from mcaptrack.transforms.detect import KnnDetector as KnnDetector
 from mcaptrack.transforms.detect import MedianDetector as MedianDetector
-from mcaptrack.transforms.detect import OnnxDetector as OnnxDetector
 from mcaptrack.transforms.ground import GroundTracker as GroundTracker
 from mcaptrack.transforms.motion import EstimateMotion as EstimateMotion
 from mcaptrack.transforms.predict import Predict as Predict

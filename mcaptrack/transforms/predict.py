@@ -73,8 +73,8 @@ class Predict:
     ----------
     predictor : str
         Predictor: blend, the mean of red and cv; red, cv, holt-cv, kalman; social, which looks at other people; or
-        lstm, which is less exact than cv; with other weights red:FILE and so on, onnx:FILE; one of an installed
-        package; or module:Class.
+        lstm, which is less exact than cv; with other weights red:FILE and so on; one of an extension or an
+        installed package; or module:Class.
     horizon_s : float
         How far ahead to predict, in seconds.
     min_history : int

@@ -51,6 +51,11 @@ from mcaptrack.ranges import limits
 from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
 
+__all__ = [
+    "Colour", "ModelCard", "Suited", "Transform", "bare_type", "check_options", "context", "option", "parameters",
+    "setting",
+]  # fmt: skip
+
 T = TypeVar("T")
 
 

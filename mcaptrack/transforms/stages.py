@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, entry_of, find, names, others, own
+from mcaptrack.registry import Entry, Kind, blamed, entry_of, find, names, others, own, split_file
 from mcaptrack.schema import (
     APPEARANCE,
     CAMERA_MOTION,
@@ -37,7 +37,7 @@ StepAfter = Literal["one-class", "log-before", "video-rate", "pictures", "seen"]
 FULL: Final = "/full"
 #: Last parts of topics that outputs can't have, beside names of finishers: these are made of the results of stages.
 RESERVED: Final = frozenset({"full", "view", "counts", "errors", "scores"})
-#: The field for the file that a name may end with, as in ``onnx:FILE``.
+#: The field for the file that a name may end with, as in ``NAME:FILE``.
 _FILE: Final = "file"
 
 
@@ -149,9 +149,8 @@ class Stage:
         return entry
 
     def split(self, name: str) -> tuple[str, str | None]:
-        """A name, and the file that it ends with: ("onnx", "FILE") for "onnx:FILE"; None for names without a file."""
-        own, colon, file = name.partition(":")
-        return (own, file) if colon and own in BUILT_IN.get(self.kind or "", ()) else (name, None)
+        """The name of a transform, and the file that it ends with (``registry.split_file``)."""
+        return split_file(self.kind, name) if self.kind else (name, None)
 
     def entry(self, cls: type[Transform]) -> Entry:
         """The entry of a class of transforms of this stage."""

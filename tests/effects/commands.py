@@ -219,11 +219,6 @@ CASES: dict[str, dict[str, Case]] = {
         force=("drop a.mcap /camera/retracks -o fresh.mcap", "--force"),
     ),
     "demo": common("demo", output="-o b", force=("demo -o taken", "--force"), scene="--scene crowd", seed="--seed 3"),
-    "models": common(
-        "models",
-        quiet=("models get yolox-nano --from known.onnx", "-q"),
-        **{"from": ("models get yolox-nano", "--from known.onnx")},
-    ),
     "doctor": common("doctor"),
     "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
 } | {name: common(seen[0], **seen[1]) for name, seen in of_extensions("EFFECTS").items() if seen}

@@ -24,9 +24,7 @@ def make(folder: Path) -> str:
     made: mcaptrack.IngestResult = mcaptrack.ingest(
         "video.mp4", folder / "log.mcap", fps=25, ground_plane=folder / "h.txt", classes=None
     )
-    network: Path = mcaptrack.get_model("yolox-nano")
-    catalogue: tuple[mcaptrack.Model, ...] = mcaptrack.models()
-    print(drawn, network, [model.name for model in catalogue])
+    print(drawn)
     return str(made.log)
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from mcaptrack.extensions.networks.network import NetworkFile, NetworkLimits, OnnxNetwork, read_file
 from mcaptrack.geometry.boxes import parse_size
-from mcaptrack.networks import NetworkFile, NetworkLimits, OnnxNetwork, read_file
 
 
 def used_s() -> float:

@@ -83,6 +83,6 @@ DEEP = {
         "api.running cli.flags cli.many cli.running foxglove.views.people geometry.assignment geometry.neighbours "
         "geometry.pinhole pipeline.checks pipeline.pictures pipeline.rebuild "
         "pipeline.several pipeline.staleness pipeline.write schema.frame_columns schema.ground_plane "
-        "sources.fixed_frame transforms.guarded transforms.protocol",
+        "sources.fixed_frame transforms.guarded",
     )
 }

@@ -108,6 +108,6 @@ PRINTED = {"tuning": _printed}
 DEEP = {
     "tuning": (
         "it makes transforms with other settings, and writes these",
-        "api.running cli.chosen cli.config tables.compared transforms.guarded transforms.protocol",
+        "api.running cli.chosen cli.config tables.compared transforms.guarded",
     )
 }

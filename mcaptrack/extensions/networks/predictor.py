@@ -15,11 +15,10 @@ from typing import Final, Self
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.networks.network import NetworkFile, NetworkLimits, OnnxNetwork, read_file
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_gaps, last_positions
-from mcaptrack.networks import NetworkFile, NetworkLimits, OnnxNetwork, read_file
-from mcaptrack.predictors.forecast import Forecast
-from mcaptrack.predictors.linear import LinearPredictor
+from mcaptrack.predictors import Forecast, Predictor, are_covariances, make
 
 _STEP_S: Final = 0.4
 #: The most positions that a network may take or give for a track: more than an hour of them, and little memory.
@@ -83,8 +82,8 @@ class Onnx:
         return cls(path, network, shape[1], steps.pop(), step_s, sha256)
 
     @cached_property
-    def _covariance_model(self) -> LinearPredictor:
-        return LinearPredictor("kalman", self.steps, self.step_s)
+    def _covariance_model(self) -> Predictor:
+        return make("kalman", self.steps, self.step_s)
 
     def _run(self, xy_m: Floats, valid: Bools) -> list[Floats]:
         arrays = (xy_m.astype(np.float32), valid)
@@ -126,9 +125,6 @@ class Onnx:
         return Forecast(now + outputs[0], cov)
 
 
-def are_covariances(cov: Floats) -> bool:
-    """Whether matrices (B, T, 2, 2) are symmetric and positive definite, up to the precision of 32 bits."""
-    xx, xy, yx, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
-    scale = np.sqrt(np.maximum(xx, 0)) * np.sqrt(np.maximum(yy, 0))  # the product of both may overflow
-    is_symmetric = np.abs(xy - yx) <= 1e-4 * scale
-    return bool((is_symmetric & (xx > 0) & (yy > 0) & (np.abs(xy + yx) / 2 <= scale)).all())
+def onnx(steps: int, step_s: float, file: Path) -> Onnx:
+    """A network in ONNX format, with steps of its own."""
+    return Onnx.of(file)

@@ -22,14 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError, did_you_mean
-from mcaptrack.files import missing
-from mcaptrack.geometry.arrays import Image, taken
-from mcaptrack.geometry.boxes import parse_size
-from mcaptrack.networks import Device, NetworkFile, NetworkLimits, digest_of, read_file
-from mcaptrack.notices import warn
-from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
-from mcaptrack.schema.classes import COCO, PEOPLE, PERSON
-from mcaptrack.transforms.detect.onnx.layouts import (
+from mcaptrack.extensions.networks.catalogue import check, find, stored
+from mcaptrack.extensions.networks.layouts import (
     LAYOUTS,
     SURE,
     Layout,
@@ -39,8 +33,15 @@ from mcaptrack.transforms.detect.onnx.layouts import (
     possible,
     recognised,
 )
-from mcaptrack.transforms.detect.onnx.nms import Boxes, Size, Tile, join_tiles, place, suppress, tiles_of
-from mcaptrack.transforms.detect.onnx.session import DetectorNetwork, check, find, stored, workers
+from mcaptrack.extensions.networks.network import Device, NetworkFile, NetworkLimits, digest_of, read_file
+from mcaptrack.extensions.networks.nms import Boxes, Size, Tile, join_tiles, place, suppress, tiles_of
+from mcaptrack.extensions.networks.pictures import DetectorNetwork, workers
+from mcaptrack.files import missing
+from mcaptrack.geometry.arrays import Image, taken
+from mcaptrack.geometry.boxes import parse_size
+from mcaptrack.notices import warn
+from mcaptrack.schema import DETECTIONS, VIDEO, Frame, Schema
+from mcaptrack.schema.classes import COCO, PEOPLE, PERSON
 from mcaptrack.transforms.protocol import Colour, ModelCard, Suited, check_options, option, parameters, setting
 
 LayoutChoice = Literal["auto", "yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
@@ -210,6 +211,7 @@ class OnnxDetector:
             raise McaptrackError(f"input_size takes width x height, as in 960x736, or picture, not {self.input_size}")
 
     def __call__(self, frames: Iterable[Frame]) -> Iterator[tuple[Frame, ...]]:
+        """Yield the boxes of each picture."""
         frames = iter(frames)
         first = next(frames, None)
         if first is None:

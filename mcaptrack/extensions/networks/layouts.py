@@ -28,8 +28,8 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from mcaptrack.extensions.networks.nms import Boxes, Fit, Size
 from mcaptrack.geometry.arrays import Floats, Image
-from mcaptrack.transforms.detect.onnx.nms import Boxes, Fit, Size
 
 LayoutName = Literal["yolox", "yolox-legacy", "nanodet", "rtdetr", "dfine", "rfdetr", "ultralytics"]
 

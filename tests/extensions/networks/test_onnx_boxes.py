@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcaptrack.transforms.detect.onnx.nms import Boxes, join_tiles, place, suppress, tiles_of
+from mcaptrack.extensions.networks.nms import Boxes, join_tiles, place, suppress, tiles_of
 
 SEEDS = st.integers(0, 2**32 - 1)
 

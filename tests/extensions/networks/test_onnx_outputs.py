@@ -9,10 +9,10 @@ import pytest
 
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.networks import layouts
+from mcaptrack.extensions.networks.detector import OnnxDetector
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import OnnxDetector
-from mcaptrack.transforms.detect.onnx import layouts
-from tests.onnx_graphs import INT64, cells, giving, value
+from tests.extensions.networks.onnx_graphs import INT64, cells, giving, value
 
 SIZE = (160, 128)
 WIDE = np.tile(SIZE, 2)

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.networks import graph
+from mcaptrack.extensions.networks import graph
 
 Limit = Literal["", "memory", "time"]
 Device = Literal["auto", "cpu", "cuda"]

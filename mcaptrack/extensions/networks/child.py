@@ -19,14 +19,14 @@ from typing import Any, Final
 from numpy.typing import NDArray
 
 from mcaptrack.environment import without
-from mcaptrack.networks.serving import Lane
-from mcaptrack.networks.session import Device, Facts, Resize, SessionError
+from mcaptrack.extensions.networks.serving import Lane
+from mcaptrack.extensions.networks.session import Device, Facts, Resize, SessionError
 from mcaptrack.processes import resident_bytes
 
 #: What a new process runs: with the path of modules of this one, and nothing from the working folder.
 _CODE: Final = (
     "import json, sys; sys.path[:], *given = json.loads(sys.argv[1]); "
-    "from mcaptrack.networks.serving import serve; serve(*given)"
+    "from mcaptrack.extensions.networks.serving import serve; serve(*given)"
 )
 #: Seconds between two looks at a process that is at work; `ps` tells memory elsewhere than on Linux, and is slow.
 _LOOK_S: Final = 0.02 if sys.platform.startswith("linux") else 0.25

@@ -1,24 +1,23 @@
-"""The catalogue of detectors with weights to fetch."""
+"""List the detectors of the catalogue, and fetch their weights."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import re
 from pathlib import Path
 from time import monotonic
 from typing import Annotated, Any
 
-from mcaptrack.api.declared import Argument, checked, declared
+from mcaptrack.api.declared import Argument, declared, done_by
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call
+from mcaptrack.extensions.networks import catalogue
+from mcaptrack.extensions.networks.catalogue import Model
+from mcaptrack.extensions.networks.network import digest_of, providers
 from mcaptrack.files import publish_bytes, refuse_special, unreadable
-from mcaptrack.networks import digest_of
 from mcaptrack.notices import warn
-from mcaptrack.transforms.detect.onnx import session
-from mcaptrack.transforms.detect.onnx.session import Model
-
-__all__ = ["Model", "get_model", "models"]
 
 #: How long to wait for a connection, and for the next bytes, in seconds.
 _WAIT_S = (10, 60)
@@ -27,7 +26,7 @@ _LEAST_BYTES_PER_S, _PATIENCE_S = 2000, 60
 _CHUNK = 4096
 
 
-@declared(printed_by="mcaptrack.cli.models:Models")
+@declared(printed_by="mcaptrack.extensions.networks.command:Models")
 def models(
     name: Annotated[
         str | None, Argument("words", "get NAME", "`get` fetches the weights of NAME.", shown="a list", words=True)
@@ -65,10 +64,10 @@ def models(
     >>> [model.name for model in mcaptrack.models()]
     ['yolox-nano', 'yolox-tiny', 'yolox-s']
     """
-    return (session.find(name),) if name else tuple(session.CATALOGUE.values())
+    return (catalogue.find(name),) if name else tuple(catalogue.CATALOGUE.values())
 
 
-@checked
+@done_by("models get")
 def get_model(name: str, *, source: PathLike | None = None) -> Path:
     """Fetch the weights of a detector of the catalogue, once, into the user's folder of caches.
 
@@ -100,7 +99,7 @@ def get_model(name: str, *, source: PathLike | None = None) -> Path:
     ...     print(str(error)[:38])
     log.mcap is not the file of yolox-nano
     """
-    model = session.find(name)
+    model = catalogue.find(name)
     text = "" if source is None else str(source)
     if text and not text.startswith(("http://", "https://")):
         data = _read(model, Path(text))
@@ -136,7 +135,7 @@ def _read(model: Model, path: Path) -> bytes:
             data, size = file.read(model.size_bytes + 1), path.stat().st_size
     except OSError as error:
         raise unreadable(path, error) from None
-    session.check(model, hashlib.sha256(data).hexdigest(), max(size, len(data)), path)
+    catalogue.check(model, hashlib.sha256(data).hexdigest(), max(size, len(data)), path)
     return data
 
 
@@ -193,3 +192,11 @@ def _reason(error: Any) -> str:
         return "the connection broke"
     why = re.search(r"\[Errno -?\d+\] ([\w ]+)", str(error))
     return why[1] if why else re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(error).__name__).lower()
+
+
+def doctor_lines() -> dict[str, str]:
+    """Return what networks can run on, and where weights are kept, for ``mcaptrack doctor``."""
+    folder = catalogue.folder()
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    can = "" if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK) else ", which can't be written"
+    return {"ONNX Runtime": ", ".join(providers()) or "not installed", "fetched weights": f"{folder}{can}"}

@@ -12,14 +12,14 @@ import pytest
 
 import mcaptrack
 from mcaptrack import notices
-from mcaptrack.api import catalogue as fetching
+from mcaptrack.extensions.networks import api as fetching
+from mcaptrack.extensions.networks import catalogue
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES
-from mcaptrack.transforms.detect.onnx import session
 from tests.commands import call, done
-from tests.models import DATA, NAME, serve, stocked
-from tests.onnx_graphs import detector
-from tests.test_onnx_detectors import log, metadata_of, recorded
+from tests.extensions.networks.models import DATA, NAME, serve, stocked
+from tests.extensions.networks.onnx_graphs import detector
+from tests.extensions.networks.test_onnx_detectors import log, metadata_of, recorded
 
 __all__ = ["log", "recorded"]  # fixtures
 
@@ -44,7 +44,7 @@ def refused(*words: object) -> str:
 
 
 def test_the_catalogue_says_where_each_model_comes_from_and_each_has_a_detector():
-    for name, model in session.CATALOGUE.items():
+    for name, model in catalogue.CATALOGUE.items():
         assert re.fullmatch("[0-9a-f]{64}", model.sha256)
         assert model.licence in ("Apache-2.0", "MIT", "BSD-3-Clause")
         assert model.size_bytes > 1_000_000
@@ -53,7 +53,7 @@ def test_the_catalogue_says_where_each_model_comes_from_and_each_has_a_detector(
         cls = STAGES["detect"].find(name).cls
         assert (cls.model, cls().weights_sha256()) == (name, model.sha256)
     known = {name for name, cls in STAGES["detect"].built_in().items() if getattr(cls, "model", "")}
-    assert known == set(session.CATALOGUE)
+    assert known == set(catalogue.CATALOGUE)
 
 
 class TestFetching:
@@ -158,14 +158,23 @@ class TestListing:
         (one,) = json.loads(done("models", "--json").out)["models"]
         assert one["path"] == str(model.path)
         assert model.urls[0] in done("models", "-v").out
+        quiet = done("models", "get", NAME, "-q")
+        assert (quiet.out, quiet.err) == ("", "")
 
     def test_the_folder_is_that_of_the_variable_or_one_for_caches(self, monkeypatch, tmp_path):
         monkeypatch.delenv("MCAPTRACK_MODELS", raising=False)
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        assert session.folder() == tmp_path / "mcaptrack" / "models"
+        assert catalogue.folder() == tmp_path / "mcaptrack" / "models"
         monkeypatch.delenv("XDG_CACHE_HOME")
         monkeypatch.setattr(Path, "home", lambda: tmp_path)
-        assert session.folder().parent.parent.parent == tmp_path
+        assert catalogue.folder().parent.parent.parent == tmp_path
+
+    def test_doctor_says_where_weights_are_kept_and_whether_they_can_be(self, monkeypatch, tmp_path):
+        monkeypatch.setenv("MCAPTRACK_MODELS", str(tmp_path / "a" / "b"))
+        assert mcaptrack.doctor().parts["fetched weights"] == str(tmp_path / "a" / "b")
+        (tmp_path / "a").write_text("a file")
+        assert mcaptrack.doctor().parts["fetched weights"] == f"{tmp_path / 'a' / 'b'}, which can't be written"
+        assert "CPUExecutionProvider" in mcaptrack.doctor().parts["ONNX Runtime"]
 
 
 class TestDetecting:

@@ -20,16 +20,16 @@ from time import sleep
 import numpy as np
 import pytest
 
-from mcaptrack import networks
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.networks import network as networks
+from mcaptrack.extensions.networks.detector import OnnxDetector
+from mcaptrack.extensions.networks.predictor import Onnx
 from mcaptrack.predictors import make
-from mcaptrack.predictors.onnx import Onnx
-from mcaptrack.registry import BUILT_IN
+from mcaptrack.registry import KINDS, own
 from mcaptrack.schema import Frame
-from mcaptrack.transforms import OnnxDetector
 from tests.awaiting import is_running
 from tests.bounded import limited
-from tests.onnx_graphs import (
+from tests.extensions.networks.onnx_graphs import (
     FLOAT,
     INPUTS,
     INT64,
@@ -75,7 +75,7 @@ def alternating(cases: Iterable[object], step: int) -> list[object]:
 
 
 def test_every_use_of_networks_is_tested_here():
-    assert set(USES) == {kind for kind, entries in BUILT_IN.items() if "onnx" in entries}
+    assert set(USES) == {kind for kind in KINDS if "onnx" in own(kind)}
 
 
 def far(name: str = "") -> bytes:
@@ -214,10 +214,10 @@ def test_a_network_can_open_no_file_even_if_nothing_was_checked(monkeypatch):
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     assert session.run(None, {"x": np.zeros(1, "f")})[0].tolist() == SECRET.tolist()
     code = (
-        "import sys; from mcaptrack.networks import graph, serving; graph.reach = lambda model: ''; "
+        "import sys; from mcaptrack.extensions.networks import graph, serving; graph.reach = lambda model: ''; "
         "serving.session.graph.reach = graph.reach; serving.serve(*given)"
     )
-    from mcaptrack.networks import child
+    from mcaptrack.extensions.networks import child
 
     start, _, _ = child._CODE.partition("from mcaptrack")
     monkeypatch.setattr(child, "_CODE", start + code)
@@ -339,8 +339,8 @@ def test_the_outputs_of_detectors_are_those_of_this_process_to_the_bit(layout):
     assert here.facts == apart.facts
     pixels = np.random.default_rng(1).uniform(0, 255, (1, 3, *SIZE[::-1])).astype(np.float32)
     given = {name: pixels if len(shape) == 4 else np.array([SIZE]) for name, shape, _ in here.facts["inputs"]}
-    for own, other in zip(here.run(given), apart.run(given), strict=True):
-        assert (own.dtype, own.shape, own.tobytes()) == (other.dtype, other.shape, other.tobytes())
+    for mine, other in zip(here.run(given), apart.run(given), strict=True):
+        assert (mine.dtype, mine.shape, mine.tobytes()) == (other.dtype, other.shape, other.tobytes())
     apart.close()
 
 

@@ -4,8 +4,6 @@ Whoever wrote the file may be a stranger. So a network runs in a process of its 
 when it takes too much time or memory, and ends with the process that needs it; and a file that keeps weights in others
 is refused, wherever in it they are named. Only a file that is trusted, because its digest is known, runs in this
 process.
-
-``session`` is ONNX Runtime, ``graph`` reads files; ``child`` and ``serving`` are the two sides of the other process.
 """
 
 from __future__ import annotations
@@ -21,9 +19,18 @@ from numpy.typing import NDArray
 
 from mcaptrack import environment
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.networks.child import NetworkProcess
+from mcaptrack.extensions.networks.session import (
+    Device,
+    Facts,
+    Resize,
+    Session,
+    SessionError,
+    Value,
+    is_installed,
+    providers,
+)
 from mcaptrack.files import unreadable
-from mcaptrack.networks.child import NetworkProcess
-from mcaptrack.networks.session import Device, Facts, Resize, Session, SessionError, Value, is_installed, providers
 from mcaptrack.notices import warn
 
 __all__ = [

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.networks import session
+from mcaptrack.extensions.networks import session
 from mcaptrack.processes import die_with
 
 #: Arrays begin at multiples of so many bytes.

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.networks import graph
-from mcaptrack.transforms.detect.onnx import layouts
-from mcaptrack.transforms.detect.onnx.detector import Contest, refuse_if_misread
-from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS, MisreadError
-from mcaptrack.transforms.detect.onnx.nms import Boxes
-from tests.onnx_graphs import FLOAT, INT64, model, node, tensor, value
+from mcaptrack.extensions.networks import graph, layouts
+from mcaptrack.extensions.networks.detector import Contest, refuse_if_misread
+from mcaptrack.extensions.networks.layouts import LAYOUTS, MisreadError
+from mcaptrack.extensions.networks.nms import Boxes
+from tests.extensions.networks.onnx_graphs import FLOAT, INT64, model, node, tensor, value
 
 WIDE, HIGH = 96, 68  # the height fits no stride
 SIZE = (WIDE, HIGH)

@@ -12,9 +12,9 @@ from time import sleep
 from types import MappingProxyType
 from typing import Any
 
-from mcaptrack.transforms.detect.onnx import session
-from mcaptrack.transforms.detect.onnx.session import Model
-from tests.onnx_graphs import detector
+from mcaptrack.extensions.networks import catalogue
+from mcaptrack.extensions.networks.catalogue import Model
+from tests.extensions.networks.onnx_graphs import detector
 
 DATA = detector("yolox")
 NAME = "yolox-nano"
@@ -80,6 +80,6 @@ def stocked(monkeypatch: Any, folder: Path, *urls: str) -> Model:
         source="https://example.org", trained_on="blue blocks", good_for="tests",
     )  # fmt: skip
     (folder / "known.onnx").write_bytes(DATA)
-    monkeypatch.setattr(session, "CATALOGUE", MappingProxyType({NAME: model}))
+    monkeypatch.setattr(catalogue, "CATALOGUE", MappingProxyType({NAME: model}))
     monkeypatch.setenv("MCAPTRACK_MODELS", str(folder / "models"))
     return model

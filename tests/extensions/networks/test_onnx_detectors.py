@@ -16,16 +16,16 @@ import pytest
 import mcaptrack
 from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.networks.detector import COCO, OnnxDetector, names_of, numbers_of, wanted
+from mcaptrack.extensions.networks.layouts import LAYOUTS
+from mcaptrack.extensions.networks.pictures import DetectorNetwork
 from mcaptrack.schema import Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.testing import check_transform
-from mcaptrack.transforms import OnnxDetector
-from mcaptrack.transforms.detect.onnx import session
-from mcaptrack.transforms.detect.onnx.detector import COCO, names_of, numbers_of, wanted
-from mcaptrack.transforms.detect.onnx.layouts import LAYOUTS
-from tests import onnx_graphs
+from mcaptrack.transforms import STAGES
 from tests.commands import call, done
-from tests.onnx_graphs import (
+from tests.extensions.networks import onnx_graphs
+from tests.extensions.networks.onnx_graphs import (
     INPUTS,
     INT64,
     REACH,
@@ -165,7 +165,7 @@ class TestConvention:
             assert facts(found_by)["layout"] == layout
 
     def test_pictures_are_not_kept_until_the_layout_is_told(self, network, monkeypatch):
-        monkeypatch.setattr("mcaptrack.transforms.detect.onnx.detector.workers", lambda: 2)
+        monkeypatch.setattr("mcaptrack.extensions.networks.detector.workers", lambda: 2)
         seen, most = [], []
 
         def frames():
@@ -314,7 +314,7 @@ class TestSizes:
         ],
     )  # fmt: skip
     def test_the_size_of_the_picture_is_rounded_up_and_kept_within_limits(self, picture, expected):
-        from mcaptrack.transforms.detect.onnx.detector import size_for
+        from mcaptrack.extensions.networks.detector import size_for
 
         assert "x".join(map(str, size_for(*picture))) == expected
 
@@ -426,7 +426,7 @@ class TestInLogs:
         assert "are two files; give one" in call("detect", log, "--detector", "onnx:a", "--file", "b").err
         err = call("detect", log, "--set", "layout=yolox").err
         assert (
-            err == "mcaptrack: --set layout is an option of onnx, yolox-nano, yolox-tiny and yolox-s, not of median\n"
+            err == "mcaptrack: --set layout is an option of onnx, yolox-nano, yolox-s and yolox-tiny, not of median\n"
         )
 
 
@@ -438,7 +438,7 @@ def test_pictures_beside_one_another_come_in_order_and_give_the_same(network, mo
     pictures = [blue_blocks(SIZE, (32 * (number % 5), 32, 32, 32)) for number in range(12)]
     found_by = OnnxDetector(file=str(network()))
     alone = boxes(found_by, *pictures)
-    monkeypatch.setattr("mcaptrack.transforms.detect.onnx.detector.workers", lambda: 5)
+    monkeypatch.setattr("mcaptrack.extensions.networks.detector.workers", lambda: 5)
     assert (
         boxes(found_by, *pictures)
         == alone
@@ -450,13 +450,13 @@ def test_several_pictures_at_a_time_give_what_one_at_a_time_gives(network, monke
     path = network("ultralytics", name="open.onnx", data=batched())
     pictures = [blue_blocks(SIZE, (32 * (number % 5), 32, 32, 32)) for number in range(7)]
     alone = boxes(OnnxDetector(file=str(path)), *pictures)
-    made = session.DetectorNetwork.__init__
+    made = DetectorNetwork.__init__
 
     def init(self, *words):
         made(self, *words)
         self.batch = 3
 
-    monkeypatch.setattr(session.DetectorNetwork, "__init__", init)
+    monkeypatch.setattr(DetectorNetwork, "__init__", init)
     assert boxes(OnnxDetector(file=str(path)), *pictures) == alone
     assert boxes(OnnxDetector(file=str(path), tiles="2x1"), *pictures) != alone
 
@@ -483,3 +483,19 @@ def test_every_option_changes_what_is_found(network, option):
 def test_every_option_is_tested_here():
     elsewhere = {"file", "layout", "max_iou", "device", "max_memory_mb"}
     assert set(EFFECTS) | elsewhere == {option.name for option in fields(OnnxDetector)}
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"min_score": 0.25}, "the network finds no person with a score of at least 0.25"),
+        ({"classes": "ALL"}, "the network finds nothing with a score of at least 0.1"),
+    ],
+)
+def test_why_nothing_came_of_it(options, reason):
+    assert OnnxDetector(**options).why_empty([], []) == reason
+
+
+def test_on_the_ground_the_tracker_that_suits_it_compares_metres():
+    suited = OnnxDetector.suits["tracker"]
+    assert STAGES["track"].make(suited.name, **suited.on_ground).cost == "metres"
