@@ -18,6 +18,7 @@ from mcaptrack import __version__
 from mcaptrack.api.declared import Argument, declared
 from mcaptrack.environment import THREADS, cache_folder, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
+from mcaptrack.installed import missing_extensions
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
 
@@ -142,6 +143,8 @@ class DoctorResult:
         Where fetched weights of detectors are kept; it is made when it is first needed.
     cache_can_be_written : bool
         Whether it can be made and written.
+    extensions : dict of str to str
+        What to do about each extension that isn't installed, by name; "" for those that are.
     plugins : dict of str to str
         Parts of other packages, as "tracker nearest (my-package 1.0)", and why each can't be imported; "" where it can.
     faults : tuple of str
@@ -167,6 +170,7 @@ class DoctorResult:
     temporary_bytes_free: int | None
     cache_folder: Path
     cache_can_be_written: bool
+    extensions: dict[str, str]
     plugins: dict[str, str]
     faults: tuple[str, ...]
     store: StoreCheck | None = None
@@ -281,6 +285,7 @@ def doctor(
             temporary_bytes_free=free,
             cache_folder=cache,
             cache_can_be_written=can_be_written(cache),
+            extensions=missing_extensions(),
             plugins=plugins,
             faults=tuple(faults),
             store=checked,

@@ -55,6 +55,8 @@ def _lines(result: DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
     yield "temporary files", f"{result.temporary_folder or 'no folder can be written'}{free}"
     can = "" if result.cache_can_be_written else ", which can't be written"
     yield "fetched weights", f"{result.cache_folder}{can}"
+    yield "extensions", ", ".join(name for name, why in result.extensions.items() if not why) or "none"
+    yield from ((f"  {name}", why) for name, why in result.extensions.items() if why)
     for name, why in result.plugins.items():
         yield name, why or "can be imported"
     if result.store is not None:
