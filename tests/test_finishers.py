@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import json
 import os
@@ -175,6 +176,28 @@ def test_a_finisher_cannot_have_the_name_of_a_command_of_the_core(site):  # noqa
     add(site, "finisher", "track", CODE)
     plugins = json.loads(done("doctor", "--json").out)["plugins"]
     assert "there is a command track; rename it" in plugins["finisher track (another 2.0)"]
+
+
+def test_a_finisher_with_a_name_of_the_result_is_left_out_and_one_that_comes_late_is_named(site, monkeypatch):  # noqa: F811
+    parts = PartsOfRun()
+    add(site, "finisher", "frames", CODE)
+    for finishers, why in (
+        (parts, "finisher frames was installed after run was imported; it is left out"),
+        (
+            PartsOfRun(),
+            "finisher frames (another 2.0) can't have its name: the result of run has frames; it is left out",
+        ),
+    ):
+        finishers.options(())
+        with collected() as warnings:
+            assert "frames" not in {step.name for step in finishers.finishers({}, False)}
+        assert [notice.message for notice in warnings] == [why]
+
+
+def test_nothing_is_asked_of_packages_for_names_that_python_looks_up(finished, monkeypatch):
+    result = mcaptrack.run(finished, tables=False)
+    monkeypatch.setattr("mcaptrack.api.running.others", None)
+    assert copy.copy(result) == result
 
 
 def test_an_option_of_nothing_is_refused():

@@ -87,10 +87,15 @@ class PartsOfRun:
             try:
                 makers.append((entry, self._made(entry, values)))
             except McaptrackError as error:
-                if entry.is_built_in or self._options[entry].keys() & values.keys():
+                if entry.is_built_in or any(self.chosen("scene", values).values()):
                     raise
                 _leave_out(str(error))
         return makers
+
+    def chosen(self, kind: Kind, values: Mapping[str, object]) -> dict[str, bool]:
+        """Return whether each option of a kind has another value than by default."""
+        options = [option for entry in self._of(kind) for option in self._options[entry].values()]
+        return {option.name: values.get(option.name, option.default) != option.default for option in options}
 
     def _of(self, kind: Kind) -> list[Entry]:
         return [entry for entry in self._options if entry.kind == kind]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Annotated, Final, Unpack
 
 import mcaptrack
-from mcaptrack.api.common import as_location, split_names
+from mcaptrack.api.common import as_location, split_names, warn_unused
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
 from mcaptrack.api.finishing import PartsOfRun
 from mcaptrack.api.options import (
@@ -204,10 +204,13 @@ def run(
     where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
     earlier = _log_before(as_location(log), follows)
     with definitions_of(definitions), choosing(topic, map, class_map):
-        return work(
+        result = work(
             where, plan, progress, tables, finishing=finishing, views=True, plane=plane, cameras=names, joins=joins,
             follows=earlier,
         )  # fmt: skip
+    if not result.cameras:
+        warn_unused("one camera is run", **_PARTS.chosen("scene", more))
+    return result
 
 
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:

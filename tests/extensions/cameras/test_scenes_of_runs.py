@@ -52,6 +52,13 @@ def test_the_maker_of_scenes_obeys_the_laws(boxes: Path) -> None:
     check_scene_maker(scenes, boxes)
 
 
+def test_options_for_scenes_are_named_where_one_camera_is_run(path: Path) -> None:
+    with collected() as warnings:
+        mcaptrack.run(path, camera="east", fuser="feet", tables=False, predictor="cv")
+    said = [notice.message for notice in warnings if notice.code == "option-not-used"]
+    assert said == ["`fuser=` changes nothing here: one camera is run"]
+
+
 def test_named_cameras_are_run_and_fused_alone_and_others_join_later(path: Path) -> None:
     with collected():
         result = mcaptrack.run(path, camera=["east", "south"], tables=False, predictor="cv")
