@@ -1,5 +1,6 @@
 """Detect and track people in a video or a log, repair the tracks, predict where people go, and write the results."""
 
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -58,7 +59,9 @@ def __getattr__(name: str) -> object:
     if name in kinds:
         return find(kinds[name], name).cls
     if text := missing_extension(name):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}: {text}")
+        # Of `from mcaptrack import NAME` Python drops the text of an AttributeError.
+        error = ImportError if sys._getframe(1).f_code.co_name == "_handle_fromlist" else AttributeError
+        raise error(f"module {__name__!r} has no attribute {name!r}: {text}")
     raise _unknown(__name__, name, [*_MODULES, *kinds])
 
 

@@ -74,6 +74,13 @@ def missing_extension(name: str, kind: str = "name", what: str = "") -> str:
     return f"{text}{extension}"
 
 
+def missing_extensions() -> dict[str, str]:
+    """The advice about each extension that isn't installed, by name; "" for those that are."""
+    present = _extensions()
+    again = "isn't installed; install mcaptrack again, with mcaptrack/extensions/"
+    return {name: "" if name in present else f"{again}{name}" for name in sorted({*re.findall(_PLACE, _stub())})}
+
+
 def missing_names(kind: str) -> list[str]:
     """The names of a kind that are of extensions which aren't installed."""
     return [*_missing(kind)]
@@ -91,10 +98,13 @@ def _missing(kind: str) -> dict[str, str]:
     """The extensions that aren't installed by the names of a kind that they have, by the stub."""
     in_python = kind in ("name", "command")
     line = rf"^from {_PLACE}\S* import (?P<name>\w+) as" if in_python else rf"^# {kind} (?P<name>\S+): {_PLACE}$"
-    stub = Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
-    named = {match["name"]: match["extension"] for match in re.finditer(line, stub, re.M)}
+    named = {match["name"]: match["extension"] for match in re.finditer(line, _stub(), re.M)}
     present = _extensions()
     return {name: extension for name, extension in named.items() if extension not in present}
+
+
+def _stub() -> str:
+    return Path(__file__).with_name("__init__.pyi").read_text(encoding="utf-8")
 
 
 def _extensions() -> set[str]:

@@ -19,8 +19,10 @@ import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels.checks import OF_ROLE, OF_SOURCE
+from mcaptrack.sources.ingest.labels.of_packages import format_named
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 from mcaptrack.sources.ingest.labels.table import BoxTable
+from mcaptrack.testing import check_label_format
 from tests.label_cases import WALK, Row, writers
 
 NAN = math.nan
@@ -243,32 +245,9 @@ def test_column_8_of_motchallenge_is_a_class_where_it_can_be_one(ends, files, cl
     assert ("classes" in [code for _, code in table.doubts]) == is_nameless
 
 
-#: What replaces a number, a text or null.
-ODD = (b"null", b"[]", b"{}", b"-1", b"1e999", b"NaN", b'""', b"true", b"9" * 400, b"\xff", b"\0", b'"x"', b"1e18")
-
-
 @pytest.mark.parametrize("name", WRITERS)
-def test_damaged_files_are_read_or_refused_in_a_line(name, tmp_path):
-    rng = np.random.default_rng(7)
-    path = WRITERS[name].write(tmp_path, WALK)
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    for number in range(16):
-        file = files[number % len(files)]
-        data = file.read_bytes()
-        spots = list(re.finditer(rb'-?\d+\.?\d*|"[^"]*"|null', data))
-        spot = spots[rng.integers(len(spots))] if spots else None
-        cut = int(rng.integers(len(data)))
-        damaged = data[:cut] if spot is None or number % 4 == 3 else b""
-        if spot is not None and not damaged:
-            damaged = data[: spot.start()] + ODD[rng.integers(len(ODD))] + data[spot.end() :]
-        file.write_bytes(damaged)
-        for role in ("truth", "detections", None):
-            try:
-                read_labels(path, name, role)
-                read_labels(path, "auto", role)
-            except McaptrackError as error:
-                assert "\n" not in str(error), error
-        file.write_bytes(data)
+def test_a_format_obeys_the_laws_and_refuses_damaged_files_in_a_line(name, tmp_path):
+    check_label_format(format_named(name), WRITERS[name].write(tmp_path, WALK))
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -11,6 +11,10 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from functools import partial
+from importlib import import_module
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,15 +30,27 @@ from mcap.reader import make_reader
 import mcaptrack
 from mcaptrack import log, testing
 from mcaptrack.api.declared import declared
-from mcaptrack.api.finishing import Finishers
+from mcaptrack.api.finishing import PartsOfRun
 from mcaptrack.choices import BoxFormat, TableFormat
-from mcaptrack.contracts import Box, Box3d, LabelBoxes
+from mcaptrack.contracts import (
+    Box,
+    Box3d,
+    LabelBoxes,
+    RecordedChannel,
+    RecordedMessage,
+    RecordingReader,
+    ReportSection,
+    SectionTable,
+)
 from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import collected
 from mcaptrack.pipeline.scenes import Scenes
 from mcaptrack.registry import BUILT_IN, KINDS, Entry, others
 from mcaptrack.schema import DETECTIONS, TRACKS
-from mcaptrack.schema.provenance import Plugin
+from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.sources import fixed_frame
+from mcaptrack.sources.box_files import MotFile
+from mcaptrack.sources.ingest.labels.of_packages import format_named
 from mcaptrack.testing import LawError
 from tests.commands import call, done
 from tests.distributions import package
@@ -104,9 +120,8 @@ def test_every_kind_stands_on_the_page_with_an_example_of_at_most_40_lines():
     text = (pages.ROOT / "docs" / "extend.md").read_text()
     assert all(f"`mcaptrack.{kind}s`" in text for kind in KINDS)
     assert all(len(code.splitlines()) <= 40 for name, code in FILES.items() if name.endswith(".py"))
-    assert {
-        f"check_{name}" for name in ("transform", "predictor", "label_format", "message_reader", "exporter", "command")
-    } == {name for name in testing.__all__ if name.startswith("check_")}
+    table = text.partition("| tested by |")[2].partition("\n\n")[0]
+    assert {*re.findall(r"`(check_\w+)`", table)} == {name for name in testing.__all__ if name.startswith("check_")}
 
 
 def test_the_names_of_options_are_those_of_the_registry():
@@ -430,7 +445,7 @@ def test_a_recording_of_a_format_of_a_package_becomes_a_log_with_all_of_its_mess
 )
 def test_a_recording_format_that_fails_is_named_and_leaves_nothing(site, opens, said):
     code = (
-        "from mcaptrack.contracts import RecordedChannel, RecordedMessage, RecordingReader\n"
+        "from mcaptrack.contracts import RecordedChannel, RecordedMessage, RecordingReader, ReportSection, SectionTable\n"
         "class Odd(RecordingReader):\n    channels = [RecordedChannel('/a')]\n"
         "    def __init__(self, given):\n        super().__init__()\n        self.given = given\n"
         "    def messages(self, report):\n        yield from self.given\n        self.notes(report)\n"
@@ -488,10 +503,13 @@ def test_an_mcap_file_that_a_format_lists_is_left_as_it_is_and_its_list_is_updat
     outcome = done("info", "b", "--json")
     assert [result["log"] for result in json.loads(outcome.out)["results"]] == ["b/c.mcap", "b/lists/a.mcap"]
     Path("b/lists/d.mcap").write_bytes(Path("b/c.mcap").read_bytes())  # now it has several files
+    Path("b/none").mkdir()
+    Path("b/none/list").touch()
     outcome = done("info", "b", "--json")
     assert [result["log"] for result in json.loads(outcome.out)["results"]] == ["b/c.mcap"]
-    assert "b/lists is a list, not an MCAP file; " in outcome.err
-    assert "its files are left out" in outcome.err
+    for name in ("lists", "none"):
+        assert outcome.err.count(f"b/{name} is a list, not an MCAP file; ") == 1
+    assert outcome.err.count("its files are left out") == 2
 
 
 # Exporters
@@ -721,6 +739,7 @@ COMMAND = "from mcaptrack.api.declared import declared\n"
         ("def Part(): ...", "is not declared"),
         ("class Part: ...", "is not declared"),
         ("Part = 3", "no class but of type int"),
+        (COMMAND + "@declared()\ndef Part(x=1):\n    'Do.'", "TypeError: the parameter x of Part has no type; annotate it"),
         (COMMAND + "@declared()\ndef Part(x: dict = {}):\n    'Do.'", "can't be a command"),
         (COMMAND + "@declared()\ndef Part(json: bool = False):\n    'Do.'", "can't have the name of the option json"),
         (COMMAND + "@declared()\ndef Part(a: int = 1):\n    'Do.'\n    raise KeyError(a)", "failed: KeyError: 1"),
@@ -780,6 +799,9 @@ def test_what_a_command_changes_in_the_process_is_undone(site, tracked):
 # The checks: each law can be broken
 
 
+NUMBERS = count()
+
+
 class Format:
     in_space = False
 
@@ -834,6 +856,34 @@ class Reader:
         ]
 
 
+class Recordings:
+    def __init__(self, breaks: str = "") -> None:
+        self.breaks, self.seen = breaks, 0
+
+    def recognises(self, path: Path) -> Any:
+        text = path.read_text("utf-8", "strict" if self.breaks == "junk" else "replace")
+        return {"words": True, "silent": ""}.get(self.breaks, "numbers as text" if text[:1] in "#0" else "")
+
+    def open(self, path: Path) -> RecordingReader:
+        self.seen += 1
+        if self.breaks == "file":
+            path.write_text(path.read_text("utf-8", "replace") + " ")
+        if self.breaks == "folder":
+            os.chdir("/")
+        numbers = path.read_text("utf-8", "replace").split()[1:]
+        if not all(map(str.isdigit, numbers)):
+            raise (KeyError if self.breaks == "cut" else ValueError)("no number")
+        out, channel = RecordingReader(), RecordedChannel("/a", encoding="json")
+        out.channels = [channel]
+        out.declared_counts = {channel: len(numbers) + 1} if self.breaks == "count" else None
+        payload = b"%d" % self.seen if self.breaks == "state" else b"{}"
+        channel = RecordedChannel("/b") if self.breaks == "channel" else channel
+        messages = [RecordedMessage(channel, int(number) % 2**40, payload) for number in numbers]
+        passes = iter(messages if self.breaks != "empty" else [])
+        out.messages = lambda report: passes if self.breaks == "once" else [*messages] if self.breaks != "empty" else []
+        return out
+
+
 class Export:
     end = ".txt"
     is_folder = False
@@ -863,7 +913,7 @@ class Export:
 
 FORMAT_LAWS = {
     "space": "declares: label format Format has in_space = 'air'", "boxes": "conforms: .* can't be",
-    "state": "pure: the same file gives other boxes", "file": "pure: ", "folder": "process: it changes the working folder",
+    "state": "pure: the same file gives other boxes", "file": "pure: ", "folder": "process: .* the working folder",
     "empty": "damaged: an empty file raises IndexError", "cut": "damaged: .* raises KeyError",
     "other": "recognises: it doesn't", "junk": "recognises: .*UnicodeDecodeError",
 }  # fmt: skip
@@ -871,6 +921,13 @@ READER_LAWS = {
     "space": "declares: ", "boxes": "conforms: .* a box can't be", "ground": "conforms: .* a box can't be",
     "fails": "conforms: it raises KeyError", "state": "pure: a message gives other boxes",
     "message": "pure: ", "blank": "empties: ", "folder": "process: ",
+}  # fmt: skip
+RECORDING_LAWS = {
+    "words": "recognises: it says True", "silent": "recognises: it says ''", "junk": "recognises: .*UnicodeDecodeError",
+    "empty": "conforms: it has no messages", "channel": "conforms: .* no message of a channel",
+    "count": "conforms: .* does not add up", "cut": "damaged: .* raises KeyError", "file": "pure: ",
+    "state": "pure: the same recording gives other messages", "once": "pure: its messages don't begin again",
+    "folder": "process: ",
 }  # fmt: skip
 EXPORT_LAWS = {
     "end": "declares: .* has end = 'txt'", "fails": "conforms: .* KeyError", "nothing": "conforms: .* wrote no file",
@@ -888,6 +945,11 @@ def check_reader(breaks: str) -> None:
     testing.check_message_reader(Reader(breaks), [{"boxes": [{"x": k}] * k} for k in range(3)])
 
 
+def check_recording(breaks: str) -> None:
+    Path("a.numbers").write_text("#numbers 10 20 20 30\n")
+    testing.check_recording_format(Recordings(breaks), Path("a.numbers"))
+
+
 def check_export(breaks: str) -> None:
     Path("b.csv").write_text(TABLE)
     done("ingest", "b.csv", "--fps", "10", "--classes", "all", "-o", "a.mcap", "--force")
@@ -897,6 +959,7 @@ def check_export(breaks: str) -> None:
 CHECKS: list[tuple[Callable[[str], None], dict[str, str]]] = [
     (check_format, FORMAT_LAWS),
     (check_reader, READER_LAWS),
+    (check_recording, RECORDING_LAWS),
     (check_export, EXPORT_LAWS),
 ]
 
@@ -921,6 +984,7 @@ def test_a_class_in_the_place_of_an_object_is_refused():
         (testing.check_label_format, Format),
         (testing.check_message_reader, Reader),
         (testing.check_exporter, Export),
+        (testing.check_recording_format, Recordings),
     ):
         with pytest.raises(LawError, match="is a class; give an object"):
             check(part, [])
@@ -973,39 +1037,67 @@ def test_the_check_of_a_command_names_the_law_that_is_broken(function, arguments
         testing.check_command(function, *arguments)
 
 
+@pytest.mark.parametrize(
+    ("sample", "said"),
+    [("mot", ""), ("shifted", "again: mot reads other boxes"), ("cut", "again: mot reads 2 boxes of the 3")],
+)
+def test_what_an_exporter_writes_is_read_again(site, tracked, sample, said):
+    class Changed(MotFile):
+        def content(self, boxes):
+            text = b"".join(super().content(boxes))
+            yield {"shifted": text.replace(b",10.0,", b",11.0,"), "cut": text.partition(b"\n")[2]}.get(sample, text)
+
+    with pytest.raises(LawError, match=said) if said else nullcontext():
+        testing.check_exporter(Changed(), tracked, format_named("mot"))
+
+
+@pytest.mark.parametrize(
+    ("part", "replaced", "by", "said"),
+    [
+        ("crowded", "is_outdated", lambda *_: False, "again: /camera/tracks/crowded is not made again where tracks"),
+        (
+            "crowded",
+            "is_outdated",
+            lambda *_: True,
+            "again: it makes /camera/tracks/crowded again, which is up to date",
+        ),
+        ("crowded", "Provenance", lambda name, *how: Provenance("other", *how), "conforms: .* is not below its input"),
+        ("crowded", "Crowded", lambda _: SimpleNamespace(make=lambda *_: {}), "conforms: it makes nothing"),
+        ("crowded", "Finished", lambda *_: 3, "conforms: .* gave an int; report has to give a Finished"),
+        ("crowded", "Provenance", lambda *how: os.chdir("/") or Provenance(*how), "process: .* the working folder"),
+        ("lengths", "ReportSection", lambda *_: None, "conforms: it says nothing of this log"),
+        ("lengths", "ReportSection", lambda *_: "html", "conforms: .* gave a str; its function has to give"),
+        (
+            "lengths",
+            "ReportSection",
+            lambda *all: ReportSection(*all, note=str(next(NUMBERS))),
+            "pure: .* another section",
+        ),
+        ("lengths", "SectionTable", lambda *all: SectionTable("a", [3], []), "conforms: .* 3 is no text"),
+        ("lengths", "len", lambda rows: os.chdir("/") or "1", "process: .* the working folder"),
+    ],
+)
+def test_the_check_of_a_finisher_and_of_a_section_names_the_law(site, finished, monkeypatch, part, replaced, by, said):
+    module = import_module(part)
+    if part == "crowded":
+        check = partial(testing.check_finisher, module.crowded, finished, crowded=2)
+    else:
+        check = partial(testing.check_report_section, module.lengths, finished)
+    check()
+    monkeypatch.setattr(module, replaced, by, raising=False)
+    with pytest.raises(LawError, match=said):
+        check()
+
+
+def test_a_section_of_a_log_without_channels_is_noticed(finished):
+    with pytest.raises(LawError, match="empties: a log without channels has a section"):
+        testing.check_report_section(lambda *_: ReportSection("a", "b"), finished)
+
+
 # Scenes of several cameras
 
 
-MEETING = """
-from typing import Annotated
-
-from mcaptrack.api.declared import Option, declared
-from mcaptrack.pipeline.scenes import SceneMaker
-from mcaptrack.pipeline.write import Made
-from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.schema.provenance import Provenance
-
-
-class Meeting(SceneMaker):
-    def __init__(self, meet):
-        self.off = "" if meet else "`meet=False` was given"
-
-    def joinable(self, opened, cameras):
-        return list(cameras), ""
-
-    def join(self, opened, cameras, prefix, progress):
-        frames = [
-            Frame(frame.t_ns, frame.index, DETECTIONS.rows(x_m=[1.0], y_m=[2.0], score=[0.9], class_id=[1]))
-            for frame in opened.frames(f"/{cameras[0]}/detections", DETECTIONS)
-        ]
-        how = Provenance("fuse", {"cameras": list(cameras), "meets": True})
-        return {f"{prefix}/detections": Made.of(DETECTIONS, frames, how)}
-
-
-@declared()
-def Part(*, meet: Annotated[bool, Option(help="Join cameras.")] = True):
-    return Meeting(meet)
-"""
+MEETING = FILES["meeting.py"].replace("def meeting", "def Part")
 
 
 @pytest.mark.usefixtures("site")
@@ -1017,16 +1109,25 @@ def test_a_scene_of_a_package_that_is_no_maker_of_scenes_is_one_line():
         Scenes([(entry, 3)])
 
 
-def test_a_package_makes_a_scene_of_cameras(site, monkeypatch):
-    add(site, "scene", "meeting", MEETING)
-    parts = Finishers()
-    assert {*parts.options(())} >= {"meet"}
-    monkeypatch.setattr("mcaptrack.api.run._FINISHERS", parts)
-    lines = "".join(f"{number},-1,{10 + number},20,20,60,0.9,-1,-1,-1\n" for number in range(1, 13))
-    Path("boxes.txt").write_text(lines)
-    for name, where in (("left", "output"), ("right", "into")):
-        mcaptrack.ingest("boxes.txt", fps=2, role="detections", camera=name, **{where: "a.mcap"})
-    result = mcaptrack.run("a.mcap", tables=False, predictor="cv")
+@pytest.fixture
+def run_cameras(site, monkeypatch) -> Callable[[str], mcaptrack.RunResult]:
+    """Run a log of two cameras where a package has this maker of scenes."""
+
+    def run(code: str) -> mcaptrack.RunResult:
+        add(site, "scene", "meeting", code)
+        parts = PartsOfRun()
+        parts.options(())
+        monkeypatch.setattr("mcaptrack.api.run._PARTS", parts)
+        Path("boxes.txt").write_text("".join(f"{n},-1,{10 + n},20,20,60,0.9,-1,-1,-1\n" for n in range(1, 13)))
+        for name, where in (("left", "output"), ("right", "into")):
+            mcaptrack.ingest("boxes.txt", fps=2, role="detections", camera=name, **{where: "a.mcap"})
+        return mcaptrack.run("a.mcap", tables=False, predictor="cv")
+
+    return run
+
+
+def test_a_package_makes_a_scene_of_cameras(site, run_cameras):
+    result = run_cameras(MEETING)
     assert [(name, camera.is_scene) for name, camera in result.cameras.items()][-1] == ("world", True)
     assert result.cameras["world"].summary.tracks == 1
     assert mcaptrack.run("a.mcap", tables=False).is_up_to_date
@@ -1036,16 +1137,35 @@ def test_a_package_makes_a_scene_of_cameras(site, monkeypatch):
 
 
 @thorough
-def test_a_package_that_fails_at_making_a_scene_is_named_and_the_cameras_are_run(site, monkeypatch):
-    add(site, "scene", "meeting", MEETING.replace("        how = ", "        how = 1 / 0\n        how = "))
-    parts = Finishers()
-    parts.options(())
-    monkeypatch.setattr("mcaptrack.api.run._FINISHERS", parts)
-    Path("boxes.txt").write_text("".join(f"{n},-1,{10 + n},20,20,60,0.9,-1,-1,-1\n" for n in range(1, 13)))
-    for name, where in (("left", "output"), ("right", "into")):
-        mcaptrack.ingest("boxes.txt", fps=2, role="detections", camera=name, **{where: "a.mcap"})
-    result = mcaptrack.run("a.mcap", tables=False, predictor="cv")
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("        how = ", "        how = 1 / 0\n        how = "), "failed: ZeroDivisionError: division by zero (ano"),
+        (("    return Meeting(", "    1 / 0\n    return Meeting("), "failed: ZeroDivisionError: division by zero (ano"),
+    ],
+)
+def test_a_package_that_fails_at_making_a_scene_is_named_and_the_cameras_are_run(run_cameras, change, said):
+    with collected() as warnings:
+        result = run_cameras(MEETING.replace(*change))
     assert [*result.cameras] == ["left", "right"]
-    assert result.not_fused.startswith(
-        "scene meeting (another 2.0) failed: ZeroDivisionError: division by zero (another.py"
-    )
+    reasons = (result.not_fused, *(notice.message for notice in warnings))
+    assert any(why.startswith(f"scene meeting (another 2.0) {said}") for why in reasons)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("", ""), ""),
+        (("list(cameras), ", '["attic"], '), r"conforms: of the cameras \['left', 'right'\] it joins \['attic'\]"),
+        (('"fuse", ', '"track", '), "conforms: the detections of the scene are not fused of the cameras"),
+        (("x_m=[1.0]", "x_m=[float(next(NUMBERS))]"), "pure: the same cameras give another scene"),
+        (("        place = ", "        import os; os.chdir('/')\n        place = "), "process: .* the working folder"),
+        (("    return Meeting(", "    return 3 # "), "conforms: .* its function has to give a SceneMaker"),
+    ],
+)
+def test_the_check_of_a_maker_of_scenes_names_the_law(run_cameras, change, said):
+    run_cameras(MEETING)
+    names: dict[str, Any] = {"NUMBERS": NUMBERS, "__name__": "another"}
+    exec(MEETING.replace(*change), names)
+    with pytest.raises(LawError, match=said) if said else nullcontext():
+        testing.check_scene_maker(names["Part"], "a.mcap")

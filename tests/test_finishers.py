@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import json
 import os
@@ -16,7 +17,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.api.finishing import Finishers
+from mcaptrack.api.finishing import PartsOfRun
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS
@@ -49,9 +50,9 @@ def run(monkeypatch) -> Any:
     """``run`` with the finishers that are installed now; those of ``mcaptrack.run`` are of the time of its import."""
 
     def run(path: Path, **options: Any) -> mcaptrack.RunResult:
-        finishers = Finishers()
+        finishers = PartsOfRun()
         finishers.options(())
-        monkeypatch.setattr("mcaptrack.api.run._FINISHERS", finishers)
+        monkeypatch.setattr("mcaptrack.api.run._PARTS", finishers)
         return inspect.unwrap(mcaptrack.run)(path, tables=False, **options)
 
     return run
@@ -125,10 +126,10 @@ def test_later_runs_do_it_again_and_one_line_says_where_nothing_can(site, path, 
 def test_a_finisher_that_cannot_have_its_options_is_left_out_and_each_run_says_so(site, change, why):  # noqa: F811
     assert change[0] in CODE
     add(site, "finisher", "odd", CODE.replace(*change))
-    finishers = Finishers()
+    finishers = PartsOfRun()
     assert not {"odd", "topic"} & finishers.options({"topic"}).keys()
     with collected() as warnings:
-        assert "odd" not in {step.name for step in finishers.steps({}, False)}
+        assert "odd" not in {step.name for step in finishers.finishers({}, False)}
     (notice,) = warnings
     assert notice.message.startswith(why)
     assert notice.message.endswith("; it is left out")
@@ -184,8 +185,30 @@ def test_a_finisher_cannot_have_the_name_of_a_command_of_the_core(site):  # noqa
     assert "there is a command track; rename it" in plugins["finisher track (another 2.0)"]
 
 
+def test_a_finisher_with_a_name_of_the_result_is_left_out_and_one_that_comes_late_is_named(site, monkeypatch):  # noqa: F811
+    parts = PartsOfRun()
+    add(site, "finisher", "frames", CODE)
+    for finishers, why in (
+        (parts, "finisher frames was installed after run was imported; it is left out"),
+        (
+            PartsOfRun(),
+            "finisher frames (another 2.0) can't have its name: the result of run has frames; it is left out",
+        ),
+    ):
+        finishers.options(())
+        with collected() as warnings:
+            assert "frames" not in {step.name for step in finishers.finishers({}, False)}
+        assert [notice.message for notice in warnings] == [why]
+
+
+def test_nothing_is_asked_of_packages_for_names_that_python_looks_up(finished, monkeypatch):
+    result = mcaptrack.run(finished, tables=False)
+    monkeypatch.setattr("mcaptrack.api.running.others", None)
+    assert copy.copy(result) == result
+
+
 def test_an_option_of_nothing_is_refused():
-    with pytest.raises(TypeError, match="has no parameter crowdedd; there are"):
+    with pytest.raises(TypeError, match="has no parameter crowdedd; "):
         mcaptrack.run("log.mcap", crowdedd=2)
     with pytest.raises(AttributeError, match="has no attribute 'crowdedd'"):
         _ = mcaptrack.RunResult.__getattr__(mcaptrack.RunResult.__new__(mcaptrack.RunResult), "crowdedd")

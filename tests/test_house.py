@@ -42,6 +42,7 @@ def call(*words):
         except SystemExit:
             return out.getvalue()
 
+from mcaptrack.installed import missing_extensions
 from mcaptrack.registry import find
 
 names, parts, core = json.loads(sys.argv[1])
@@ -51,6 +52,13 @@ for name in names:
         said[name] = getattr(mcaptrack, name).__module__
     except AttributeError as error:
         said[name] = str(error)
+imports = {}
+for name in names:
+    try:
+        exec(f"from mcaptrack import {name}")
+        imports[name] = ""
+    except ImportError as error:
+        imports[name] = str(error)
 for kind, name in parts:
     try:
         said[f"{kind} {name}"] = find(kind, name).module
@@ -67,7 +75,7 @@ commands = {name: call(name, "x") for name in names if name.islower()}
 options = {name: call("info", f"--{name}", "x") for name in commands}
 loaded = [name for name in sys.modules if name.startswith("mcaptrack.extensions.")] if core else []
 print(json.dumps({
-    "help": call("--help"), "names": said, "all": mcaptrack.__all__, "commands": commands, "options": options, "broken": broken,
+    "help": call("--help"), "names": said, "imports": imports, "missing": missing_extensions(), "all": mcaptrack.__all__, "commands": commands, "options": options, "broken": broken,
     "where": mcaptrack.__file__, "loaded": loaded,
 }))
 """
@@ -119,6 +127,7 @@ def test_without_an_extension_the_rest_works_and_what_is_missing_is_named(gone, 
             is_there = room_of(value) not in missing
             assert (name in said["all"]) is is_there
             assert (f"{text}{room_of(value)}" in said["names"][name]) is not is_there
+            assert (f"{text}{room_of(value)}" in said["imports"][name]) is not is_there
             if group == "commands":
                 assert (f"\n  {name} " in said["help"]) is is_there
                 assert (f"mcaptrack: {text}{room_of(value)}\n" == said["commands"][name]) is not is_there
@@ -129,6 +138,7 @@ def test_without_an_extension_the_rest_works_and_what_is_missing_is_named(gone, 
             is_named = said["names"][f"{group.partition('.')[2][:-1]} {name}"] == f"{text}{room_of(value)}"
             assert is_named is (room_of(value) in missing)
     assert "\n  ingest " in said["help"]
+    assert {name for name, why in said["missing"].items() if why} == {*missing}
 
 
 @pytest.mark.parametrize("gone", EXTENSIONS[:1])

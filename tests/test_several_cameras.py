@@ -9,7 +9,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import McaptrackError, RunResult, log, pipeline
-from mcaptrack.api.finishing import Finishers
+from mcaptrack.api.finishing import PartsOfRun
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import collected
 from mcaptrack.pipeline import scenes
@@ -155,7 +155,7 @@ class TestWithoutScenes:
     @pytest.fixture(autouse=True)
     def alone(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(scenes, "names", lambda _: ())
-        monkeypatch.setattr("mcaptrack.api.run._FINISHERS", Finishers())
+        monkeypatch.setattr("mcaptrack.api.run._PARTS", PartsOfRun())
 
     def test_each_camera_is_run_and_a_line_says_why_there_is_no_scene(self, path: Path) -> None:
         with collected():

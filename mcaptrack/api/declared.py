@@ -364,6 +364,8 @@ def _take_more(function: Callable[..., Any], more: _More) -> None:
 def _completed(function: Callable[..., Any]) -> str:
     """The docstring of a function with all parameters, in order: also with those that annotations alone describe."""
     doc, hints, parameters = inspect.getdoc(function) or "", hints_of(function), inspect.signature(function).parameters
+    if untyped := [name for name in parameters if name not in hints]:
+        raise TypeError(f"the parameter {untyped[0]} of {function.__name__} has no type; annotate it")
     if _PARAMETERS not in doc:
         doc = re.sub(r"(?=^Returns\n)|\Z", f"{_PARAMETERS}\n\n", doc, count=1, flags=re.M)
     before, _, rest = doc.partition(_PARAMETERS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +12,7 @@ from mcaptrack.api.declared import hints_of, parameter_of
 from mcaptrack.contracts import Finished
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
-from mcaptrack.registry import Entry, Kind, blamed, find, of_type, others
+from mcaptrack.registry import Entry, Kind, blamed, find, of_type, others, titled
 
 if TYPE_CHECKING:
     from mcaptrack.geometry.plane import Planes
@@ -20,27 +20,28 @@ if TYPE_CHECKING:
     from mcaptrack.pipeline.runner import Finish
     from mcaptrack.pipeline.write import Made, RunState
 
-_KINDS: Final[tuple[Kind, ...]] = ("finisher", "scene")
 #: The option of ``run`` that a finisher gets, if it has a parameter of this name.
-_FORCE = "force"
+_FORCE: Final = "force"
 
 
-class Finishers:
-    """The finishers and makers of scenes of installed packages: declared functions that take options and return a part.
+class PartsOfRun:
+    """Functions of installed packages that take options of ``run`` and return a part of it: finishers, scene makers.
 
     One that can't be imported, or has an option that ``run`` has, gives no options; each run says why it is left out.
+    ``entries`` are these functions; by default all that are installed now.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, entries: Iterable[Entry] | None = None) -> None:
         self._entries: dict[Entry, dict[str, inspect.Parameter]] = {}
         self._options: dict[Entry, dict[str, inspect.Parameter]] = {}
-        self._faults: list[str] = []
-        for kind, name in ((each, name) for each in _KINDS for name in others(each)):
+        self.faults: list[str] = []
+        self._names = _installed()
+        for part in self._names if entries is None else entries:
             try:
-                entry = find(kind, name)
+                entry = part if isinstance(part, Entry) else find(*part)
                 self._entries[entry] = _options_of(entry)
             except McaptrackError as error:
-                self._faults.append(str(error))
+                self.faults.append(str(error))
 
     @property
     def most_used(self) -> tuple[str, ...]:
@@ -52,29 +53,69 @@ class Finishers:
         out: dict[str, inspect.Parameter] = {}
         for entry, own in self._entries.items():
             if name := next((name for name in own if name in taken or name in out), ""):
-                self._faults.append(f"{entry} can't have the option {name}: run has one of this name")
+                self.faults.append(f"{entry} can't have the option {name}: run has one of this name")
             else:
                 self._options[entry] = own
                 out |= own
         return out
 
-    def steps(self, values: Mapping[str, object], force: bool) -> list[Finish]:
+    def finishers(self, values: Mapping[str, object], force: bool) -> list[Finish]:
         """Return the steps of finishers with these values of options. Warn of what is left out."""
-        for fault in self._faults:
-            warn(f"{fault}; it is left out", "left-out")
-        parts = self.parts("finisher", values, force)
-        return [step if entry.is_built_in else _OfPackage(entry, step) for entry, step in parts]
+        from mcaptrack.api.running import RunResult
 
-    def parts(self, kind: Kind, values: Mapping[str, object], force: bool = False) -> list[tuple[Entry, Any]]:
-        """Return what the functions of a kind make of these values of options, each with its entry."""
-        parts = []
-        for entry in (entry for entry in self._options if entry.kind == kind):
-            own = {name: values[name] for name in self._options[entry] if name in values}
-            own |= {_FORCE: force} if _FORCE in inspect.signature(entry.cls).parameters else {}
-            with blamed(entry, "failed"):
-                part = entry.cls(**own)
-            parts.append((entry, part))
-        return parts
+        late = [
+            f"{titled(*name)} was installed after run was imported" for name in _installed() if name not in self._names
+        ]
+        for fault in (*self.faults, *late):
+            _leave_out(fault)
+        steps: list[Finish] = []
+        for entry in self._of("finisher"):
+            if not entry.is_built_in and entry.name in {*dir(RunResult), *RunResult.__dataclass_fields__}:
+                _leave_out(f"{entry} can't have its name: the result of run has {entry.name}")
+                continue
+            step = self._made(entry, values, force)
+            steps.append(step if entry.is_built_in else _OfPackage(entry, step))
+        return steps
+
+    def scene_makers(self, values: Mapping[str, object]) -> list[tuple[Entry, Any]]:
+        """Return the makers of scenes with these values of options, each with its entry.
+
+        One that can't be made is left out, with a warning, unless one of its options has a value.
+        """
+        makers = []
+        for entry in self._of("scene"):
+            try:
+                makers.append((entry, self._made(entry, values)))
+            except McaptrackError as error:
+                if entry.is_built_in or any(self.chosen("scene", values).values()):
+                    raise
+                _leave_out(str(error))
+        return makers
+
+    def chosen(self, kind: Kind, values: Mapping[str, object]) -> dict[str, bool]:
+        """Return whether each option of a kind has another value than by default."""
+        options = [option for entry in self._of(kind) for option in self._options[entry].values()]
+        return {option.name: values.get(option.name, option.default) != option.default for option in options}
+
+    def _of(self, kind: Kind) -> list[Entry]:
+        return [entry for entry in self._options if entry.kind == kind]
+
+    def _made(self, entry: Entry, values: Mapping[str, object], force: bool = False) -> Any:
+        """Return what a function makes of these values of options."""
+        own = {name: values[name] for name in self._options[entry] if name in values}
+        own |= {_FORCE: force} if _FORCE in inspect.signature(entry.cls).parameters else {}
+        with blamed(entry, "failed"):
+            return entry.cls(**own)
+
+
+def _installed() -> list[tuple[Kind, str]]:
+    """Return kind and name of all that are installed now."""
+    kinds: tuple[Kind, ...] = ("finisher", "scene")
+    return [(kind, name) for kind in kinds for name in others(kind)]
+
+
+def _leave_out(fault: str) -> None:
+    warn(f"{fault}; it is left out", "left-out")
 
 
 def _options_of(entry: Entry) -> dict[str, inspect.Parameter]:

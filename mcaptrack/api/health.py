@@ -18,6 +18,7 @@ from mcaptrack import __version__
 from mcaptrack.api.declared import Argument, declared
 from mcaptrack.environment import THREADS, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
+from mcaptrack.installed import missing_extensions
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
 
@@ -132,6 +133,8 @@ class DoctorResult:
         Free space there.
     parts : dict of str to str
         What parts say of themselves, such as what networks can run on, by its heading.
+    extensions : dict of str to str
+        What to do about each extension that isn't installed, by name; "" for those that are.
     plugins : dict of str to str
         Parts of other packages, as "tracker nearest (my-package 1.0)", and why each can't be imported; "" where it can.
     faults : tuple of str
@@ -155,6 +158,7 @@ class DoctorResult:
     temporary_folder: Path | None
     temporary_bytes_free: int | None
     parts: dict[str, str]
+    extensions: dict[str, str]
     plugins: dict[str, str]
     faults: tuple[str, ...]
     store: StoreCheck | None = None
@@ -264,6 +268,7 @@ def doctor(
             temporary_folder=folder,
             temporary_bytes_free=free,
             parts=_parts(),
+            extensions=missing_extensions(),
             plugins=plugins,
             faults=tuple(faults),
             store=checked,

@@ -7,9 +7,9 @@ from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Annotated, Final, Unpack
 
 import mcaptrack
-from mcaptrack.api.common import as_location, split_names
+from mcaptrack.api.common import as_location, split_names, warn_unused
 from mcaptrack.api.declared import PYTHON_ONLY, Option, declared
-from mcaptrack.api.finishing import Finishers
+from mcaptrack.api.finishing import PartsOfRun
 from mcaptrack.api.options import (
     FILES,
     ClassNames,
@@ -42,17 +42,17 @@ if TYPE_CHECKING:
 _AFTER: Final = "After the stages"
 _CLASSES: Final = "Classes of objects"
 _AGAIN: Final = "The {kind}, also where another one was used before"
-_FINISHERS: Final = Finishers()
+_PARTS: Final = PartsOfRun()
 
 
 @declared(
     most_used=(
         *("output", "topic", "camera", "detector", "tracker", "retracker", "predictor"),
-        *(*_FINISHERS.most_used, "force"),
+        *(*_PARTS.most_used, "force"),
     ),
     heading="Start here",
     printed_by="mcaptrack.cli.running:Run",
-    more=_FINISHERS.options,
+    more=_PARTS.options,
 )
 def run(
     log: EachLog,
@@ -186,7 +186,7 @@ def run(
     chosen = {kind: choice for kind, choice in named.items() if choice is not None}
     transforms = transforms_of(stages)
     transforms |= {s.name: transform_of(s.name, chosen[s.option], {}) for s in STAGES.values() if s.option in chosen}
-    joins = Scenes(_FINISHERS.parts("scene", more))
+    joins = Scenes(_PARTS.scene_makers(more))
     plane = PlaneChoice(fit_plane, person_height_m, frame, ground_frame)
     settings = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
     shared = {name: value for name, value in settings.items() if value is not None}
@@ -200,14 +200,17 @@ def run(
         return plan_all(opened, prefix, say, topic, kept, force, options, shared, plane, frame or "", changed, renewed)
 
     options = events if isinstance(events, EventOptions) else EventOptions()
-    finishing = [*([Watch(options, force=force)] if events else []), *_FINISHERS.steps(more, force)]
+    finishing = [*([Watch(options, force=force)] if events else []), *_PARTS.finishers(more, force)]
     where = Where(log, names[0] if len(names) == 1 else None, topic, output, sidecar, force)
     earlier = _log_before(as_location(log), follows)
     with definitions_of(definitions), choosing(topic, map, class_map):
-        return work(
+        result = work(
             where, plan, progress, tables, finishing=finishing, views=True, plane=plane, cameras=names, joins=joins,
             follows=earlier,
         )  # fmt: skip
+    if not result.cameras:
+        warn_unused("one camera is run", **_PARTS.chosen("scene", more))
+    return result
 
 
 def _log_before(log: Location, follows: PathLike | Sequence[PathLike] | None) -> Location | None:

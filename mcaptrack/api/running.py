@@ -139,7 +139,7 @@ class RunResult(_OfFinishers):
 
         def __getattr__(self, name: str) -> object:
             """Return what a finisher says; nothing if it was not asked."""
-            if name in others("finisher"):
+            if not name.startswith("_") and name in others("finisher"):
                 report = self.finished.get(name)
                 return report.value if report else {}
             text = missing_extension(name) or f"{type(self).__name__!r} object has no attribute {name!r}"

@@ -53,6 +53,8 @@ def _lines(result: DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
     free = "" if result.temporary_bytes_free is None else f", {result.temporary_bytes_free / 1e9:.1f} GB free"
     yield "temporary files", f"{result.temporary_folder or 'no folder can be written'}{free}"
     yield from result.parts.items()
+    yield "extensions", ", ".join(name for name, why in result.extensions.items() if not why) or "none"
+    yield from ((f"  {name}", why) for name, why in result.extensions.items() if why)
     for name, why in result.plugins.items():
         yield name, why or "can be imported"
     if result.store is not None:

@@ -62,4 +62,4 @@ class Ingest(EachLog["IngestResult"]):
 
 
 def _counts(done: IngestResult) -> str:
-    return ", ".join(f"{topic} {count}" for topic, count in done.messages.items())
+    return ", ".join(f"{topic} {count}" for topic, count in done.messages.items()) or "no channels, so no messages"

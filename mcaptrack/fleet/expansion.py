@@ -19,7 +19,7 @@ from mcaptrack.files import place_of, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, sibling
 from mcaptrack.log import results_path
 from mcaptrack.log.recording_files import format_of, listing_of, logs_in, not_mcap, refuse_non_mcap
-from mcaptrack.notices import warn
+from mcaptrack.notices import collected, warn
 
 #: The argument that stands for a list of names on standard input.
 LIST: Final = "-"
@@ -166,7 +166,8 @@ def _without_results(named_logs: Sequence[NamedLog]) -> list[NamedLog]:
 
 
 def _has_logs(folder: Path) -> bool:
-    return next(_logs_in(folder, "", is_named=True), None) is not None
+    with collected():
+        return next(_logs_in(folder, "", is_named=True), None) is not None
 
 
 def _is_no_pattern(path: Path) -> bool:
@@ -220,8 +221,9 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
 def _logs_in(folder: Path, leave_out: str, *, is_named: bool = False) -> Iterator[NamedLog]:
     """Yield all logs in a folder and below it, in order of their names.
 
-    The files of a folder that are listed as parts of one recording are no logs: they are left out with a warning. One
-    file that is a whole recording is a log. A folder of a recording that a user named is refused.
+    A folder below it that is a recording of another format, or of which the files are listed as parts of one, is left
+    out with a warning. One file that is a whole recording is a log. A folder of a recording that a user named is
+    refused.
     """
 
     def unreadable(error: OSError) -> None:
@@ -231,8 +233,9 @@ def _logs_in(folder: Path, leave_out: str, *, is_named: bool = False) -> Iterato
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         names = [name for name in sorted(files) if name.lower().endswith(_SUFFIX) and not name.startswith(".")]
         is_top = is_named and Path(place) == folder
-        if names and (is_top or len(logs_in(Path(place))) > 1) and listing_of(Path(place, names[0])):
-            recognised = format_of(Path(place))
+        is_listed = names and (is_top or len(logs_in(Path(place))) > 1) and listing_of(Path(place, names[0]))
+        recognised = format_of(Path(place)) if is_listed or not (names or is_top) else None
+        if is_listed or recognised:
             text = not_mcap(Path(place), str(recognised.answer) if recognised else "a recording")
             if is_top:
                 raise McaptrackError(text)

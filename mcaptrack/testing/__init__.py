@@ -1,4 +1,4 @@
-"""Test a transform, a predictor, a format or a command against the laws that hold for every one of its kind.
+"""Test a part of a package, such as a transform or a format, against the laws that hold for every one of its kind.
 
 from mcaptrack.testing import check_predictor, check_transform
 
@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from mcaptrack.predictors import AnyPredictor, PeopleSeen, are_covariances, predict_among
-from mcaptrack.testing.formats import check_command, check_exporter, check_label_format, check_message_reader
+from mcaptrack.testing.formats import check_exporter, check_label_format, check_message_reader, check_recording_format
+from mcaptrack.testing.functions import check_command, check_finisher, check_report_section, check_scene_maker
 from mcaptrack.testing.transforms import LAWS, LawError, check_transform, same_process, sample_frames
 
 __all__ = [
@@ -19,9 +20,13 @@ __all__ = [
     "LawError",
     "check_command",
     "check_exporter",
+    "check_finisher",
     "check_label_format",
     "check_message_reader",
     "check_predictor",
+    "check_recording_format",
+    "check_report_section",
+    "check_scene_maker",
     "check_transform",
     "sample_frames",
 ]

@@ -13,6 +13,7 @@ from mcaptrack.foxglove.views import styles
 from mcaptrack.foxglove.views.people import ellipse_points, segments
 from mcaptrack.foxglove.views.styles import TrackStyle
 from mcaptrack.geometry.arrays import Image
+from mcaptrack.registry import names as names_of
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES
@@ -63,7 +64,8 @@ def _legend(views: tuple[str, ...], width_px: int) -> Image | None:
 def _samples(views: Sequence[str]) -> dict[str, TrackStyle]:
     """The styles of what is drawn in views, by its text."""
     names = [view.partition("/view/")[0] for view in views]
-    tracks = [name for name in names if not name.endswith(("/predictions", "/detections", "/zones", "/boxes"))]
+    others = ("predictions", "detections", "boxes", *names_of("finisher"))
+    tracks = [name for name in names if name.rpartition("/")[2] not in others]
     kinds = {style.title: style for style in map(styles.style_of, tracks)}
     out = dict(kinds)
     if kinds:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,7 +34,7 @@ from mcaptrack.extensions.report.identity_events import (
 from mcaptrack.extensions.report.scene_map import forecast_map
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import Planes, is_estimated, origin_of, plane_at
-from mcaptrack.registry import blamed, find, of_type, others
+from mcaptrack.registry import find, others
 from mcaptrack.schema import DECISIONS, EVENTS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import frame_times
@@ -47,6 +46,7 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.viewing.background import SceneBackground, background_picture, moment_picture
 from mcaptrack.viewing.formatting import clock, plain, short
 from mcaptrack.viewing.legend import tracker_name
+from mcaptrack.viewing.sections import section_of
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {
@@ -188,27 +188,8 @@ def _add_sections(opened: log.Log, out: LogReport) -> None:
     """Add the sections of installed packages."""
     names = {role: track_set.name for role, track_set in out.track_sets.items()}
     for name in others("report_section"):
-        entry = find("report_section", name)
-        with blamed(entry, "failed"):
-            section = entry.cls(opened, out.prefix, names)
-        if section is not None:
-            out.sections[name] = of_type(entry, section, ReportSection, "its function")
-            with blamed(entry, "gave what is no ReportSection"):
-                _check(section)
-
-
-def _check(section: ReportSection) -> None:
-    """Raise an error for a section that can't stand in a page, or in its data."""
-    texts = [section.short, section.title, section.note]
-    for caption, columns, groups in section.tables:
-        texts += [caption, *columns]
-        for heading, rows in groups:
-            texts += [heading, *(text for role, name, topic, cells in rows for text in (role, name, topic, *cells))]
-    for figure in section.figures:
-        texts += [figure["title"], figure["caption"], figure["chart"]["kind"]]
-    json.dumps(plain(section.data))
-    if wrong := [text for text in texts if not isinstance(text, str)]:
-        raise TypeError(f"{wrong[0]!r:.40} is no text")
+        if (section := section_of(find("report_section", name), opened, out.prefix, names)) is not None:
+            out.sections[name] = section
 
 
 def _without_path(error: McaptrackError, opened: log.Log) -> str:

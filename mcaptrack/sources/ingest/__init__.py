@@ -53,7 +53,7 @@ from mcaptrack.sources.ingest.labels.timeline import (
     picture_size,
     timeline_of,
 )
-from mcaptrack.sources.ingest.recording import open_recording
+from mcaptrack.sources.ingest.recording import compare_counts, open_recording
 from mcaptrack.sources.pictures import size_of
 from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import IMAGE_SUFFIXES, EncodedPicture, Video, open_video
@@ -505,7 +505,8 @@ class RecordingJob(IngestJob):
         self._progress("ingest", done, max(total, done))
         self.report.notes += reading_notes.notes
         self.report.lost += reading_notes.lost
-        self._compare()
+        counts = {channel: self._written[number] for channel, number in self._channels.items()}
+        compare_counts(self._recorded, self.source, counts, self.report.lost)
         self._report({number: channel.topic for channel, number in self._channels.items()})
         return self._timeline(times)
 
@@ -520,18 +521,6 @@ class RecordingJob(IngestJob):
         )
         self._channels[channel] = number
         self._written[number] = 0
-
-    def _compare(self) -> None:
-        """Compare the messages read with the counts that the recording declares."""
-        for channel, declared in (self._recorded.declared_counts or {}).items():
-            count = self._written[self._channels[channel]]
-            if count < declared and self.report.lost:
-                self.report.lost.append(f"{channel.topic}: {declared - count} of {declared} messages")
-            elif count != declared:
-                raise McaptrackError(
-                    f"{self.source} does not add up: its index counts {declared} messages of {channel.topic}, "
-                    f"and {count} are there"
-                )
 
     def _report(self, topics: dict[int, str]) -> None:
         counts: Counter[str] = Counter()

@@ -36,7 +36,7 @@ def open_recording(path: Path) -> RecordingReader | None:
     """
     recognised = format_of(path)
     if recognised:
-        return _opened(recognised.entry, recognised.form, path)
+        return opened_by(recognised.entry, recognised.form, path)
     if path.is_dir():
         entries = sorted(visible(path.iterdir()))
         if any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in entries):
@@ -64,15 +64,33 @@ def unlike(path: Path, what: str) -> McaptrackError:
     return McaptrackError(f"{path} can't be read as {what}: it {why}")
 
 
-def _opened(entry: Entry, form: Any, path: Path) -> RecordingReader:
+def opened_by(entry: Entry, form: Any, path: Path) -> RecordingReader:
     """The recording that a format opens; that of another package is checked while it is read."""
     with blamed(entry, f"can't read {path}"):
         recording = form.open(path)
     of_type(entry, recording, RecordingReader, "open")
-    return recording if entry.is_built_in else _OfPackage(entry, recording, path)
+    return recording if entry.is_built_in else RecordingOfPackage(entry, recording, path)
 
 
-class _OfPackage(RecordingReader):
+def compare_counts(
+    recording: RecordingReader, path: Path, counts: Mapping[RecordedChannel, int], lost: list[str]
+) -> None:
+    """Compare the numbers of messages that were read with those that a recording states; fewer are a line of ``lost``.
+
+    Raises McaptrackError if they differ though nothing was lost.
+    """
+    for channel, declared in (recording.declared_counts or {}).items():
+        count = counts.get(channel, 0)
+        if count < declared and lost:
+            lost.append(f"{channel.topic}: {declared - count} of {declared} messages")
+        elif count != declared:
+            raise McaptrackError(
+                f"{path} does not add up: its index counts {declared} messages of {channel.topic}, "
+                f"and {count} are there"
+            )
+
+
+class RecordingOfPackage(RecordingReader):
     """A recording as another package reads it: what it raises names the format, and what it gives is checked."""
 
     def __init__(self, entry: Entry, recording: RecordingReader, path: Path) -> None:

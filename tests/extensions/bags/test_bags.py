@@ -21,6 +21,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from mcaptrack import log
 from mcaptrack.contracts import ReadingNotes
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.bags.formats import RosBags
 from mcaptrack.extensions.bags.metadata_yaml import names_file, read_metadata
 from mcaptrack.extensions.bags.rosbag2 import open_bag, open_files
 from mcaptrack.extensions.bags.sqlite_tables import SqliteTables
@@ -30,6 +31,7 @@ from mcaptrack.schema import GROUND_PLANE, TRACKS
 from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.sources.foreign import definitions
 from mcaptrack.sources.ingest import IngestOptions, decompression, ingest, recording
+from mcaptrack.testing import check_recording_format
 from tests.extensions.bags.bags import MOT, ROS1, ROS2, STRING1, T0, bag1, bag2, camera_bag, database
 from tests.logs import plain, recorder
 
@@ -175,6 +177,7 @@ class TestRos1:
 
     def test_whatever_is_done_to_a_bag_it_is_read_or_refused(self, tmp_path):
         said = set(bag1(tmp_path / "a.bag", 12, 500))
+        check_recording_format(RosBags(), tmp_path / "a.bag")
         data = (tmp_path / "a.bag").read_bytes()
         dice = np.random.default_rng(11)
         outcomes = Counter()
@@ -205,6 +208,7 @@ class TestRosbag2:
         report = make(tmp_path / "bag", tmp_path / "a.mcap")
         assert recorded(tmp_path / "a.mcap") == sorted(said)
         assert report.messages == {"/talk": 30, "/image": 10, "/silent": 0}
+        check_recording_format(RosBags(), tmp_path / "bag")
         header, _ = summary(tmp_path / "a.mcap")
         assert header.profile == "ros2"
         kept = {topic: about for topic, *about, _ in channels(tmp_path / "a.mcap")}

@@ -10,8 +10,10 @@ import pytest
 
 import mcaptrack
 from mcaptrack import RunResult, log
+from mcaptrack.extensions.cameras.run import scenes
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS
+from mcaptrack.testing import check_scene_maker
 from tests.commands import done
 from tests.places import CAMERAS, NS, PEOPLE, ran_copy, said, topics, walk, write_log, write_parts
 from tests.tiers import thorough
@@ -45,6 +47,17 @@ def test_the_scene_is_tracked(ran: tuple[Path, RunResult]) -> None:
     told = done("run", path, "--no-tables").err
     lines = {line.split()[0]: line for line in told.splitlines() if line.startswith("  ")}
     assert lines["fused"].split(maxsplit=1)[1] == "world, the scene"
+
+
+def test_the_maker_of_scenes_obeys_the_laws(boxes: Path) -> None:
+    check_scene_maker(scenes, boxes)
+
+
+def test_options_for_scenes_are_named_where_one_camera_is_run(path: Path) -> None:
+    with collected() as warnings:
+        mcaptrack.run(path, camera="east", fuser="feet", tables=False, predictor="cv")
+    said = [notice.message for notice in warnings if notice.code == "option-not-used"]
+    assert said == ["`fuser=` changes nothing here: one camera is run"]
 
 
 @thorough

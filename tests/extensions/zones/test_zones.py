@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import log, notices
+from mcaptrack import log, notices, testing
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.zones import api
 from mcaptrack.extensions.zones.geojson import parse_zones, read_zones, zones_from_json, zones_to_json
+from mcaptrack.extensions.zones.section import section
 from mcaptrack.extensions.zones.shapes import Paths, Shape, crossings, visits
 from mcaptrack.extensions.zones.visits import (
     ZoneOptions,
@@ -382,6 +384,10 @@ class TestRun:
         assert all("/retracks/full/zones/" in topic for topic in result.channels if "/zones/" in topic)
         assert result.zones["/camera/truth"] == before.zones["/camera/truth"]
         assert mcaptrack.run(path, tables=False).is_up_to_date
+
+    def test_the_finisher_and_the_section_obey_their_laws(self, place, finished):
+        testing.check_finisher(api.count, finished, name="zones", zones=ZONES)
+        testing.check_report_section(section, place / "a.mcap")
 
     @thorough
     def test_other_zones_replace_those_of_before(self, place):

@@ -1,0 +1,269 @@
+"""The laws that hold for every command, finisher, maker of scenes and section of the report: functions of packages."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+
+from mcaptrack import log as logs
+from mcaptrack.api.common import as_path
+from mcaptrack.api.declared import Argument, PythonOnly, about, arguments_of, hints_of, options_of, words_of
+from mcaptrack.api.finishing import PartsOfRun
+from mcaptrack.api.options import PathLike, no_progress
+from mcaptrack.api.running import RunResult, Where, work
+from mcaptrack.api.stages import track
+from mcaptrack.errors import McaptrackError
+from mcaptrack.notices import collected
+from mcaptrack.pipeline.scenes import Scenes
+from mcaptrack.pipeline.several import write_scene
+from mcaptrack.pipeline.staleness import is_stale
+from mcaptrack.registry import Entry, Kind
+from mcaptrack.schema.provenance import FUSE
+from mcaptrack.sources.cameras import cameras, detections_topic, provenance_of, scenes_of
+from mcaptrack.testing.transforms import LawError, law, same_process
+from mcaptrack.viewing.formatting import plain
+from mcaptrack.viewing.sections import section_of
+
+#: What a command may return, beside nothing and dataclasses.
+_PRINTED: Final = (str, int, float, dict, list, tuple, np.ndarray, np.generic)
+#: What tracks are called in the report, by their role.
+_NAMES: Final = {role: role for role in ("tracks", "samples", "online", "offline", "truth")}
+_SCENE: Final = "/world"
+
+
+def check_command(function: Callable[..., Any], *arguments: Any, **options: Any) -> None:
+    """Check a command against the laws that hold for every one.
+
+    The laws: its function is declared, and says what it does, and what each of its parameters means; its parameters
+    have types that a command line can say; it returns nothing, text, a number, or a mapping, sequence or dataclass of
+    these; it leaves the process that it runs in as it was.
+
+    Parameters
+    ----------
+    function : callable
+        The function.
+    *arguments, **options
+        What to call it with.
+
+    Raises
+    ------
+    LawError
+        If it breaks a law; the message names the law.
+
+    Examples
+    --------
+    >>> from mcaptrack.api.declared import declared
+    >>> from mcaptrack.testing import check_command
+    >>> @declared()
+    ... def hello(name: str = "you") -> str:
+    ...     '''Say hello.
+    ...
+    ...     Parameters
+    ...     ----------
+    ...     name : str, default "you"
+    ...         Who is greeted.
+    ...     '''
+    ...     return f"hello {name}"
+    >>> check_command(hello)
+    """
+    name = getattr(function, "__name__", repr(function))
+    _check_declaration(function, name)
+    with same_process(name), collected():
+        result = function(*arguments, **options)
+    if not (result is None or isinstance(result, _PRINTED) or hasattr(result, "__dataclass_fields__")):
+        raise LawError(f"conforms: {name} returns a {type(result).__name__}, which can't be printed")
+
+
+def _check_declaration(function: Callable[..., Any], name: str) -> None:
+    """Check what a command says of itself: its help, and the types and the meaning of its parameters."""
+    if not hasattr(function, "most_used"):
+        raise LawError(f"declares: {name} is not declared; put @declared() of mcaptrack.api.declared above it")
+    try:
+        parameters, placed = options_of(function), arguments_of(function)
+    except Exception as error:
+        raise LawError(f"declares: {name} has types that a command line can't say ({error!r})") from None
+    if not words_of(function).text:
+        raise LawError(f"declares: {name} has no docstring, which is the help of its command")
+    silent = [parameter.name for parameter in parameters if not parameter.help]
+    silent += [parameter for parameter, argument in placed.items() if not argument.text]
+    if silent:
+        raise LawError(f"declares: {name} doesn't say what {silent[0]} means; its docstring may")
+    needed = [
+        parameter.name
+        for parameter in inspect.signature(function).parameters.values()
+        if parameter.default is parameter.empty
+        and not any(isinstance(part, Argument | PythonOnly) for part in about(hints_of(function)[parameter.name]))
+    ]
+    if needed:
+        raise LawError(f"declares: {name} has no default of {needed[0]}; options may be left out")
+
+
+def check_finisher(function: Callable[..., Any], log: PathLike, *, name: str = "", **options: Any) -> None:
+    """Check a finisher against the laws that hold for every one.
+
+    The laws: its function is declared, and says what each of its options means; what it makes is below its input, in
+    its name; it makes something of this log, and nothing when all is up to date, with these options or with none; it
+    makes the same again where tracks have changed, if the log has detections to track; its report is ``Finished``; it
+    leaves other channels, and the process that it runs in, as they were.
+
+    Parameters
+    ----------
+    function : callable
+        The function of the entry point.
+    log : path
+        A log of one camera with what it is made of; it is copied.
+    name : str, optional
+        The name of the entry point; by default that of the function.
+    **options
+        Its options.
+
+    Raises
+    ------
+    LawError
+        If it breaks a law; the message names the law.
+    """
+    with _part_of_run("finisher", function, name) as parts, TemporaryDirectory() as folder:
+        copy = Path(shutil.copy(as_path(log), Path(folder, "log.mcap")))
+        before = _channels(copy)
+        made = _finished(parts, copy, options)
+        if not made.channels:
+            raise LawError("conforms: it makes nothing of this log with these options")
+        if changed := [topic for topic, channel in _channels(copy).items() if before.get(topic, channel) != channel]:
+            raise LawError(f"conforms: it changes {changed[0]}")
+        for again in (options, {}):
+            if topics := _finished(parts, copy, again).channels:
+                raise LawError(f"again: it makes {topics[0]} again, which is up to date, with the options {again}")
+        with suppress(McaptrackError):  # without detections
+            track(copy, tracker="ocsort", force=True)
+        _finished(parts, copy, {})
+        with logs.read(copy) as opened:
+            if late := [topic for topic in made.channels if is_stale(opened, topic)]:
+                raise LawError(f"again: {late[0]} is not made again where tracks have changed")
+
+
+def _finished(parts: PartsOfRun, path: Path, options: Mapping[str, Any]) -> RunResult:
+    with law("conforms"):
+        return work(Where(path, None, None, None, False, False), lambda *_: [], no_progress,
+                    finishing=parts.finishers(options, False))  # fmt: skip
+
+
+def _channels(path: Path) -> dict[str, Any]:
+    """The number and the fingerprint of the messages of each channel, by topic."""
+    with logs.read(path) as opened:
+        return {topic: (channel.messages, opened.fingerprint(topic)) for topic, channel in opened.channels.items()}
+
+
+def check_scene_maker(function: Callable[..., Any], log: PathLike, **options: Any) -> None:
+    """Check a maker of scenes against the laws that hold for every one.
+
+    The laws: its function is declared, and says what each of its options means; it returns a ``SceneMaker``, which
+    joins cameras of this log, and gives names of cameras alone; the scene has detections, which say that they are
+    fused, and of which cameras; the same cameras give the same scene, which is not made again while it is up to date;
+    it leaves the log, and the process that it runs in, as they were.
+
+    Parameters
+    ----------
+    function : callable
+        The function of the entry point.
+    log : path
+        A log of several cameras that it can join, with their detections.
+    **options
+        Its options.
+
+    Raises
+    ------
+    LawError
+        If it breaks a law; the message names the law.
+    """
+    path = as_path(log).absolute()
+    with _part_of_run("scene", function, "") as parts, TemporaryDirectory() as folder:
+        before = path.read_bytes()
+        made = []
+        for number in range(2):
+            output = Path(folder, f"{number}.mcap")
+            with law("conforms"), logs.read(path) as opened:
+                scenes = Scenes(parts.scene_makers(options))
+                every = [each.prefix[1:] for each in cameras(opened) if each.prefix not in scenes_of(opened)]
+                names, why = scenes.joinable(opened, every)
+                if not names or not {*names} <= {*every}:
+                    raise LawError(f"conforms: of the cameras {every} it joins {names}: {scenes.off or why}")
+                write_scene(opened, _SCENE, partial(scenes.join, opened, names), no_progress, output)
+            made.append(_channels(output))
+        with logs.read(output) as opened:
+            how = provenance_of(opened, detections_topic(_SCENE))
+            if how is None or how.transform != FUSE or how.parameters.get("cameras") != names:
+                raise LawError(f"conforms: the detections of the scene are not {FUSE}d of the cameras {names}: {how}")
+            if again := scenes.join_again(opened, _SCENE, False, False, print, no_progress):
+                raise LawError(f"again: it makes {next(iter(again))} again, which is up to date")
+        if made[0] != made[1]:
+            raise LawError("pure: the same cameras give another scene when they are joined again")
+        if path.read_bytes() != before:
+            raise LawError("pure: it changes the log")
+
+
+def check_report_section(function: Callable[..., Any], log: PathLike) -> None:
+    """Check a section of the report against the laws that hold for every one.
+
+    The laws: it gives a ``ReportSection`` of texts, with data that can be JSON, or None, but not of all cameras of this
+    log; the same log gives the same section, and is not changed; a log without channels gives None; it leaves the
+    process that it runs in as it was.
+
+    Parameters
+    ----------
+    function : callable
+        The function of the entry point.
+    log : path
+        A log with what it is about.
+
+    Raises
+    ------
+    LawError
+        If it breaks a law; the message names the law.
+    """
+    entry = _entry_of("report_section", function, "")
+    path = as_path(log).absolute()
+    before = path.read_bytes()
+
+    def sections(of: Path) -> list[Any]:
+        with law("conforms"), logs.read(of) as opened:
+            prefixes = [camera.prefix for camera in cameras(opened)] or ["/camera"]
+            return [section_of(entry, opened, prefix, _NAMES) for prefix in prefixes]
+
+    with same_process(entry.name), collected(), TemporaryDirectory() as folder:
+        first = sections(path)
+        if not any(first):
+            raise LawError("conforms: it says nothing of this log")
+        if json.dumps(plain(sections(path))) != json.dumps(plain(first)):
+            raise LawError("pure: the same log gives another section when it is read again")
+        if path.read_bytes() != before:
+            raise LawError("pure: it changes the log")
+        with logs.create(empty := Path(folder, "empty.mcap")):
+            pass
+        if any(sections(empty)):
+            raise LawError("empties: a log without channels has a section")
+
+
+@contextmanager
+def _part_of_run(kind: Kind, function: Callable[..., Any], name: str) -> Iterator[PartsOfRun]:
+    """A part of ``run``, of which the declaration is checked; what this block changes in the process is a LawError."""
+    entry = _entry_of(kind, function, name)
+    _check_declaration(function, entry.name)
+    with same_process(entry.name), collected():
+        parts = PartsOfRun([entry])
+        parts.options(())
+        if parts.faults:
+            raise LawError(f"declares: {parts.faults[0]}")
+        yield parts
+
+
+def _entry_of(kind: Kind, function: Callable[..., Any], name: str) -> Entry:
+    return Entry(name or function.__name__, kind, function, function.__module__, "", "")
