@@ -439,8 +439,8 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
         return windows(recipe, Path("b.txt"))
 
     monkeypatch.setattr(training, "synthetic", synthetic)
-    done("train", "synthetic", "--walks", 1234, "--seed", 5, "--validate", "b.txt", "-o", "one")
-    done("train", "a.txt", "synthetic", "--walks", 1234, "--seed", 5, "--validate", "b.txt", "-o", "two")
+    done("train", "synthetic", "--walks", 1234, "--set", "seed=5", "--validate", "b.txt", "-o", "one")
+    done("train", "a.txt", "synthetic", "--walks", 1234, "--set", "seed=5", "--validate", "b.txt", "-o", "two")
     (recipe, made, *_, card, _, _, _, _, _), (_, both, *_, mixed, _, _, _, _, _) = given
     assert same(made, windows(recipe, Path("b.txt")))
     walks = f"1234 synthetic walks of mcaptrack {__version__}, seed 5"
