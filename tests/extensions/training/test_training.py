@@ -457,7 +457,7 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
     [
         ("--epochs 3 --set batch=9 --set rate=0.01", {"epochs": 3, "batch": 9, "rate": 0.01}, {}),
         (
-            "--set patience=4 --seed 6 --set consistency_weight=2",
+            "--set patience=4 --set seed=6 --set consistency_weight=2",
             {"patience": 4, "seed": 6, "consistency_weight": 2.0},
             {},
         ),
