@@ -93,7 +93,6 @@ CASES: dict[str, dict[str, Case]] = {
         person_height_m="--person-height-m 1.5",
         frame="--frame map",
         topic="--topic /none",
-        to="--to /camera/others",
         camera="--camera other",
         output="-o b.mcap",
         definitions=("run bare.mcap --no-tables --topic /t", "--definitions src"),
