@@ -327,7 +327,7 @@ def there(template, tmp_path) -> Path:
 def test_colours_are_stored_only_on_request_and_go_with_the_next_run_without_it(there):
     with log.Log(there) as opened:
         assert TOPIC not in opened.channels
-    done("retrack", there, "--store-appearance", "-q")
+    done("retrack", there, "--set", "store_appearance=true", "-q")
     with log.Log(there) as opened:
         rows = opened.frame_columns(TOPIC, APPEARANCE).rows()
         tracks = set(opened.frame_columns("/camera/retracks", TRACKS).rows()["track_id"].tolist())
@@ -373,7 +373,8 @@ def test_a_comparison_that_the_user_asks_for_is_contradicted_where_there_are_no_
     assert words in asked.err
     assert words not in usual.err
     assert (
-        "--store-appearance finds nothing to write: the log has no" in call("retrack", there, "--store-appearance").err
+        "--set store_appearance finds nothing to write: the log has no"
+        in call("retrack", there, "--set", "store_appearance=true").err
     )
 
 

@@ -110,6 +110,12 @@ class TestErrors:
             (["--predictor", "red"], "no such option: --predictor (run, predict, retrack have it)"),
             (["--min_iou", "0.5"], "no such option: --min_iou; did you mean --min-iou?"),
             (["--max-age", "2"], "no such option: --max-age; did you mean --max-age-s?"),
+            (["--across-classes"], "no such option: --across-classes (run has it); write --set across_classes=true"),
+            (
+                ["--frame", "map"],
+                "no such option: --frame (ingest, run have it); in Python mcaptrack.track has it: frame=...",
+            ),
+            (["--views"], "no such option: --views; in Python mcaptrack.track has it: views=True"),
             (["--max-age-s", "2s"], "invalid value for '--max-age-s': '2s' is not a number;"),
             (["--jobs", "2.5"], "invalid value for '--jobs': '2.5' is not a whole number;"),
         ):

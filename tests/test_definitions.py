@@ -309,7 +309,7 @@ def test_the_option_is_one_of_every_command_that_reads_messages(tmp_path):
     assert outcome.code == 0, outcome
     with log.read(tmp_path / "a.mcap") as opened:
         assert len(named_detections(opened, "/t").frames) == len(payloads)
-    for line in (["track"], ["run"], ["export"]):
+    for line in (["run"], ["export"]):
         outcome = call(*line, bare, "--topic", "/t", "--definitions", folder, "-o", tmp_path / f"{line[0]}.mcap")
         assert outcome.code == 0, outcome
         assert "which fits its messages" in outcome.err
@@ -318,7 +318,7 @@ def test_the_option_is_one_of_every_command_that_reads_messages(tmp_path):
         (tmp_path / "none", ": no folder, and not one of "),
         (tmp_path / "empty", ", which has no .msg"),
     ):
-        outcome = call("track", bare, "--definitions", wrong)
+        outcome = call("run", bare, "--definitions", wrong)
         assert outcome.code == 1
         assert f"--definitions names {wrong}{why}" in outcome.err
 
@@ -345,7 +345,7 @@ def test_a_definition_of_the_user_that_is_none_is_refused(tmp_path, name):
     (tmp_path / "defs" / "Detection2DArray.msg").write_bytes(text)
     _, payloads = message("vision_msgs/Detection2DArray")
     bare = write(tmp_path / "bare.mcap", "vision_msgs/msg/Detection2DArray", "ros2msg", "", payloads)
-    outcome = call("track", bare, "--topic", "/t", "--definitions", tmp_path / "defs")
+    outcome = call("run", bare, "--topic", "/t", "--definitions", tmp_path / "defs")
     assert (outcome.code, outcome.err.count("\n")) == (1, 1), outcome
     assert why in outcome.err
 

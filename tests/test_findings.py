@@ -180,6 +180,6 @@ def test_tracks_of_a_side_view_are_passed_on_with_a_warning(tmp_path):
     with log.read(path) as opened:
         samples, retracks = (opened.rows(f"/camera/{name}", TRACKS).rows for name in ("samples", "retracks"))
     assert_same_rows(retracks, samples)
-    insisted = json.loads(done("retrack", path, "--side-view", "--json", "-q").out)
+    insisted = json.loads(done("retrack", path, "--set", "side_view=true", "--json", "-q").out)
     assert "held-back" not in {one["code"] for one in insisted["warnings"]} | {code for _, code in kept(path)}
     assert provenance_of(path, "/camera/retracks").parameters["side_view"] is True

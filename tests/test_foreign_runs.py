@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+import mcaptrack
 from mcaptrack import log, pipeline
 from mcaptrack.api import recording
 from mcaptrack.errors import McaptrackError
@@ -40,7 +41,7 @@ def content(path: Path) -> dict[str, list]:
     return out
 
 
-def mcaptrack(*words: object) -> None:
+def in_place(*words: object) -> None:
     assert not GROUP([*map(str, words), "--in-place"], standalone_mode=False), words
 
 
@@ -75,8 +76,9 @@ def stamped(part: Any) -> int:
 @thorough
 def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
     before = content(robot)
-    for words in (("detect", "--topic", IMAGES), ("track",), ("retrack",)):
-        mcaptrack(words[0], robot, "-q", "--views", *words[1:])
+    mcaptrack.detect(robot, topic=IMAGES, sidecar=False, views=True)
+    mcaptrack.track(robot, sidecar=False, views=True)
+    mcaptrack.retrack(robot, sidecar=False, views=True)
     after = content(robot)
     assert after[IMAGES] == before[IMAGES]
     prefix = "/robot/front"
@@ -102,8 +104,8 @@ def test_stages_in_place_keep_all_channels_and_draw_at_capture_times(robot):
 @thorough
 def test_run_with_the_only_topic_equals_run_without_a_topic(robot, tmp_path):
     shutil.copy(robot, tmp_path / "b.mcap")
-    mcaptrack("run", robot, "-q", "--topic", IMAGES)
-    mcaptrack("run", tmp_path / "b.mcap", "-q")
+    in_place("run", robot, "-q", "--topic", IMAGES)
+    in_place("run", tmp_path / "b.mcap", "-q")
     assert robot.read_bytes() == (tmp_path / "b.mcap").read_bytes()
     assert (tmp_path / "robot.tables").is_dir()
 
@@ -117,9 +119,9 @@ def test_several_cameras_need_a_choice(tmp_path):
         f"{path} has no channel /camera/video for detect; it has pictures in /left/image, /right/image. "
         "choose one with `topic=`"
     )
-    mcaptrack("run", path, "-q", "--topic", "/left/image")
-    mcaptrack("detect", path, "-q", "--topic", "/right/image")
-    mcaptrack("track", path, "-q", "--camera", "right", "--views")
+    in_place("run", path, "-q", "--topic", "/left/image")
+    in_place("detect", path, "-q", "--topic", "/right/image")
+    mcaptrack.track(path, camera="right", sidecar=False, views=True)
     with log.read(path) as opened:
         assert pipeline.camera_at(opened, "/right").pictures == "/right/image"
         assert {"/left/retracks", "/right/tracks", "/right/tracks" + SUFFIX} <= set(opened.channels)
@@ -139,7 +141,7 @@ def test_recorded_channels_are_never_replaced(tmp_path):
             McaptrackError, match=r"/eye/detections is there and was recorded by others .*; leave `topic=` out"
         ):
             pipeline.plan_all(opened, "/eye", source="/eye/image")
-    mcaptrack("detect", path, "-q", "--topic", "/eye/image", "--to", "/eye/found", "--views")
+    mcaptrack.detect(path, topic="/eye/image", to="/eye/found", sidecar=False, views=True)
     assert content(path)["/eye/detections"] == content_of(before, tmp_path)["/eye/detections"]
     assert [stamped(m) for _, m in annotations(path, "/eye/found")] == [stamp_of(n) for n in range(50)]
 
@@ -167,9 +169,9 @@ def test_a_damaged_message_is_reported_and_the_log_left_unchanged(robot, tmp_pat
 def test_a_real_log_of_images_is_processed_in_place(data, tmp_path):
     path = Path(shutil.copyfile(data / "mcap/images/custom-camera-model.mcap", tmp_path / "real.mcap"))
     before = content(path)
-    mcaptrack("detect", path, "-q", "--topic", "/image/compressed")
-    mcaptrack("track", path, "-q")
-    mcaptrack("retrack", path, "-q")
+    in_place("detect", path, "-q", "--topic", "/image/compressed")
+    in_place("track", path, "-q")
+    in_place("retrack", path, "-q")
     after = content(path)
     assert {topic: after[topic] for topic in before} == before
     assert len(after["/image/detections"]) == 10

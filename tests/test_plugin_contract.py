@@ -153,7 +153,7 @@ def test_outputs_may_be_missing_or_more_and_go_with_their_class(logs, place, beg
     [
         ("retracker", "Full", (), "has an output 'full', which is a name of what is made of results"),
         ("retracker", "Wrong", (), "has an output 'online' of mcaptrack.Detections; that of a retracker has mcaptrack.Tr"),
-        ("retracker", "Same", ("--mode", "online"), "has no output online or predictions, so it can't run in this --mode"),
+        ("retracker", "Same", ("--set", "mode=online"), "has no output online or predictions, so it can't run in this --set mode"),
     ],
 )  # fmt: skip
 def test_outputs_that_can_not_be_are_refused_in_one_line(logs, place, kind, name, options, said):

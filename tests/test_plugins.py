@@ -324,7 +324,7 @@ def test_help_reads_no_file_of_settings(place):
 def test_tune_names_a_tracker_that_fails(place):
     """In a run, when it is made with values to try, and at the ends of a range."""
     (place / "gt.txt").write_text("".join(f"{n},1,10,10,5,5,1,-1,-1,-1\n" for n in range(1, 9)))
-    words = ("tune", "gt.txt", "--truth", "gt.txt", "--fps", "10", "--tracker", "single", "--trials", "2", "-q")
+    words = ("tune", "gt.txt", "--truth", "gt.txt", "--set", "fps=10", "--tracker", "single", "--trials", "2", "-q")
     text = MODULE.replace('"the id", least=0', '"the id", least=0, search=(0, 9)')
     install(text=text)
     done(*words)

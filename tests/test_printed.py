@@ -299,16 +299,16 @@ def of_mistakes(to: Transcript) -> None:
     for limit in ("idf1", "idf1=", "luck=1"):
         to.run(f"evaluate x.mcap --fail-under {limit}")
     for words in ("alpha", "alhpa=1", "alpha=x", "min_hits=1.5", "trim_ends=maybe", "alpha=1 --set alpha=2",
-                  "link_s=1 --link-s 2", "alpha=2 --profile paper"):  # fmt: skip
+                  "max_age_s=1 --max-age-s 2", "alpha=2 --profile paper"):  # fmt: skip
         to.run(f"retrack a.mcap --set {words}")
     for time in ("0", "0.0h", "-1", "1d", "m", "''", "1.", "'1 2'"):
-        to.run(f"check x.mcap --timeout={time}")
-    to.run("check x.mcap --ledger x.mcap")
+        to.run(f"run x.mcap --timeout={time}")
+    to.run("run x.mcap --ledger x.mcap")
     write_clip(Path("clip.mp4"), options={"bf": "0"})
-    for words in ("--quality 60", "--image-format jpeg --quality 0", "--image-format png --quality 9",
-                  "--image-format jpeg --keyframe-interval-s 1", "--keyframe-interval-s 0"):  # fmt: skip
+    for words in ("--set quality=60", "--image-format jpeg --set quality=0", "--image-format png --set quality=9",
+                  "--image-format jpeg --set keyframe_interval_s=1", "--set keyframe_interval_s=0"):  # fmt: skip
         to.run(f"ingest clip.mp4 -o c.mcap {words}")
-    to.run("ingest truth.txt -o c.mcap --quality 20")
+    to.run("ingest truth.txt -o c.mcap --set quality=20")
     to.lines.append(f"c.mcap is there: {Path('c.mcap').exists()}")
     to.run("run x.mcap", run=McaptrackError("give `fps=25` or `force=True`; `mcaptrack.run('a b.mcap', events=False)`"))
 

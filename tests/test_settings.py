@@ -58,6 +58,8 @@ def another(setting: Setting, default: Any) -> Any:
         return not default
     if get_origin(setting.kind) is Literal:
         one = next(name for name in get_args(setting.kind) if name != default)
+    elif setting.name == "set":
+        one = f"{next(iter(COMMANDS[setting.command].settable))}=1"
     elif setting.kind is str and isinstance(setting.declared.tuning, str):
         pattern = setting.declared.tuning
         one = next(word for word in ("cv", "25", "0.25", "min-iou", "car=40") if re.fullmatch(pattern, word))
@@ -177,6 +179,10 @@ class TestUnknownNames:
             assert f"the environment variable {variable} names no option; did you mean " in refused("info", "x.mcap")
             monkeypatch.delenv(variable)
 
+    def test_a_variable_of_a_parameter_without_an_option_is_refused_with_the_way(self, monkeypatch):
+        monkeypatch.setenv("MCAPTRACK_RETRACK_LINK_S", "2")
+        assert "names no option; write MCAPTRACK_RETRACK_SET=link_s=VALUE" in refused("info", "x.mcap")
+
     def test_a_variable_without_its_unit_is_refused(self, monkeypatch):
         monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")
         assert refused("run", "x.mcap").endswith("; did you mean MCAPTRACK_TRACK_MAX_AGE_S?\n")
@@ -244,12 +250,25 @@ class TestTrust:
                     assert f"[{command}] {setting.name}" in refused(command, *ARGUMENTS.get(command, ["x.mcap"]))
 
     def test_the_working_folder_may_be_the_config_folder(self, monkeypatch):
-        path = put(user_file(), '[info]\noutput = "a.txt"\n')
+        path = put(user_file(), '[cut]\noutput = "a.mcap"\n')
         monkeypatch.chdir(path.parent)
-        assert parsed("info")["output"] == "a.txt"
+        assert parsed("cut")["output"] == "a.mcap"
+
+    def test_set_may_set_there_what_options_may(self, folder):
+        """The file of a network is none of it, nor a predictor with weights; a threshold and a speed are."""
+        for command, text in (("detect", "file=evil.onnx"), ("retrack", "predictor=red:a.bin"), ("train", "classes=a")):
+            put(folder / "mcaptrack.toml", f'[{command}]\nset = ["{text}"]\n')
+            assert "may tune and nothing else" in refused(command, "x.mcap")
+        for command, text in (
+            ("detect", "overlap=0.1"),
+            ("track", "class_limits=car=40:1"),
+            ("retrack", "mode=online"),
+        ):
+            put(folder / "mcaptrack.toml", f'[{command}]\nset = ["{text}"]\n')
+            assert parsed(command)["set"] == [text]
 
     def test_a_link_to_a_file_is_not_trusted(self, folder):
-        other = put(folder.parent / "other.toml", '[info]\noutput = "a.txt"\n')
+        other = put(folder.parent / "other.toml", '[cut]\noutput = "a.mcap"\n')
         (folder / "mcaptrack.toml").symlink_to(other)
         assert "may tune and nothing else" in refused("info", "x.mcap")
 
@@ -266,6 +285,7 @@ class TestFiles:
         b"track = 1": "track is a command; write its options below [track]",
         b'[track]\n"a\\nb\\u001b[2J" = 1': r"track has no option a\nb\x1b[2J",
         b'[track]\ncost = "a\\nb\\u001b[2J"': r'track has no option cost; write set = ["cost=a\nb\x1b[2J"]',
+        b"[track]\nviews = true": "track has no option views; in Python mcaptrack.track has it: views=True",
         b"[track]\nmax-age-s = [1, 2, 3, 4, 5, 6, 7]": "[track] max-age-s needs a number, not [1, 2, 3, 4, 5, 6, ...]",
         b"[track]\nmin-iou = true": "[track] min-iou needs a number, not True",
         b"\0" * 100: "is not valid TOML: Invalid statement",

@@ -44,11 +44,11 @@ STEPS: dict[str, tuple[str, Retracking]] = {
         replace(AUTHORS, covariance="predictor", predictor="kalman", gate_m=3.0, alpha=1.0, beta=0.0),
     ),
     "likelihood, estimated noise": (
-        "--link-s 0 --set resolve_swaps=false --no-smooth --set track_confidence=0",
+        "--set link_s=0 --set resolve_swaps=false --no-smooth --set track_confidence=0",
         replace(DEFAULT, **_PLAIN),
     ),
     "+ false-track removal": (
-        "--link-s 0 --set resolve_swaps=false --no-smooth",
+        "--set link_s=0 --set resolve_swaps=false --no-smooth",
         replace(DEFAULT, **_PLAIN | {"track_confidence": 0.5}),
     ),
     "+ offline linking": ("--set resolve_swaps=false --no-smooth", replace(DEFAULT, resolve_swaps=False, smooth=False)),

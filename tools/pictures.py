@@ -197,7 +197,7 @@ def camera_motion(log: Path, folder: Path, swing_px: int = 160) -> Picture:
         path = folder / f"swing-{mode}.mcap"
         command("ingest", folder / "swing.mp4", "--detections", folder / "det.txt", "-o", path)
         command("motion", path)
-        command("track", path, "--camera-motion", mode)
+        command("track", path, "--set", f"camera_motion={mode}")
         with mcaptrack.open(path) as opened:
             parts.append(still(opened, 12.0, "tracks"))
     return grid(parts)

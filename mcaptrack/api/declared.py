@@ -67,9 +67,6 @@ class Option:
         Returns the values to complete.
     commas : bool
         Whether several values are one text on the command line, with commas between them.
-    is_set : bool
-        Whether the command has no option of its own for it: ``--set name=value`` sets it. This is for numbers, choices
-        and switches that tune, and that few users can choose a value for.
     help : str
         The meaning of the parameter, where the docstring of a function doesn't say it.
     """
@@ -85,7 +82,6 @@ class Option:
     shown: str | bool | None = None
     names: Callable[[], Sequence[str]] | None = None
     commas: bool = False
-    is_set: bool = False
     help: str = ""
 
 
@@ -144,7 +140,9 @@ class Words(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """A parameter as an option: its type there, its names, its help, and the default that the help shows."""
+    """A parameter as an option: its type there, its names, its help, the default that the help shows, and whether
+    ``--set`` sets it (``declared``).
+    """
 
     name: str
     kind: Any
@@ -154,6 +152,7 @@ class Parameter(NamedTuple):
     option: Option
     help: str
     shown: str | bool | None
+    is_set: bool = False
 
 
 @cache
@@ -187,14 +186,16 @@ def arguments_of(function: Callable[..., Any]) -> dict[str, Argument]:
 
 def options_of(function: Callable[..., Any]) -> list[Parameter]:
     """The parameters of a declared function that are options of its command, in order."""
-    doc, hints = words_of(function), hints_of(function)
+    doc, hints, settable = words_of(function), hints_of(function), getattr(function, "settable", ())
     flags = {name: _flag(name, hint) for name, hint in hints.items()}
-    return [
+    options = [
         parameter_of(name, hints[name], parameter.default, with_dashes(doc.parameters.get(name, [""])[0], flags))
         for name, parameter in inspect.signature(function).parameters.items()
         if parameter.kind is not parameter.VAR_KEYWORD
+        and name not in getattr(function, "python_only", ())
         and not any(isinstance(part, PythonOnly | Argument) for part in about(hints[name]))
     ]
+    return [option._replace(is_set=option.name in settable) for option in options]
 
 
 def _flag(name: str, hint: Any) -> str:
@@ -329,9 +330,18 @@ def done_by(command_line: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
 
 
 def declared(
-    *, most_used: tuple[str, ...] = (), heading: str = "", printed_by: str = "", more: _More | None = None
+    *,
+    most_used: tuple[str, ...] = (),
+    settable: tuple[str, ...] = (),
+    python_only: tuple[str, ...] = (),
+    heading: str = "",
+    printed_by: str = "",
+    more: _More | None = None,
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
     """Declare a command: a function that is ``checked``. The options ``most_used`` come first in its help.
+
+    The command has no options of its own for ``settable`` parameters, which few users can choose a value for:
+    ``--set name=value`` sets them. Those in ``python_only`` are options of other commands, and of this one in Python.
 
     What the annotations say of parameters that the docstring leaves out is added to it. ``heading`` is that of the
     command in ``mcaptrack --help``, which reads it from the source, and ``printed_by`` the class that prints the
@@ -345,7 +355,8 @@ def declared(
         if function.__doc__:  # there is none with python -OO
             function.__doc__ = _completed(function)
         call = checked(function)
-        vars(call).update(most_used=most_used, heading=heading, printed_by=printed_by)
+        vars(call).update(most_used=most_used, settable=settable, python_only=python_only)
+        vars(call).update(heading=heading, printed_by=printed_by)
         return call
 
     return decorate

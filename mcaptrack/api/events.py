@@ -26,6 +26,7 @@ from mcaptrack.choices import Similarity
 
 @declared(
     most_used=("topic", "similarity", "gate_m", "output", "force"),
+    python_only=("sidecar",),
     heading="Results",
     printed_by="mcaptrack.cli.running:Events",
 )

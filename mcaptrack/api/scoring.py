@@ -307,7 +307,7 @@ def _check_name(name: str, row: Mapping[str, Any]) -> None:
 _Gates = Annotated[float | Sequence[float] | Floats, replace(gate_m(), commas=True, tuning=r"[0-9.eE+, -]+")]
 
 
-@declared(heading="Results", printed_by="mcaptrack.cli.evaluate:Evaluate")
+@declared(settable=("rules", "smoothed", "point"), heading="Results", printed_by="mcaptrack.cli.evaluate:Evaluate")
 def evaluate(
     tracks: Annotated[
         PathLike | Sequence[PathLike],
@@ -319,8 +319,8 @@ def evaluate(
     similarity: Annotated[Similarity | None, similarity("both, as far as there are boxes and metres")] = None,
     gate_m: _Gates = DEFAULT_GATES_M,
     min_iou: MinIou = 0.5,
-    rules: Annotated[Rules, Option(SCORES, tuning=True, is_set=True)] = "trackeval",
-    smoothed: Annotated[bool, Option(SCORES, tuning=True, is_set=True)] = False,
+    rules: Annotated[Rules, Option(SCORES, tuning=True)] = "trackeval",
+    smoothed: Annotated[bool, Option(SCORES, tuning=True)] = False,
     topic: Annotated[str | Sequence[str] | None, Option(SCORES)] = None,
     label_format: labels.Format = "auto",
     columns: labels.Columns = None,

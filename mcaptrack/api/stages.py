@@ -42,7 +42,10 @@ Stages = Annotated[
 ]
 
 
-@declared(most_used=("detector", "threshold", "classes", "min_score", "output", "topic", "to", "camera", "force"))
+@declared(
+    most_used=("detector", "threshold", "classes", "min_score", "output", "topic", "to", "camera", "force"),
+    python_only=("definitions", "views"),
+)
 def detect(
     log: EachLog,
     *,
@@ -98,7 +101,7 @@ def detect(
     )  # fmt: skip
 
 
-@declared(most_used=("output", "topic", "to", "camera", "force"))
+@declared(most_used=("output", "topic", "to", "camera", "force"), python_only=("sidecar",))
 def motion(
     log: EachLog,
     *,
@@ -153,7 +156,10 @@ def motion(
     return run_stage("motion", chosen, log, topic, to, camera, output, sidecar, force, stages, progress)
 
 
-@declared(most_used=("tracker", "max_age_s", "min_hits_s", "min_iou", "min_score", "output", "topic", "to", "force"))
+@declared(
+    most_used=("tracker", "max_age_s", "min_hits_s", "min_iou", "min_score", "output", "topic", "to", "force"),
+    python_only=("frame", "map", "class_map", "definitions", "views"),
+)
 def track(
     log: EachLog,
     *,
@@ -216,7 +222,9 @@ def track(
     )  # fmt: skip
 
 
-@declared(most_used=("rate_hz", "max_gap_s", "output", "topic", "to", "camera", "force"))
+@declared(
+    most_used=("rate_hz", "max_gap_s", "output", "topic", "to", "camera", "force"), python_only=("sidecar", "views")
+)
 def sample(
     log: EachLog,
     *,
@@ -271,7 +279,9 @@ def sample(
     return run_stage("sample", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
 
 
-@declared(most_used=("predictor", "horizon_s", "output", "topic", "to", "camera", "force"))
+@declared(
+    most_used=("predictor", "horizon_s", "output", "topic", "to", "camera", "force"), python_only=("sidecar", "views")
+)
 def predict(
     log: EachLog,
     *,
@@ -328,7 +338,11 @@ def predict(
     return run_stage("predict", chosen, log, topic, to, camera, output, sidecar, force, stages, progress, views=views)
 
 
-@declared(most_used=("profile", "mode", "retracker", "predictor", "max_age_s", "output", "topic", "to", "force"))
+@declared(
+    most_used=("profile", "retracker", "predictor", "max_age_s", "output", "topic", "to", "force"),
+    settable=("mode",),
+    python_only=("views",),
+)
 def retrack(
     log: EachLog,
     *,

@@ -7,10 +7,11 @@ from dataclasses import Field, dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any, get_type_hints
 
-from mcaptrack.cli.command import Settable, is_on_command_line, listed, settings_of, values_set
+from mcaptrack.api.options import PLUGIN
+from mcaptrack.cli.command import Settable, is_on_command_line, is_option_given, listed, settings_of
 from mcaptrack.errors import McaptrackError
 from mcaptrack.transforms import STAGES, Stage, Transform
-from mcaptrack.transforms.protocol import bare_type, member_type
+from mcaptrack.transforms.protocol import bare_type, choices, member_type
 
 
 def options_of(kind: type[Transform]) -> dict[str, Field[Any]]:
@@ -23,9 +24,17 @@ def settable_of(kinds: Mapping[str, type[Transform]]) -> dict[str, Settable]:
     out = {}
     for kind in reversed(list(kinds.values())):
         hints = get_type_hints(kind)
-        for name in options_of(kind):
-            out[name] = Settable(*member_type(hints[name]), bare_type(hints[name]) is not hints[name])
+        for name, declared in options_of(kind).items():
+            hint = hints[name]
+            member, many = member_type(hint)
+            out[name] = Settable(member, many, bare_type(hint) is not hint, tuning_of(declared, member))
     return out
+
+
+def tuning_of(field: Field[Any], member: Any) -> bool | str:
+    """Return ``Option.tuning`` of a parameter of a transform, with values of the type ``member``."""
+    about = field.metadata
+    return PLUGIN if about.get("kind") else about.get("pattern") or bool(choices(member)) or member is not str
 
 
 def has_flag(field: Field[Any]) -> bool:
@@ -67,11 +76,10 @@ class Maker:
         owners: Mapping[str, list[str]] = MappingProxyType({}),
     ) -> Maker:
         """Return a maker for ``options`` of a command; those of the running one have ``owners``."""
-        flags = {name: f"--{name.replace('_', '-')}" if name in options else f"--set {name}" for name in owners}
         typed = {
-            name: flags[name]
+            name: f"--{name.replace('_', '-')}" if is_option_given(name) else f"--set {name}"
             for name in wanted
-            if name in owners and is_on_command_line(name if name in options else "set")
+            if name in owners and is_on_command_line(name)
         }
         chosen = (options.get(stage.kind) if stage.kind else "") or ""
         return cls(stage.name, chosen, options.get("profile") or "", wanted, typed, dict(owners))
@@ -114,9 +122,7 @@ def configured(chosen: Mapping[str, str] = MappingProxyType({})) -> dict[str, Tr
         if not wanted:
             continue
         own = {option for kind in stage.built_in().values() for option in options_of(kind)}
-        chosen_plugin = settings.get(stage.kind) if stage.kind else None
-        kinds = dict(stage.built_in()) | ({chosen_plugin: stage.find(chosen_plugin).cls} if chosen_plugin else {})
-        wanted |= values_set(stage.name, wanted.pop("set", None), settable_of(kinds))
+        wanted |= wanted.pop("set", {})
         if wanted.keys() & {*own, stage.option, "profile"}:
             out[stage.name] = Maker.of(stage, settings, wanted)()
     return out

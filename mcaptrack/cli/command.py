@@ -11,10 +11,20 @@ from typing import Annotated, Any, Final, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperOption
 
-from mcaptrack.api.declared import Option, Parameter
+from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.help import ALL, HELP, LAST_PANELS, write_page
-from mcaptrack.cli.settings import SWITCH, Given, Setting, declared_settings, found_of, gather, nearest
+from mcaptrack.cli.settings import (
+    SWITCH,
+    Elsewhere,
+    Given,
+    Setting,
+    declared_settings,
+    found_of,
+    gather,
+    nearest,
+    other_way,
+)
 from mcaptrack.cli.text import refuse_usage, say
 from mcaptrack.errors import similar
 from mcaptrack.installed import missing_extension
@@ -76,9 +86,9 @@ def _unknown_option(error: Any) -> str:
     begin = f"--{name.removeprefix('--').replace('_', '-')}-"
     if len(alike := [option for option in own_options if option.startswith(begin)]) > 1:
         return f"{text}; did you mean {' or '.join(alike)}?"
-    parameter = name.removeprefix("--").removeprefix("no-").replace("-", "_")
-    is_set = parameter in getattr(context.command, "settable", ())
-    meant = f"--set {parameter}=VALUE" if is_set else similar(name, own_options, 0.75)
+    if way := other_way(context.command, name):
+        return f"{text}; {way}"
+    meant = similar(name, own_options, 0.75)
     return f"{text}; did you mean {meant}?" if meant else text
 
 
@@ -95,7 +105,8 @@ class Command(TyperCommand):
         self.parameters: tuple[Parameter, ...] = function.parameters
         self.settings = declared_settings(name, self.parameters)
         self.most_used: tuple[str, ...] = function.most_used
-        self.settable: tuple[str, ...] = function.settable
+        self.elsewhere: Mapping[str, Elsewhere] = function.elsewhere
+        self.settable: Mapping[str, Settable] = function.settable
         self.set_parameters: list[Parameter] = function.set_parameters
         self._function = function
         self._help_all: Any = None
@@ -223,7 +234,10 @@ def converted(context: Any, command: str) -> dict[str, Any]:
 
 
 def settings_of(command: str) -> dict[str, Any]:
-    """Return the values that environment and files set for another command (a stage that the running one runs)."""
+    """Return the values that environment and files set for another command (a stage that the running one runs).
+
+    Those of ``set`` are values by parameter.
+    """
     context: Any = RUNNING.get()
     if not (set_values := found_of(command)):
         return {}
@@ -232,7 +246,7 @@ def settings_of(command: str) -> dict[str, Any]:
     for setting in other.settings.values():
         place = set_values[setting.parameter][1].where if setting.parameter in set_values else ""
         setting.check(values.get(setting.parameter), place)
-    return values
+    return values | ({"set": values_set(command, values["set"], other.settable)} if values.get("set") else {})
 
 
 def check_ranges(values: Mapping[str, Any]) -> None:
@@ -246,6 +260,14 @@ def check_ranges(values: Mapping[str, Any]) -> None:
 
 
 def is_on_command_line(parameter: str) -> bool:
+    """Whether a parameter of the running command was given on its command line: by its option, or by ``--set``."""
+    if is_option_given(parameter):
+        return True
+    texts = (RUNNING.get().params["set"] or ()) if is_option_given("set") else ()
+    return parameter in (_parameter_of(text.partition("=")[0]) for text in texts)
+
+
+def is_option_given(parameter: str) -> bool:
     """Whether an option of the running command was given on its command line."""
     context = RUNNING.get()
     source = context.get_parameter_source(parameter) if context is not None else None
@@ -254,33 +276,40 @@ def is_on_command_line(parameter: str) -> bool:
 
 def warn_unused(reason: str, *parameters: str) -> None:
     """Warn of options on the command line that have no effect in this call; ``reason`` says why."""
-    command: Any = RUNNING.get().command
-    for setting in command.settings.values():
-        if setting.parameter in parameters and is_on_command_line(setting.parameter):
-            warn(f"--{setting.name} changes nothing here: {reason}", "option-not-used")
+    for parameter in filter(is_on_command_line, parameters):
+        warn(f"`{parameter}=` changes nothing here: {reason}", "option-not-used")
 
 
 # Parameters without an option of their own.
 
 
-Set = Annotated[
-    Sequence[str] | None,
-    Option(
-        tuning=r"[A-Za-z0-9_-]+=[A-Za-z0-9_.,+ -]*",
+def set_option(settable: Mapping[str, Settable]) -> Parameter:
+    """Return the option ``--set``. A file in the working folder may set by it what it may set by other options."""
+    tuned = {name.replace("_", "[_-]"): about.tuning for name, about in settable.items() if about.tuning}
+    patterns = (f"{name}=({_TUNED if tuning is True else tuning})" for name, tuning in tuned.items())
+    option = Option(
+        tuning="|".join(patterns),
         metavar="NAME=VALUE",
         shown=False,
         help="Set a parameter that has no option of its own, as often as needed; `mcaptrack docs options` lists them.",
-    ),
-]
+    )
+    return parameter_of("set", Annotated[Sequence[str] | None, option], None)
+
+
+#: Numbers, names and switches, as text.
+_TUNED: Final = r"[A-Za-z0-9_.,+ -]*"
 _KIND_WORDS: Final = {bool: "true or false", int: "a whole number", float: "a number"}
 
 
 class Settable(NamedTuple):
-    """A parameter that ``--set`` sets: the type of one value, and whether it may have several, and be None."""
+    """A parameter that ``--set`` sets: the type of one value, whether it may have several, and be None, and who may set
+    it (``Option.tuning``).
+    """
 
     kind: Any
     many: bool = False
     may_be_none: bool = True
+    tuning: bool | str = False
 
     def read(self, value: str) -> Any:
         """The value that a text gives. Raises ValueError that says what it should be."""
@@ -309,7 +338,7 @@ def values_set(command: str, texts: Sequence[str] | None, parameters: Mapping[st
     values: dict[str, Any] = {}
     for text in texts or ():
         written, equals, value = text.partition("=")
-        name = written.strip().lstrip("-").replace("-", "_")
+        name = _parameter_of(written)
         if not equals or not name:
             refuse_usage(f"{where} needs name=value, as in --set {name or 'name'}=0.5, not {text!r}")
         if name not in parameters:
@@ -322,6 +351,11 @@ def values_set(command: str, texts: Sequence[str] | None, parameters: Mapping[st
         except ValueError as error:
             refuse_usage(f"{where} {text}: {value.strip()!r} is not {error}")
     return values
+
+
+def _parameter_of(written: str) -> str:
+    """Return the parameter that a text for ``--set`` names."""
+    return written.strip().lstrip("-").replace("-", "_")
 
 
 def listed(names: Sequence[str]) -> str:

@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Final, Generic, TypeVar, get_type_hints
 
 import typer
@@ -30,8 +31,9 @@ from mcaptrack.api.declared import (
 )
 from mcaptrack.api.options import FILES, Force, PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import Set, Settable, values_set
+from mcaptrack.cli.command import Settable, set_option, values_set
 from mcaptrack.cli.help import LAST_PANELS, arranged
+from mcaptrack.cli.settings import Elsewhere
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 from mcaptrack.registry import blamed, find
@@ -103,8 +105,8 @@ class Called(Generic[T]):
         return own if entry.is_built_in else OfPackage(self.name)
 
     @classmethod
-    def options(cls) -> list[Parameter]:
-        """Return the options that the function has no use for."""
+    def options(cls, name: str) -> list[Parameter]:
+        """Return the options of a command that its function has no use for."""
         return parameters_of(cls.More)
 
     @classmethod
@@ -114,7 +116,7 @@ class Called(Generic[T]):
         names = {option.name: option.name for option in options_of(declared)}
         placed = arguments_of(declared).items()
         names |= {parameter: about.name for parameter, about in placed if not isinstance(about, OneOfMany)}
-        return command(name, declared, lambda values: cls(name, values).run(names), cls.options(), cls.most_used)
+        return command(name, declared, lambda values: cls(name, values).run(names), cls.options(name), cls.most_used)
 
     def arguments(self, names: Mapping[str, str]) -> dict[str, Any]:
         """Return the arguments of the function; ``names`` has the name on the command line of each."""
@@ -171,17 +173,20 @@ def command(
     run: Callable[[Mapping[str, Any]], None],
     more: Iterable[Parameter],
     most_used: tuple[str, ...] = (),
+    settable: Mapping[str, Settable] = MappingProxyType({}),
 ) -> Callable[..., None]:
     """Return the function of a command, with the signature of a declared function as Typer takes it.
 
-    ``more`` are options that the function lacks. ``run`` gets the values of all.
+    ``more`` are options that the function lacks, ``settable`` such parameters of ``--set``. ``run`` gets the values of
+    all, and of ``set`` by parameter.
     """
     hints, signature = hints_of(declared), inspect.signature(declared).parameters
     every = {option.name: option for option in (*options_of(declared), *more, *parameters_of(OfAll))}
-    settable = {name: Settable(each.kind, each.many) for name, each in every.items() if each.option.is_set}
-    parameters = {name: option for name, option in every.items() if name not in settable}
+    own = {name: each for name, each in every.items() if each.is_set}
+    parameters = {name: option for name, option in every.items() if name not in own}
+    settable = {**settable, **{name: Settable(e.kind, e.many, tuning=e.option.tuning) for name, e in own.items()}}
     if settable:
-        parameters["set"] = parameter_of("set", Set, None)
+        parameters["set"] = set_option(settable)
     most_used = most_used or getattr(declared, "most_used", ())
     options = arranged(most_used, parameters.values())
     arguments = [
@@ -192,8 +197,9 @@ def command(
     annotations |= {option.name: (annotation_of(option), option.default) for option in options}
 
     def call(**values: Any) -> None:
-        defaults = {parameter: every[parameter].default for parameter in settable}
-        run(values | defaults | (values_set(name, values["set"], settable) if settable else {}))
+        defaults = {parameter: each.default for parameter, each in own.items()}
+        texts = values_set(name, values["set"], settable) if settable else {}
+        run(values | defaults | {each: texts[each] for each in own if each in texts} | {"set": texts})
 
     keyword = inspect.Parameter.KEYWORD_ONLY
     function: Any = common.one_line(call)
@@ -201,11 +207,27 @@ def command(
         [inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in annotations.items()]
     )
     function.__name__, function.__annotations__ = name, {n: hint for n, (hint, _) in annotations.items()}
-    function.parameters, function.settable = tuple(options), tuple(settable)
-    function.set_parameters = [every[parameter] for parameter in settable]
+    in_python = [
+        parameter_of(each, hints[each], signature[each].default) for each in getattr(declared, "python_only", ())
+    ]
+    flagless = [parameter_of(each, about.kind, None) for each, about in settable.items() if each not in parameters]
+    function.parameters, function.settable, function.set_parameters = tuple(options), settable, [*own.values()]
+    function.elsewhere = dict(
+        [*_elsewhere([*flagless, *own.values()], is_set=True), *_elsewhere(in_python, is_set=False)]
+    )
     function.help, function.most_used = help_of(declared), most_used
     function.places = [(usage, about.metavar, about.text) for about, usage, *_ in arguments]
     return function  # type: ignore[no-any-return]
+
+
+def _elsewhere(parameters: Iterable[Parameter], *, is_set: bool) -> Iterator[tuple[str, Elsewhere]]:
+    """Yield the flags that parameters would have as options, and how they are given instead."""
+    on, off = ("true", "false") if is_set else ("True", "False")
+    for each in parameters:
+        flag, _, negative = each.flags[0].partition("/")
+        yield flag, Elsewhere(each.name, on if each.kind is bool else "VALUE" if is_set else "...", is_set)
+        if negative:
+            yield negative, Elsewhere(each.name, off, is_set)
 
 
 def parameters_of(options: type) -> list[Parameter]:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from mcaptrack.api.declared import Argument, declared
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import Once, Printed
+from mcaptrack.cli.declared import Once
 from mcaptrack.cli.generated import PARTS, with_parts
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError, did_you_mean
@@ -65,8 +65,6 @@ def documentation(
 class Docs(Once[Pages]):
     """List the pages, or print one."""
 
-    More = Printed
-
     def data(self, done: Pages) -> dict[str, Any]:
         """Return the list, or the page, as values of JSON."""
         titles = [{"name": name, "title": _title(path)} for name, path in done.items()]
@@ -77,7 +75,7 @@ class Docs(Once[Pages]):
         if self.values["page"] is None:
             width = max(map(len, done)) + 2
             show(*(f"{name:<{width}}{_title(path)}" for name, path in done.items()))
-        elif self.values["output"] is None and sys.stdout.isatty():
+        elif sys.stdout.isatty():
             from rich.markdown import Markdown
 
             console().print(Markdown(_text(done)))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import Once, Printed
+from mcaptrack.cli.declared import Once
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import counted, print_table, refuse_usage, show
 from mcaptrack.errors import command, list_names
@@ -29,7 +29,6 @@ class Check(EachLog["LogCheck"]):
     """Check logs; the findings are printed at the end."""
 
     writes = False
-    More = Printed
 
     def show(self, log: Location, done: LogCheck, talk: common.Talk) -> None:
         """Print nothing yet."""

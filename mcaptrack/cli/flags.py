@@ -36,7 +36,12 @@ def _command(match: re.Match[str]) -> str:
     arguments_: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
     for parameter, value in options.items():
         flag = flag_of(parameter, value, parts[0])
-        arguments_ += [flag] if isinstance(value, bool) else [flag, str(value)]
+        if flag.endswith("="):  # Python alone has it
+            return match[0]
+        if flag.startswith("--set "):
+            arguments_ += ["--set", f"{parameter}={_text(value)}"]
+        else:
+            arguments_ += [flag] if isinstance(value, bool) else [flag, str(value)]
     flags = [part for part in parts if part.startswith("-")]
     return command(*(part for part in parts if part not in flags), *arguments_, *flags)
 
@@ -51,8 +56,14 @@ def _option(match: re.Match[str]) -> str:
         return match[0]
     flag = flag_of(parameter, value)
     if flag.startswith("--set "):
-        return f"{flag}={value}"
+        return f"{flag}={_text(value)}"
+    if flag.endswith("="):
+        return f"{flag}{value!r} in Python"
     return flag if isinstance(value, bool) else f"{flag} {value}"
+
+
+def _text(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def flag_of(parameter: str, value: object = None, name: str = "") -> str:
@@ -64,5 +75,7 @@ def flag_of(parameter: str, value: object = None, name: str = "") -> str:
         if option.name == parameter and option.param_type_name == "option":
             names = option.secondary_opts if value is False and option.secondary_opts else option.opts
             return str(min(names, key=len))
-    is_set = parameter in getattr(running, "settable", ())
-    return f"--set {parameter}" if is_set else f"--{parameter.replace('_', '-')}"
+    for elsewhere in getattr(running, "elsewhere", {}).values():
+        if elsewhere.parameter == parameter:
+            return f"--set {parameter}" if elsewhere.is_set else f"{parameter}="
+    return f"--{parameter.replace('_', '-')}"

@@ -64,7 +64,7 @@ def class_of(name: str) -> type[Called[Any]]:
         kind: type[Called[Any]] = load(str(entry), entry.cls.printed_by) if entry.cls.printed_by else usual
         if not entry.is_built_in:
             own = {option.name for option in options_of(entry.cls)}
-            if taken := sorted(own & {option.name for option in (*kind.options(), *parameters_of(OfAll))}):
+            if taken := sorted(own & {option.name for option in (*kind.options(name), *parameters_of(OfAll))}):
                 raise McaptrackError(f"a parameter can't have the name of the option {', '.join(taken)}")
             kind.function_of(name)
     return kind

@@ -81,6 +81,8 @@ class ManyOptions:
 
 
 NAMES: Final = tuple(field.name for field in fields(ManyOptions))
+#: Commands that take long on many logs; the others have no ledger and no time limit (`mcaptrack.fleet.run` has).
+_OF_FLEETS: Final = ("run", "ingest", "detect", "retrack", "export")
 
 
 class EachLog(Called[T]):
@@ -106,9 +108,10 @@ class EachLog(Called[T]):
         self.many = ManyOptions(**{option: values[option] for option in NAMES if option in values})
 
     @classmethod
-    def options(cls) -> list[Parameter]:
+    def options(cls, name: str) -> list[Parameter]:
         """Return the options that the function has no use for: also those for many logs."""
-        return [*super().options(), *parameters_of(ManyOptions)]
+        own = NAMES if name in _OF_FLEETS else ("jobs",)
+        return [*super().options(name), *(option for option in parameters_of(ManyOptions) if option.name in own)]
 
     def logs(self) -> Sequence[NamedLog]:
         """Return the inputs."""

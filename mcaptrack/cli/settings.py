@@ -106,9 +106,19 @@ class Setting:
 
 
 class HasSettings(Protocol):
-    """A command: ``settings`` are its options by name."""
+    """A command: ``settings`` are its options by name, ``elsewhere`` has other parameters by the flags of options."""
 
+    name: str | None
     settings: dict[str, Setting]
+    elsewhere: Mapping[str, Elsewhere]
+
+
+class Elsewhere(NamedTuple):
+    """A parameter without an option: ``--set`` sets it, or Python alone does. ``value`` is what its flag would set."""
+
+    parameter: str
+    value: str
+    is_set: bool
 
 
 #: Commands by name. One is made when it is looked up, so only those are that the environment and files name.
@@ -155,7 +165,8 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
             variables = [each.variable for other in commands for each in commands[other].settings.values()]
             option = name.removeprefix(f"{PREFIX}{command.upper()}_").lower()
             missing = missing_extension(command) or missing_extension(option)
-            hint = f"; {missing}" if missing else nearest(name, [*variables, *VARIABLES])
+            way = other_way(commands[command], option, f"{PREFIX}{command.upper()}_SET=") if command in commands else ""
+            hint = f"; {missing or way}" if missing or way else nearest(name, [*variables, *VARIABLES])
             refuse_usage(f"the environment variable {name} names no option{hint}")
         if not text:
             continue
@@ -178,8 +189,8 @@ def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Sett
         for key, value in values.items():
             name = key.replace("_", "-")
             if name not in own:
-                settable = key.replace("-", "_") in getattr(commands[command], "settable", ())
-                hint = f'; write set = ["{key}={value}"]' if settable else nearest(name, own)
+                way = other_way(commands[command], name, 'set = ["', f'={value}"]')
+                hint = f"; {way}" if way else nearest(name, own)
                 refuse_usage(f"{file.path}: {command} has no option {key}{hint}")
             where = f"{file.path}: [{command}] {key}"
             try:
@@ -208,6 +219,19 @@ def found_of(command: str) -> dict[str, tuple[Setting, Given]]:
         return {}
     settings = commands[command].settings
     return {settings[name].parameter: (settings[name], set_value) for name, set_value in values_set[command].items()}
+
+
+def other_way(command: HasSettings, name: str, start: str = "--set ", end: str = "") -> str:
+    """Return how a parameter of a command is given that has no option there; "" if there is no such parameter.
+
+    ``name`` is that of its flag. Text that sets it begins with ``start``, and its value ends with ``end``.
+    """
+    elsewhere = command.elsewhere.get(f"--{name.removeprefix('--').replace('_', '-')}")
+    if elsewhere is None:
+        return ""
+    if elsewhere.is_set:
+        return f"write {start}{elsewhere.parameter}{end or f'={elsewhere.value}'}"
+    return f"in Python mcaptrack.{command.name} has it: {elsewhere.parameter}={elsewhere.value}"
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

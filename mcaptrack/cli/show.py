@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.declared import Printed
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.text import console, counted, print_table, printable, show_left_out
 from mcaptrack.geometry.clocks import FIRST_DATE_NS
@@ -28,7 +27,6 @@ class Info(EachLog["LogInfo"]):
 
     writes = False
     prints_results = True
-    More = Printed
 
     def show(self, log: Location, done: LogInfo, talk: common.Talk) -> None:
         """Print the channels."""

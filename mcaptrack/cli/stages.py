@@ -6,7 +6,7 @@ import inspect
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field
 from functools import partial
 from types import MappingProxyType
@@ -14,25 +14,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
-from mcaptrack.api.options import PLUGIN
-from mcaptrack.cli.chosen import Maker, configured, has_flag, options_of, settable_of
-from mcaptrack.cli.command import Set, is_on_command_line, listed, values_set
+from mcaptrack.cli.chosen import Maker, configured, has_flag, options_of, settable_of, tuning_of
+from mcaptrack.cli.command import is_option_given, listed
 from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
 from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.errors import McaptrackError
 from mcaptrack.registry import titled
 from mcaptrack.transforms import STAGES, Stage, Transform
-from mcaptrack.transforms.protocol import choices, member_type
+from mcaptrack.transforms.protocol import member_type
 
 if TYPE_CHECKING:
     from mcaptrack import RunResult
 
 
 #: Arguments of ``run_stage`` that commands have as options.
-_WHERE: Final = (
-    "topic", "to", "frame", "class_map", "camera", "output", "definitions", "sidecar", "views", "force", "mode",
-)  # fmt: skip
+_WHERE: Final = ("topic", "to", "camera", "output", "sidecar", "force", "mode")
 
 
 class StageCommand(RunsStages):
@@ -66,8 +63,8 @@ class StageCommand(RunsStages):
         """Return the arguments of the function, and make the transform, unless the boxes of a log decide which."""
         stage, owners = STAGES[self.name], _owners(self.kinds)
         wanted = {option: self.values[option] for option in owners if self.values.get(option) is not None}
-        for option, value in values_set(self.name, self.values.get("set"), settable_of(self.kinds)).items():
-            if option in wanted and is_on_command_line(option):
+        for option, value in self.values["set"].items():
+            if option in wanted and is_option_given(option):
                 raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
             wanted[option] = value
         make = Maker.of(stage, self.values, wanted, owners)
@@ -75,7 +72,6 @@ class StageCommand(RunsStages):
             is_open = stage.kind == "tracker" and not self.values["tracker"]  # the boxes of a log decide
             self._transform = None if is_open else make()
             arguments: dict[str, Any] = {"stages": configured(), "make": make}
-        arguments |= {"fields": self.values["map"]} if "map" in names else {}
         return arguments | {name: self.values[name] for name in _WHERE if name in names}
 
     @classmethod
@@ -85,8 +81,7 @@ class StageCommand(RunsStages):
         """Return the function of the command, with the options of ``plugins``: transforms of other packages."""
         stage, declared = STAGES[name], cls.declaration(name)
         kinds, own = {**plugins, **stage.built_in()}, options_of_function(declared)
-        options, settable = _options(stage, kinds)
-        more = [*options, *cls.options()]
+        more = [*_options(stage, kinds), *cls.options(name)]
         flags = Counter(flag for option in (*own, *more, *parameters_of(OfAll)) for flag in _flags(option))
         flags += Counter(["help", "help-all", "logs"])
         if twice := {flag.replace("-", "_") for flag, count in flags.items() if count > 1}:
@@ -94,8 +89,12 @@ class StageCommand(RunsStages):
             text = f"{owners} can't have a parameter {' or '.join(sorted(twice))}"
             raise McaptrackError(f"{text}: that is the name of an option of {name}")
         names = {option.name: option.name for option in own}
-        function: Any = command(name, declared, lambda given: cls(name, given, kinds).run(names), more)
-        function.help, function.settable = stage_help(stage, help_of(declared), plugins), settable
+        flagless = any(not has_flag(field) for kind in kinds.values() for field in options_of(kind).values())
+        settable = settable_of(kinds) if flagless else {}
+        function: Any = command(
+            name, declared, lambda given: cls(name, given, kinds).run(names), more, settable=settable
+        )
+        function.help = stage_help(stage, help_of(declared), plugins)
         return function  # type: ignore[no-any-return]
 
 
@@ -108,21 +107,14 @@ def _owners(kinds: Mapping[str, type[Transform]]) -> dict[str, list[str]]:
     return owners
 
 
-def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> tuple[list[Parameter], tuple[str, ...]]:
-    """The options for the transforms of a stage, and the parameters that only ``--set`` sets."""
-    options = []
-    settable = []
+def _options(stage: Stage, kinds: Mapping[str, type[Transform]]) -> Iterator[Parameter]:
+    """Yield the options for the transforms of a stage, without the parameters that only ``--set`` sets."""
     for name, having in _owners(kinds).items():
         field = options_of(kinds[having[0]])[name]
         if has_flag(field):
             is_shared = set(stage.built_in()) <= set(having)
             hint = hint_of(kinds[having[0]], field, () if is_shared else having)
-            options.append(parameter_of(name, hint, None))
-        else:
-            settable.append(name)
-    if settable:
-        options.append(parameter_of("set", Set, None))
-    return options, tuple(settable)
+            yield parameter_of(name, hint, None)
 
 
 def stage_help(stage: Stage, text: str, plugins: Mapping[str, type[Transform]] = MappingProxyType({})) -> str:
@@ -161,7 +153,7 @@ def hint_of(kind: type[Transform], field: Field[Any], of: Sequence[str] = ()) ->
         _panel(about.get("theme", ""), of),
         about.get("least", -math.inf),
         about.get("most", math.inf),
-        tuning=PLUGIN if about.get("kind") else about.get("pattern") or bool(choices(member)) or member is not str,
+        tuning=tuning_of(field, member),
         shown=shown_default(field.default_factory() if field.default_factory is not MISSING else field.default),
         help=f"{text[:1].upper()}{text[1:]}.",
     )

@@ -656,8 +656,8 @@ class GroundTracker:
     min_iou: float = option(0.05, least=0.0, most=1.0, theme=_ASSOCIATION)
     min_score: float | None = option(None, theme=_DETECTIONS)
     class_id: int | None = setting(None, least=0, most=2**31 - 1, theme=_DETECTIONS)
-    across_classes: bool = option(False, theme=_DETECTIONS)
-    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_ASSOCIATION)
+    across_classes: bool = setting(False, theme=_DETECTIONS)
+    class_limits: str = setting("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_ASSOCIATION)
     class_names: ClassNames = context(tuple, is_recorded=False)
 
     reads: ClassVar[Schema] = DETECTIONS

@@ -97,7 +97,7 @@ class Predict:
     horizon_s: float = option(4.8, least=0.1, most=60.0)
     min_history: int = setting(4, least=1, most=100)
     adapt: bool = setting(True, ADAPT_HELP)
-    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN)
+    class_limits: str = setting("", LIMITS_HELP, pattern=LIMITS_PATTERN)
     rate_hz: float = context(lambda: 2.5)
     class_names: ClassNames = context(tuple, is_recorded=False)
 

@@ -28,26 +28,18 @@ def common(base: str, **others: str | tuple[str, str]) -> dict[str, Case]:
     return cases(base, json="--json", quiet=(f"{base} -v", "-q"), verbose="-v") | cases(base, **others)
 
 
-def of_boxes(command: str) -> dict[str, Case]:
-    """The options of commands that read boxes of other software."""
-    base = f"{command} things.mcap --topic /things"
-    other = "left=things[].top,top=things[].left,w=things[].right,h=things[].bottom"
-    return {"map": (base, f"--map {other}"), "class_map": (base, "--class-map 7=person")}
-
-
 def stage(command: str, **others: str | tuple[str, str]) -> dict[str, Case]:
     """The options of a stage that its transform doesn't declare."""
     base = f"{command} a.mcap"
     return common(
         base, topic="--topic /other/detections" if command == "track" else "--topic /none", to="--to /camera/others",
-        camera="--camera other", output="-o b.mcap", sidecar="--sidecar", force=(f"{base} -o fresh.mcap", "--force"),
-        **({"frame": "--frame map"} if command == "track" else {}),
-        **({"definitions": (f"{command} bare.mcap --topic /t", "--definitions src")} if command in ("detect", "track") else {}),
-        **(of_boxes("track") if command == "track" else {}),
-        **({} if command == "motion" else {"views": "--views"}), **others,
+        camera="--camera other", output="-o b.mcap", force=(f"{base} -o fresh.mcap", "--force"),
+        **({"sidecar": "--sidecar"} if command in ("detect", "track", "retrack") else {}), **others,
     )  # fmt: skip
 
 
+_OF_OTHERS = "run --no-tables things.mcap --topic /things"
+_FIELDS = "left=things[].top,top=things[].left,w=things[].right,h=things[].bottom"
 SCORED = "evaluate tall.txt --truth truth.txt"
 
 
@@ -55,15 +47,12 @@ SCORED = "evaluate tall.txt --truth truth.txt"
 CASES: dict[str, dict[str, Case]] = {
     "ingest": common(
         "ingest clip.mp4",
-        keyframe_interval_s="--keyframe-interval-s 0.5",
-        calibration_unit=("ingest clip.mp4 --calibration pose.yml", "--calibration-unit cm"),
         output="-o b.mcap",
         camera="--camera left",
         fps="--fps 5",
         start_time="--start-time 2026-05-01T12:00:00Z",
         image_format="--image-format jpeg",
-        quality="--quality 40",
-        stream="--stream 0",
+        set="--set quality=40",
         ground_plane="--ground-plane plane.txt",
         calibration="--calibration pose.yml",
         calibration_name=("ingest clip.mp4 --camera cam0 --calibration camchain.yaml", "--calibration-name cam1"),
@@ -96,8 +85,7 @@ CASES: dict[str, dict[str, Case]] = {
         "retrack",
         retracker="--retracker none",
         profile="--profile paper",
-        mode="--mode online",
-        set="--set track_confidence=1",
+        set="--set mode=online --set track_confidence=1",
     ),
     "run": common(
         "run fresh.mcap --no-tables",
@@ -108,7 +96,8 @@ CASES: dict[str, dict[str, Case]] = {
         camera="--camera other",
         output="-o b.mcap",
         definitions=("run bare.mcap --no-tables --topic /t", "--definitions src"),
-        **of_boxes("run --no-tables"),
+        map=(_OF_OTHERS, f"--map {_FIELDS}"),
+        class_map=(_OF_OTHERS, "--class-map 7=person"),
         sidecar="--sidecar",
         events="--no-events",
         **of_extensions("OPTIONS_OF_RUN"),
@@ -132,7 +121,6 @@ CASES: dict[str, dict[str, Case]] = {
         min_iou=("events a.mcap --similarity iou", "--min-iou 0.99"),
         camera="--camera other",
         output="-o b.mcap",
-        sidecar="--sidecar",
         force=("events a.mcap -o fresh.mcap", "--force"),
     ),
     "evaluate": common(
@@ -154,7 +142,6 @@ CASES: dict[str, dict[str, Case]] = {
         size=("evaluate shares.csv --truth shares.csv", "--size 40x40"),
         camera="--camera other",
         ground_plane=(SCORED, "--ground-plane plane.txt"),
-        point=(f"{SCORED} --ground-plane plane.txt --gate-m 0.1", "--point center"),
         fps=("evaluate truth.txt --truth walk.txt --ground-plane plane.txt", "--fps 10"),
         fail_under="--fail-under idf1=2",
         csv="--csv",
@@ -187,7 +174,7 @@ CASES: dict[str, dict[str, Case]] = {
         verbose=("query a.mcap 'select 1'", "-v"),
         worlds="--worlds",
     ),
-    "info": common("info a.mcap", frames="--frames", output="-o b.txt", force=("info a.mcap -o clip.mp4", "--force")),
+    "info": common("info a.mcap", frames="--frames"),
     "view": common(
         "view a.mcap",
         at=("view eventful.mcap --links", "--at 1"),
@@ -199,7 +186,7 @@ CASES: dict[str, dict[str, Case]] = {
         layout=("view a.mcap --links", "--layout tracking"),
         open="--open",
     ),
-    "check": common("check a.mcap", output="-o b.txt", force=("check a.mcap -o clip.mp4", "--force")),
+    "check": common("check a.mcap"),
     "recover": common("recover a.mcap", output="-o b.mcap", force=("recover a.mcap -o fresh.mcap", "--force")),
     "cut": common(
         "cut a.mcap",
@@ -220,5 +207,5 @@ CASES: dict[str, dict[str, Case]] = {
     ),
     "demo": common("demo", output="-o b", force=("demo -o taken", "--force"), scene="--scene crowd", seed="--seed 3"),
     "doctor": common("doctor"),
-    "docs": common("docs", output="-o pages.txt", force=("docs -o clip.mp4", "--force")),
+    "docs": common("docs"),
 } | {name: common(seen[0], **seen[1]) for name, seen in of_extensions("EFFECTS").items() if seen}

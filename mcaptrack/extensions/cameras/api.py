@@ -58,13 +58,13 @@ def _of_feet(name: str) -> Option:
     """The option for a parameter of the usual fuser, which declares its range and its help."""
     (about,) = (field.metadata for field in fields(FootFuser) if field.name == name)
     text = about["help"]
-    return Option(
-        "", about["least"], about["most"], tuning=True, is_set=not about["flag"], help=f"{text[:1].upper()}{text[1:]}."
-    )
+    return Option("", about["least"], about["most"], tuning=True, help=f"{text[:1].upper()}{text[1:]}.")
 
 
 @declared(
     most_used=("to", "cameras", "clock_offset_s", "min_score", "output", "force"),
+    settable=tuple(field.name for field in fields(FootFuser) if field.name in _OPTIONS and not field.metadata["flag"]),
+    python_only=("sidecar", "views"),
     printed_by="mcaptrack.extensions.cameras.command:Fuse",
 )
 def fuse(
@@ -250,6 +250,7 @@ class CalibrateResult:
 
 @declared(
     most_used=("reference", "cameras", "dry_run", "clock_offset_s", "output", "force"),
+    python_only=("sidecar",),
     heading="Improve and repair",
     printed_by="mcaptrack.extensions.cameras.command:Calibrate",
 )

@@ -184,7 +184,7 @@ class OnnxDetector:
 
     file: str = option("", theme=NETWORK)
     layout: LayoutChoice = setting("auto", theme=NETWORK)
-    input_size: str = option("", theme=NETWORK)
+    input_size: str = setting("", theme=NETWORK)
     device: Device = option("auto", theme=NETWORK)
     max_memory_mb: int = setting(1000, least=10, most=1_000_000, theme=NETWORK)
     tiles: str = option("1x1", theme=_BOXES)
@@ -583,7 +583,7 @@ class CataloguedDetector(OnnxDetector):
     """
 
     layout: LayoutChoice = setting("yolox", theme=NETWORK)
-    input_size: str = option("picture", theme=NETWORK)
+    input_size: str = setting("picture", theme=NETWORK)
 
     #: False boxes score up to 0.6 and begin no tracks, so that those that begin need no confirmation.
     suits: ClassVar[Mapping[str, Suited]] = MappingProxyType(

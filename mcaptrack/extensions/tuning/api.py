@@ -90,6 +90,8 @@ class TuneResult:
 
 @declared(
     most_used=("truth", "stage", "tracker", "metric", "trials", "search", "topic", "output", "force"),
+    settable=("seed", "gate_m", "min_iou", "classes", "fps"),
+    python_only=("label_format", "ground_plane"),
     heading="Improve and repair",
     printed_by="mcaptrack.extensions.tuning.command:Tune",
 )

@@ -66,9 +66,9 @@ class Tune(Once["TuneResult"]):
         """Write the settings to the file, and print them with their scores."""
         given, output, metric = self.values, self.values["output"], done.metric
         if given["truth"]:
-            warn_unused("files of detections are of no camera", "camera", "topic")
+            warn_unused("files of detections are of no camera", "topic", "camera")
         else:
-            warn_unused("it is about label files; logs have theirs inside", "ground_plane", "fps")
+            warn_unused("it is about label files; logs have theirs inside", "fps")
         if not self._has_tracker:
             warn_unused(f"{given['stage']} has no trackers", "tracker")
         by_overlap = done.similarity == "iou"

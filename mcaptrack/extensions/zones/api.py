@@ -69,6 +69,7 @@ def count(
 
 @declared(
     most_used=("zones", "topic", "camera", "output", "force"),
+    python_only=("sidecar",),
     heading="Results",
     printed_by="mcaptrack.extensions.zones.command:Zones",
 )

@@ -33,7 +33,7 @@ class Zones(EachLog["RunResult"]):
             return
         if len(logs) == 1:
             raise McaptrackError("`zones draw` needs a log: name it after draw")
-        counting = ("zones", "topic", "margin_m", "max_gap_s", "sidecar")
+        counting = ("zones", "topic", "margin_m", "max_gap_s")
         extra = {f"--{name.replace('_', '-')}": self.values[name] for name in counting}
         if len(logs) > 2 or any(value is not None for value in extra.values()):
             unused = next((name for name, value in extra.items() if value is not None), f"another log ({logs[-1]})")

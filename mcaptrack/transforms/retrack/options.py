@@ -114,14 +114,14 @@ class RetrackOptions:
     max_age_s: float = option(2.0, least=0.0, theme=_LIFE)
     interpolated: bool = setting(False, theme=_ASSOCIATION)
     min_track_s: float = setting(2.0, least=0.0, theme=_LIFE)
-    link_s: float = option(20.0, least=0.0, theme=_OFFLINE)
+    link_s: float = setting(20.0, least=0.0, theme=_OFFLINE)
     link_confidence: float = setting(0.5, least=0.01, most=0.99, theme=_OFFLINE)
     resolve_swaps: bool = setting(True, theme=_OFFLINE)
     track_confidence: float = setting(0.5, least=0.0, most=1.0, theme=_OFFLINE)
-    across_classes: bool = option(False, theme=_ASSOCIATION)
-    class_limits: str = option("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
+    across_classes: bool = setting(False, theme=_ASSOCIATION)
+    class_limits: str = setting("", LIMITS_HELP, pattern=LIMITS_PATTERN, theme=_MOTION)
     smooth: bool = option(True, theme=_OFFLINE)
-    side_view: bool = option(False, theme=_ASSOCIATION)
+    side_view: bool = setting(False, theme=_ASSOCIATION)
     rate_hz: float = context(lambda: 2.5)
     ground_planes: Planes = context(tuple)
     class_names: ClassNames = context(tuple, is_recorded=False)
@@ -247,7 +247,7 @@ class LikelihoodOptions(RetrackOptions):
     adapt_online: bool = setting(True, theme=_LIFE)
     adapt: bool = setting(True, ADAPT_HELP, theme=_PREDICTIONS)  # type: ignore[misc]
     appearance: bool | None = option(None, theme=_OFFLINE)
-    store_appearance: bool = option(False, theme=_OFFLINE)
+    store_appearance: bool = setting(False, theme=_OFFLINE)
     worlds: int = option(0, least=0, most=1000, theme=_OFFLINE)  # type: ignore[misc]
     descriptors: Descriptors | None = context(lambda: None, is_recorded=False)
 

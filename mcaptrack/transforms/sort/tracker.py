@@ -360,8 +360,8 @@ class Sort:
     max_distance_m: float = setting(1.0, least=0.0, theme=_ASSOCIATION)
     min_score: float | None = option(None, theme=_DETECTIONS)
     class_id: int | None = setting(None, least=0, most=2**31 - 1, theme=_DETECTIONS)
-    across_classes: bool = option(False, theme=_DETECTIONS)
-    camera_motion: CameraMotionUse = option("auto", theme=_ASSOCIATION)
+    across_classes: bool = setting(False, theme=_DETECTIONS)
+    camera_motion: CameraMotionUse = setting("auto", theme=_ASSOCIATION)
     ground_planes: Planes = context(tuple)
     camera_path: CameraPath | None = context(lambda: None, is_recorded=False)
 

@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log
+from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.bags import metadata_yaml
 from mcaptrack.schema import PREDICTIONS, SCHEMAS, TRACKS, Frame
 from mcaptrack.schema.encodings import CDR, cdr_codec, record_of
@@ -207,7 +208,7 @@ def tracked(tmp_path_factory) -> Path:
     inner["relative_file_paths"].append("drive/drive_1.mcap")
     (folder / "metadata.yaml").write_text(json.dumps(info))  # which is YAML, too
     (folder / "before.yaml").write_bytes((folder / "metadata.yaml").read_bytes())
-    done("track", path, "--views", "--topic", "/lidar/boxes", "--in-place")
+    mcaptrack.track(path, topic="/lidar/boxes", sidecar=False, views=True)
     return path
 
 
@@ -315,16 +316,17 @@ def test_results_that_stand_twice_are_said(copied):
     shutil.copytree(copied.parent, other)
     lone = other / "drive.mcap"
     done("drop", lone, *ours(lone))
-    done("track", lone, "--topic", "/lidar/boxes", "--sidecar", "--views")
+    mcaptrack.track(lone, topic="/lidar/boxes", sidecar=True, views=True)
     shutil.copy(lone.with_name("drive.results.mcap"), copied.with_name("drive.results.mcap"))
-    result = done("predict", copied, "--topic", "/lidar/tracks", "--predictor", "cv", "--views")
-    (line,) = [line for line in result.err.splitlines() if "and in drive.results.mcap" in line]
+    result = mcaptrack.predict(copied, topic="/lidar/tracks", predictor="cv", views=True)
+    (line,) = [notice.message for notice in result.warnings if "and in drive.results.mcap" in notice.message]
     assert f"stand in {copied} and in drive.results.mcap; the second is read and replaced" in line
 
 
 def test_topics_that_ros_does_not_accept_are_said(copied):
-    result = done("track", copied, "--topic", "/lidar/boxes", "--to", "/lidar/2nd", "--views")
-    assert "ROS 2 accepts no topic like /lidar/2nd, /lidar/2nd/view/scene: its tools read these messages" in result.err
+    result = mcaptrack.track(copied, topic="/lidar/boxes", to="/lidar/2nd", views=True)
+    said = "ROS 2 accepts no topic like /lidar/2nd, /lidar/2nd/view/scene: its tools read these messages"
+    assert any(said in notice.message for notice in result.warnings)
     by_rosbags(copied.parent)
     result = done("drop", copied, "/lidar/2nd*")
     assert "ROS 2 accepts" not in result.err
@@ -379,9 +381,8 @@ def test_times_that_ros_does_not_have_are_refused_in_one_line(tmp_path):
     payloads = cdr_codec(TRACKS).encode_all(rows, np.array([1])) * 20
     path = odd(tmp_path / "a.mcap", "/own/tracks", (name, encoding, data), payloads, 2**31 * 10**9)
     before = path.read_bytes()
-    result = call("predict", path, "--topic", "/own/tracks", "--in-place", "--predictor", "cv", "--views")
-    assert result.code == 1
-    assert "ROS has times from 1970 to 2038 only" in result.err.splitlines()[-1]
+    with pytest.raises(McaptrackError, match="ROS has times from 1970 to 2038 only"):
+        mcaptrack.predict(path, topic="/own/tracks", sidecar=False, predictor="cv", views=True)
     assert path.read_bytes() == before
 
 

@@ -14,6 +14,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 from rosbags.rosbag2 import Writer as Writer2
 
+import mcaptrack
 from mcaptrack import log
 from mcaptrack.registry import BUILT_IN
 from mcaptrack.schema import TRACKS
@@ -137,7 +138,7 @@ def test_in_place_insists_and_what_is_in_place_goes_on_there(path):
 
 
 def test_in_place_is_refused_where_results_stand_beside(path):
-    done("detect", path, "--detector", "knn", "--views")
+    mcaptrack.detect(path, detector="knn", views=True)
     before = on_disk(path.parent)
     result = call("track", path, "--in-place")
     assert result.code == 1
@@ -146,7 +147,7 @@ def test_in_place_is_refused_where_results_stand_beside(path):
 
 
 def test_a_copy_without_channels_has_its_results_beside_it(path, tmp_path):
-    done("detect", path, "--detector", "knn", "--views")
+    mcaptrack.detect(path, detector="knn", views=True)
     before = on_disk(path.parent)
     out = tmp_path / "small.mcap"
     done("drop", path, "/robot/front/image", "/robot/front/detections/*", "-o", out)

@@ -21,8 +21,6 @@ EFFECTS = {
             "to": "--to plaza",
             "fuser": "--fuser grid",
             "output": "-o b.mcap",
-            "sidecar": "--sidecar",
-            "views": ("fuse a.mcap", "--views"),  # drawn on the pictures of its camera
             "force": ("fuse two.mcap -o fresh.mcap", "--force"),
         },
     ),
@@ -34,7 +32,6 @@ EFFECTS = {
             "clock_offset_s": "--clock-offset-s left=2",
             "dry_run": "--dry-run",
             "output": "-o b.mcap",
-            "sidecar": (f"{_RIGHT} --dry-run", "--sidecar"),  # a correction: test_calibrate
             "force": (f"{_RIGHT} -o fresh.mcap", "--force"),
         },
     ),

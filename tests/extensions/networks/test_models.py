@@ -179,7 +179,7 @@ class TestListing:
 
 class TestDetecting:
     def test_a_detector_by_name_needs_its_weights_and_then_finds(self, model, log):
-        words = ("detect", log, "--detector", NAME, "--input-size", "160x128")
+        words = ("detect", log, "--detector", NAME, "--set", "input_size=160x128")
         assert "not here yet; `mcaptrack models get yolox-nano` fetches them" in call(*words).err
         mcaptrack.get_model(NAME)
         done(*words)
@@ -211,7 +211,7 @@ class TestDetecting:
         assert [notice.message for notice in said] == [f"{model.path} is damaged, or another file; it is fetched again"]
         (tmp_path / "other.onnx").write_bytes(b"other")
         assert "is not the file of" in call("detect", log, "--detector", f"{NAME}:{tmp_path}/other.onnx").err
-        done("detect", log, "--detector", f"{NAME}:{tmp_path}/known.onnx", "--input-size", "160x128")
+        done("detect", log, "--detector", f"{NAME}:{tmp_path}/known.onnx", "--set", "input_size=160x128")
 
     def test_what_it_made_is_up_to_date_without_the_weights(self, model, log):
         mcaptrack.get_model(NAME)

@@ -439,8 +439,8 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
         return windows(recipe, Path("b.txt"))
 
     monkeypatch.setattr(training, "synthetic", synthetic)
-    done("train", "synthetic", "--walks", 1234, "--seed", 5, "--validate", "b.txt", "-o", "one")
-    done("train", "a.txt", "synthetic", "--walks", 1234, "--seed", 5, "--validate", "b.txt", "-o", "two")
+    done("train", "synthetic", "--walks", 1234, "--set", "seed=5", "--validate", "b.txt", "-o", "one")
+    done("train", "a.txt", "synthetic", "--walks", 1234, "--set", "seed=5", "--validate", "b.txt", "-o", "two")
     (recipe, made, *_, card, _, _, _, _, _), (_, both, *_, mixed, _, _, _, _, _) = given
     assert same(made, windows(recipe, Path("b.txt")))
     walks = f"1234 synthetic walks of mcaptrack {__version__}, seed 5"
@@ -457,7 +457,7 @@ def test_synthetic_walks_and_files_are_other_scenes(folder, given, monkeypatch):
     [
         ("--epochs 3 --set batch=9 --set rate=0.01", {"epochs": 3, "batch": 9, "rate": 0.01}, {}),
         (
-            "--set patience=4 --seed 6 --set consistency_weight=2",
+            "--set patience=4 --set seed=6 --set consistency_weight=2",
             {"patience": 4, "seed": 6, "consistency_weight": 2.0},
             {},
         ),

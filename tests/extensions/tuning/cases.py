@@ -7,26 +7,20 @@ import mcaptrack
 
 READING = {"tune": lambda log, out: [log, "--trials", "1", "-o", out / "tuned.json"]}
 DEEDS = {"tune": ["read", "write"]}
-_TALL = "tune tall.txt --truth truth.txt --fps 10"
+_TALL = "tune tall.txt --truth truth.txt --set fps=10"
 EFFECTS = {
     "tune": (
         "tune a.mcap --trials 2 --search min-iou",
         {
-            "truth": ("tune truth.txt --fps 10 --trials 1", "--truth truth.txt"),
+            "truth": ("tune truth.txt --set fps=10 --trials 1", "--truth truth.txt"),
             "stage": "--stage sample --search max-gap-s",
             "tracker": "--tracker bytetrack",
             "metric": "--metric mota",
             "trials": (f"{_TALL} --search min-iou", "--trials 1"),
             "search": "--search max-age-s",
-            "seed": "--seed 3",
+            "set": "--set seed=3",
             "study": "--study b.jsonl",
             "similarity": "--similarity metres",
-            "gate_m": ("tune a.mcap --trials 1 --similarity metres", "--gate-m 0.01"),
-            "min_iou": ("tune a.mcap --trials 1", "--min-iou 0.99"),
-            "format": (f"{_TALL} --trials 1", "--format kitti"),
-            "classes": ("tune kinds.csv --truth kinds.csv --trials 1 --fps 10", "--classes all"),
-            "fps": ("tune truth.txt --truth truth.txt --trials 1", "--fps 1"),
-            "ground_plane": (f"{_TALL} --trials 1 --similarity metres", "--ground-plane plane.txt"),
             "topic": "--topic /none",
             "camera": "--camera other",
             "output": "-o b.toml",
@@ -91,12 +85,11 @@ def _printed(to: Any) -> None:
     to.lines += Path("mcaptrack.toml").read_text().splitlines() + Path("b.toml").read_text().splitlines()
     to.run("tune x.mcap -o c.toml --json", tune=_tuned(best=0))
     for words, similarity in (
-        ("--gate-m 1 --min-iou 0.4", "iou"),
-        ("--gate-m 1 --min-iou 0.4", "metres"),
+        ("--set gate_m=1 --set min_iou=0.4", "iou"),
+        ("--set gate_m=1 --set min_iou=0.4", "metres"),
         ("--tracker sort --stage sample", "iou"),
-        ("--fps 5 --camera c", "iou"),
-        ("--truth t.txt --fps 5 --camera c --topic /t", "iou"),
-        ("--truth t.txt --ground-plane p.txt", "iou"),
+        ("--set fps=5 --camera c", "iou"),
+        ("--truth t.txt --set fps=5 --camera c --topic /t", "iou"),
     ):
         to.run(f"tune x.mcap -o c.toml -q {words}", shows_answer=False, tune=_tuned(best=0, similarity=similarity))
     for search in ("min-iou=0.1", "min-iou=1:2:3", "min-iou=", "min-iou=a:b"):

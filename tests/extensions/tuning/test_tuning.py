@@ -132,7 +132,7 @@ def write_files(folder):
 
 def test_tune_writes_settings_that_other_commands_read(tmp_path):
     write_files(tmp_path)
-    words = ("tune", "det.txt", "--truth", "gt.txt", "--fps", 10, "--trials", 12, "--search", "max-age-s=0.1:6")
+    words = ("tune", "det.txt", "--truth", "gt.txt", "--set", "fps=10", "--trials", 12, "--search", "max-age-s=0.1:6")
     out, err = printed(*words, "--json", folder=tmp_path)
     row = json.loads(out)["results"][0]
     assert row["scores"]["IDF1"] > row["default_scores"]["IDF1"]
@@ -169,7 +169,19 @@ def test_a_log_is_tuned_and_errors_are_one_line(tmp_path):
 
 def test_settings_are_added_to_a_file_that_exists_unless_it_cannot_be_edited(tmp_path):
     write_files(tmp_path)
-    words = ("tune", "det.txt", "--truth", "gt.txt", "--fps", 10, "--trials", 12, "--search", "max-age-s=0.1:6", "-q")
+    words = (
+        "tune",
+        "det.txt",
+        "--truth",
+        "gt.txt",
+        "--set",
+        "fps=10",
+        "--trials",
+        12,
+        "--search",
+        "max-age-s=0.1:6",
+        "-q",
+    )
     settings = tmp_path / "mcaptrack.toml"
     settings.write_bytes(b"# mine\r\n[ track ]  # spaced\r\nmax_age_s = 1.4 # seconds\r\nretrack.profile = 'paper'\r\n")
     settings.write_bytes(settings.read_bytes().replace(b"retrack.", b"[retrack]\r\n"))

@@ -42,7 +42,6 @@ EFFECTS = {
             "max_gap_s": "--max-gap-s 1",
             "camera": "--camera other",
             "output": "-o b.mcap",
-            "sidecar": "--sidecar",
             "force": ("zones a.mcap --zones zones.geojson -o fresh.mcap", "--force"),
         },
     )
