@@ -32,7 +32,7 @@ def _command(match: re.Match[str]) -> str:
         options = {keyword.arg or "": ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, AssertionError):
         return match[0]
-    parts = getattr(getattr(mcaptrack, name, None), "done_by", name).split()
+    parts = str(getattr(getattr(mcaptrack, name, None), "done_by", name)).split()
     arguments_: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
     for parameter, value in options.items():
         flag = flag_of(parameter, value, parts[0])
