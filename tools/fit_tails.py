@@ -28,7 +28,6 @@ from reproduce import on_clock
 
 from mcaptrack import __version__
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Forecasts, Positions, pair_forecasts
-from mcaptrack.extensions.training.walks import walks
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.histories import Histories
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared
@@ -38,6 +37,7 @@ from mcaptrack.predictors.tail_calibration import TABLES, counts_of
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import JoinedFrames, join_frames
+from mcaptrack.sources.walks import walks
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms import forecasts as made_by
 from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers

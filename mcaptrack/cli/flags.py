@@ -32,9 +32,10 @@ def _command(match: re.Match[str]) -> str:
         options = {keyword.arg or "": ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, AssertionError):
         return match[0]
-    parts = str(getattr(getattr(mcaptrack, name, None), "done_by", name)).split()
+    done_by, more = getattr(getattr(mcaptrack, name, None), "done_by", (name, {}))
+    parts = done_by.split()
     arguments_: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
-    for parameter, value in options.items():
+    for parameter, value in (options | more).items():
         flag = flag_of(parameter, value, parts[0])
         if flag.endswith("="):  # Python alone has it
             return match[0]
@@ -42,8 +43,7 @@ def _command(match: re.Match[str]) -> str:
             arguments_ += ["--set", f"{parameter}={_text(value)}"]
         else:
             arguments_ += [flag] if isinstance(value, bool) else [flag, str(value)]
-    flags = [part for part in parts if part.startswith("-")]
-    return command(*(part for part in parts if part not in flags), *arguments_, *flags)
+    return command(*parts, *arguments_)
 
 
 def _option(match: re.Match[str]) -> str:

@@ -6,7 +6,7 @@ transform with the same parameters, or left as it is, with a warning, if that is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
@@ -238,15 +238,19 @@ class _Planner:
                 text = f"{camera.pictures} has depths ({depth}), in which people are not detected"
                 raise McaptrackError(f"{self.opened.path}: {text}; `topic=` looks for them there all the same")
             self._notes.append(f"{usual} is missing: taking the pictures of {camera.pictures}")
-            if camera.boxes and camera.boxes not in self.sources.values():
-                self._notes.append(f"boxes that others detected are in {camera.boxes}; `topic=` takes them instead")
-            for topic, name in uncertain_boxes(self.opened).items():
-                self._notes.append(f"{topic} ({name}) has positions that may be of people; `topic=` takes them instead")
+            self._notes += self._other_boxes(camera.boxes)
             return camera.pictures
         if reads is DETECTIONS and camera.boxes and (depth or not camera.pictures):
             self._notes.append(f"{usual} is missing: taking the boxes of {camera.boxes}")
             return camera.boxes
         return usual
+
+    def _other_boxes(self, boxes: str) -> Iterator[str]:
+        """Notes on channels with boxes, or with what may be people, that are not read."""
+        if boxes and boxes not in self.sources.values():
+            yield f"boxes that others detected are in {boxes}; `topic=` takes them instead"
+        for topic, name in uncertain_boxes(self.opened).items():
+            yield f"{topic} ({name}) has positions that may be of people; `topic=` takes them instead"
 
     def suited_tracker(self, stage: str, source: str) -> str:
         """Return the tracker for boxes that the default one can't take; "" for others, and for other stages."""

@@ -17,7 +17,6 @@ from mcaptrack import log, pipeline, tables
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.extensions.training.recipe import Recipe
-from mcaptrack.extensions.training.walks import walks
 from mcaptrack.extensions.training.windows import Windows
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
@@ -28,6 +27,7 @@ from mcaptrack.schema.framing import join_frames
 from mcaptrack.sources.ingest import IngestOptions, label_frames
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.roles import ONLY_PEOPLE
+from mcaptrack.sources.walks import walks
 from mcaptrack.transforms import Sample
 
 SYNTHETIC: Final = "synthetic"

@@ -40,6 +40,6 @@ DEEP = {
     "training": (
         "it makes the weights that predictors read, of labels",
         "geometry.mixtures predictors.forecast predictors.linear predictors.lstm predictors.red predictors.weights "
-        "sources.ingest.labels.reading sources.ingest.labels.roles",
+        "sources.ingest.labels.reading sources.ingest.labels.roles sources.walks",
     )
 }

@@ -11,12 +11,12 @@ import pytest
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
 from mcaptrack.extensions.training.recipe import RECIPES
 from mcaptrack.extensions.training.sources import SourceOptions, read_scenes, windows_of
-from mcaptrack.extensions.training.walks import walks
 from mcaptrack.extensions.training.windows import Windows, ar1
 from mcaptrack.predictors import PeopleSeen, make
 from mcaptrack.predictors.lstm import Lstm
 from mcaptrack.predictors.red import Red
 from mcaptrack.predictors.weights import Weights
+from mcaptrack.sources.walks import walks
 
 
 def test_networks_for_training_give_the_same_forecasts():

@@ -22,10 +22,10 @@ from mcaptrack.extensions.training import api as training
 from mcaptrack.extensions.training.recipe import RECIPES, Recipe
 from mcaptrack.extensions.training.result import TrainResult
 from mcaptrack.extensions.training.sources import Scene, SourceOptions, read_scenes, split, synthetic, windows_of
-from mcaptrack.extensions.training.walks import walks
 from mcaptrack.extensions.training.windows import Corruption, Windows, ar1
 from mcaptrack.predictors.weights import load
 from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.walks import walks
 from mcaptrack.tables.export import export
 from tests.commands import call, done
 
