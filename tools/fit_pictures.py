@@ -24,7 +24,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 from pictured import Pictured, drawn
 from regression import logistic, show_reliability
 
-from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.schema import TRACKS
@@ -39,6 +38,7 @@ from mcaptrack.transforms.retrack.in_pictures import (
     find_candidates,
     find_pieces,
 )
+from mcaptrack.transforms.retrack.linking import best_links
 from mcaptrack.transforms.retrack.options import MAX_LINK_IN_PICTURE_S
 from mcaptrack.transforms.retrack.weights import probability
 
@@ -60,15 +60,7 @@ class Pairs(NamedTuple):
 
     def best(self, log_odds: np.ndarray) -> np.ndarray:
         """The pairs of the likeliest links, one on each side of a piece."""
-        good = np.flatnonzero(log_odds > np.log(LEAST / (1 - LEAST)))
-        if not len(good):
-            return good
-        shape = (self.count, self.count)
-        gain = log_odds[good] - np.log(LEAST / (1 - LEAST))
-        (i, j), _ = max_weight_matching((self.before[good], self.after[good]), np.round(gain, 6), shape)
-        chosen = set(zip(i.tolist(), j.tolist(), strict=True))
-        pairs = zip(self.before[good].tolist(), self.after[good].tolist(), strict=True)
-        return good[[pair in chosen for pair in pairs]]
+        return best_links(self.before, self.after, log_odds - np.log(LEAST / (1 - LEAST)), self.count)
 
 
 def pairs_of(scene: Pictured) -> Pairs:

@@ -230,7 +230,7 @@ class Judged(NamedTuple):
 def choices_of(run: Run) -> Chosen:
     """What the ends and beginnings of tracklets should choose in a scene."""
     log, tracks = reached("hypotheses_of", *run.args)
-    tracklets, before, after, _, gap, terms, leaves, comes, _ = Hypotheses.of(log.model, tracks, log.max_gap_s)
+    tracklets, before, after, gap, terms, leaves, comes, _ = Hypotheses.of(log.model, tracks, log.max_gap_s)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
     same = np.flatnonzero((ends[before] >= 0) & (ends[before] == begins[after]))
     right = []

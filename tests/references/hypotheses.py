@@ -27,7 +27,7 @@ from tests.references.offline import (
 
 CHOICES = FITTED["choices"]
 GAPS = ("next step", "up to 1.7 s", "up to 5 s", "longer")
-ENOUGH, USUAL, BESIDE_M, SQUARE_M = 1 / 5, 20, 2.0, 1.0
+ENOUGH, USUAL, BESIDE_M, ALONE, ALONE_M_PER_S = 1 / 5, 20, 2.0, 8.0, 1.1
 
 
 @dataclass(frozen=True)
@@ -127,21 +127,24 @@ class Scene:
             "rate of tracks": log((len({claim.online for claim in self.claims}) + 1) / (samples + 50)),
         }
 
+    def is_alone(self, a: list[Claim], b: list[Claim]) -> bool:
+        """Whether a link is to the next step of one online track, nearby, with no other track beside."""
+        end, begin = a[-1], b[0]
+        apart = hypot(begin.at[0] - end.at[0], begin.at[1] - end.at[1])
+        near = begin.step - end.step == 1 and apart < ALONE_M_PER_S * self.motion.step_s
+        return near and begin.online == end.online and not self.beside(end) and not self.beside(begin)
+
     def end(self, part: list[Claim], leaves: bool) -> dict[str, float]:
         """The terms of leaving at the end of a tracklet, or of coming at its beginning."""
         claim = part[-1] if leaves else part[0]
         state = (self.ahead if leaves else self.back)[claim.track][claim.step]
         places = np.array([other.at for other in self.claims])
-        sides = [own[k].at for k in (0, -1) for own in self.tracklets if len(own) >= 8]
-        heres = [(own[-1] if leaves else own[0]).at for own in self.tracklets]
         low, high = np.percentile(places, [1, 99], axis=0)
         inside = min(min(claim.at[k] - low[k], high[k] - claim.at[k]) for k in (0, 1))
-        ends = max(around(sides, heres, claim.at) - (len(part) >= 8) + 0.5, 0.1)
         steps = [other.step for other in self.claims]
         left_s = (max(steps) - claim.step if leaves else claim.step - min(steps)) * self.motion.step_s
         return {
             "end": 1.0,
-            "ends here": log(ends / (around(places.tolist(), heres, claim.at) + 5)),
             "beside a track": max(self.beside(claim).values(), default=0.0),
             "border": log(max(inside, 0.0) + 0.5),
             "speed": log(hypot(*state.mean[:, 1]) + 0.1),
@@ -158,13 +161,6 @@ def path_of(claims: list[Claim]) -> Path:
     return {claim.step: claim.at for claim in claims}
 
 
-def around(points: list, heres: list, at: Point) -> int:
-    """How many points are in the square of a position and in the eight around it."""
-    corner = np.array([*points, *heres]).min(axis=0)
-    own = np.floor((np.array(at) - corner) / SQUARE_M)
-    return sum(bool((abs(np.floor((np.array(point) - corner) / SQUARE_M) - own) <= 1).all()) for point in points)
-
-
 def total(weights: dict[str, float], terms: dict[str, float]) -> float:
     return sum(weights[name] * value for name, value in terms.items())
 
@@ -178,7 +174,7 @@ def gains_of(scene: Scene, max_gap_s: float, least: float) -> dict[tuple[int, in
         if terms is not None:
             bounds = np.maximum.accumulate([1.5 * motion.step_s, 1.7, 5.0])
             gap[i, j] = GAPS[int(np.searchsorted(bounds, terms["gap"]))]
-            link[i, j] = total(CHOICES["links"][gap[i, j]], terms)
+            link[i, j] = total(CHOICES["links"][gap[i, j]], terms) + ALONE * scene.is_alone(parts[i], parts[j])
     gains = dict.fromkeys(link, -log(least / (1 - least) * ENOUGH))
     for side, name in enumerate(("leaves", "comes")):
         none = [total(CHOICES[name], scene.end(part, name == "leaves")) for part in parts]

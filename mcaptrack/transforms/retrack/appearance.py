@@ -53,8 +53,7 @@ class Descriptors(NamedTuple):
 # log is known to have: within one input track over a gap of about that length (one person, nearly always), and
 # between input tracks that are there at one time (two people). Nothing is fitted on other recordings.
 #
-# Letters: C samples, S descriptors, D bytes of one, B blocks of consecutive descriptors of a track, P pairs of
-# these.
+# Letters: C samples, S descriptors, D bytes of one, B pieces of a track, P pairs of these.
 
 
 #: Log likelihood ratios are no larger than this, and this share of comparisons is of something else than two people:
@@ -83,9 +82,9 @@ _REACH_M, _SPEED_M_PER_S = 1.0, 2.5
 _PRIOR_SD: Final = 2.0
 #: The width of bins of log ratios of distances, and their number to either side of 0.
 _BIN, _BINS = 0.05, 200
-#: Longer logs are calibrated by so many blocks, of so many stretches of this length in seconds.
-_MAX_BLOCKS, _STRETCHES, _STRETCH_S = 800, 8, 40.0
-#: Pairs of blocks that are computed with at once.
+#: Longer logs are calibrated by so many pieces, of so many stretches.
+_MOST_PIECES, _STRETCHES = 800, 8
+#: Pairs of pieces that are computed with at once.
 BATCH: Final = 10_000
 
 
@@ -146,13 +145,11 @@ def usual_distance(values: NDArray[np.uint8], mine: Ints, is_one: Bools, other: 
     return out
 
 
-class _Blocks(NamedTuple):
-    """Up to ``WINDOW`` consecutive descriptors of one input track: rows of values (B, WINDOW), which there are, the
-    first and the last step and position; the number of the track, and when it begins and ends.
+class _Pieces(NamedTuple):
+    """Up to ``WINDOW`` consecutive descriptors of one input track (B,): the first and the last step and position; the
+    number of the track, and when it begins and ends.
     """
 
-    which: Ints
-    has: Bools
     first: Ints
     last: Ints
     from_m: Floats
@@ -162,8 +159,8 @@ class _Blocks(NamedTuple):
     ends: Ints
 
 
-def calibrate(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> AppearanceCalibration | None:
-    """Measure how descriptors, rows of ``values`` (S, D), tell the input tracks of samples (C,) apart.
+def calibrate(descriptors: Descriptors, tracks: Tracks, step_s: float) -> AppearanceCalibration | None:
+    """Measure how descriptors tell the input tracks of samples (C,) apart.
 
     None if no two tracks that are there at one time were seen before and after a gap.
     """
@@ -171,92 +168,51 @@ def calibrate(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> Appea
     tracks = taken(tracks, np.lexsort((tracks.step, tracks.source)))
     if len(tracks.look) < 2:
         return None
-    blocks, noise = _blocks(values, tracks, step_s)
-    which, has, pairs = blocks.which, blocks.has, _pairs(blocks, step_s)
-    distance = usual_distance(values, which[pairs.before], has[pairs.before], which[pairs.after], has[pairs.after])
-    lag = np.searchsorted(_LAGS_S, pairs.gap_s, "right") - 1
-    is_same = blocks.track[pairs.before] == blocks.track[pairs.after]
-    count = len(np.unique(blocks.track[pairs.before[is_same]]))
+    step, starts = tracks.step, run_starts(tracks.source)
+    begin, number = np.flatnonzero(starts), np.cumsum(starts) - 1
+    within = (np.arange(len(number)) - begin[number]) % WINDOW
+    first, end = np.flatnonzero(within == 0), np.append(begin[1:], len(number)) - 1
+    last, track = np.append(first[1:], len(number)) - 1, number[first]
+    sides = step[first], step[last], tracks.xy_m[first], tracks.xy_m[last]
+    before, after, gap_s = _pairs(_Pieces(*sides, track, step[begin][track], step[end][track]), step_s)
+    two = np.flatnonzero(within > 0)
+    now, then = (descriptors.values[tracks.look[which]] / np.float32(255) for which in (two, two - 1))
+    noise = max(float(np.median(np.square(now - then).sum(axis=1))) if len(two) else 1.0, 1e-6)
+    windows = Windows(descriptors, tracks._replace(track=np.cumsum(within == 0) - 1), step_s)
+    distance, *_ = windows.distances(before, windows.starts[before + 1], after, windows.starts[after])
+    lag = np.searchsorted(_LAGS_S, gap_s, "right") - 1
+    low, high = np.sort([track[before], track[after]], axis=0)
+    is_same = low == high
+    count = len(np.unique(low[is_same]))
     if count < 2 or is_same.all():  # nothing to compare with
         return None
-    drift = _drift(distance - noise, lag, blocks.track[pairs.before], is_same, noise)
+    drift = _drift(distance - noise, lag, track[before], is_same, noise)
     calibration = AppearanceCalibration(noise, drift, 0.0, 0.0, 0.5, 0.5, count)
-    excess = calibration.excess(distance, pairs.gap_s)
-    low = np.minimum(blocks.track[pairs.before], blocks.track[pairs.after])
-    high = np.maximum(blocks.track[pairs.before], blocks.track[pairs.after])
-    _, who, often = np.unique(low * (high.max() + 1) + high, return_inverse=True, return_counts=True)
-    weight = 1 / often[who]
-    bias, slope, separation = _fit(excess, is_same, weight)
+    _, pair, often = np.unique(low * (high.max() + 1) + high, return_inverse=True, return_counts=True)
+    weight = 1 / often[pair]
+    bias, slope, separation = _fit(calibration.excess(distance, gap_s), is_same, weight)
     # that of the rank sum of as many independent members
     error = np.sqrt((1 / weight[is_same].sum() + 1 / weight[~is_same].sum()) / 12)
     return calibration._replace(bias=bias, slope=max(slope, 0.0), separation=separation, error=float(error))
 
 
-class _Pairs(NamedTuple):
-    """Pairs of blocks (P,) and the seconds between them."""
-
-    before: Ints
-    after: Ints
-    gap_s: Floats
-
-
-def _blocks(values: NDArray[np.uint8], tracks: Tracks, step_s: float) -> tuple[_Blocks, float]:
-    """The blocks of descriptors, ordered by track, then step, and the squared distance of those within one."""
-    which, step, source, xy_m = tracks.look, tracks.step, tracks.source, tracks.xy_m
-    starts = run_starts(source)
-    begin = np.flatnonzero(starts)
-    track = np.cumsum(starts) - 1
-    within = np.arange(len(source)) - begin[track]
-    first = np.flatnonzero(within % WINDOW == 0)
-    count = np.diff(np.append(first, len(source)))
-    last = first + count - 1
-    places = first[:, None] + np.arange(WINDOW)
-    has = places <= last[:, None]
-    members = which[np.minimum(places, last[:, None])]
-    two = np.flatnonzero(within % WINDOW > 0)
-    step_of = np.square((values[which[two]] / np.float32(255)) - (values[which[two - 1]] / np.float32(255))).sum(axis=1)
-    noise = max(float(np.median(step_of)) if len(two) else 1.0, 1e-6)
-    lives = step[begin], step[np.append(begin[1:], len(source)) - 1]
-    blocks = _Blocks(
-        members,
-        has,
-        step[first],
-        step[last],
-        xy_m[first],
-        xy_m[last],
-        track[first],
-        *(of[track[first]] for of in lives),
-    )
-    return _fewer(blocks, step_s), noise
-
-
-def _fewer(blocks: _Blocks, step_s: float) -> _Blocks:
-    """Blocks of some stretches of a long log."""
-    if len(blocks.first) <= _MAX_BLOCKS:
-        return blocks
-    long = max(round(_STRETCH_S / step_s), 1)
-    begins = np.linspace(blocks.first.min(), max(blocks.last.max() - long, blocks.first.min()), _STRETCHES)
-    stretch = np.searchsorted(begins, blocks.first, "right") - 1
-    inside = np.flatnonzero(blocks.last <= begins[stretch] + long)
-    inside = inside[np.lexsort((inside, stretch[inside]))]
-    starts = run_starts(stretch[inside])
-    number = np.arange(len(inside)) - np.flatnonzero(starts)[np.cumsum(starts) - 1]
-    kept = np.sort(inside[number < _MAX_BLOCKS // _STRETCHES])
-    return taken(blocks, kept)
-
-
-def _pairs(blocks: _Blocks, step_s: float) -> _Pairs:
-    """Pairs of successive blocks: of one track, or of two tracks that exist at the same time within reach."""
-    order = np.argsort(blocks.first, kind="stable")
-    begins = blocks.first[order]
-    low = np.searchsorted(begins, blocks.last, "right")
-    many = np.searchsorted(begins, blocks.last + round(_LONGEST_S / step_s), "right") - low
-    before, after = group_index(many), order[ragged_range(low, many)]
-    gap_s = np.asarray((blocks.first[after] - blocks.last[before]) * step_s, np.float64)
-    way = blocks.from_m[after] - blocks.to_m[before]
-    meet = np.minimum(blocks.ends[before], blocks.ends[after]) > np.maximum(blocks.begins[before], blocks.begins[after])
+def _pairs(pieces: _Pieces, step_s: float) -> tuple[Ints, Ints, Floats]:
+    """Pairs (P,) of successive pieces, of one track or of two that exist at the same time within reach, and the seconds
+    between them.
+    """
+    order = np.argsort(pieces.first, kind="stable")
+    if len(order) > _MOST_PIECES:
+        order = order[np.arange(len(order)) % (len(order) // _STRETCHES) < _MOST_PIECES // _STRETCHES]
+    begins, ends = pieces.first[order], pieces.last[order]
+    low = np.searchsorted(begins, ends, "right")
+    many = np.searchsorted(begins, ends + round(_LONGEST_S / step_s), "right") - low
+    before, after = order[group_index(many)], order[ragged_range(low, many)]
+    gap_s = np.asarray((pieces.first[after] - pieces.last[before]) * step_s, np.float64)
+    way = pieces.from_m[after] - pieces.to_m[before]
+    meet = np.minimum(pieces.ends[before], pieces.ends[after]) > np.maximum(pieces.begins[before], pieces.begins[after])
     meet &= np.hypot(way[:, 0], way[:, 1]) <= _REACH_M + _SPEED_M_PER_S * gap_s
-    return taken(_Pairs(before, after, gap_s), meet | (blocks.track[before] == blocks.track[after]))
+    counts = meet | (pieces.track[before] == pieces.track[after])
+    return before[counts], after[counts], gap_s[counts]
 
 
 def _drift(beyond: Floats, lag: Ints, track: Ints, is_same: Bools, noise: float) -> Floats:
@@ -311,68 +267,42 @@ class Appearance(NamedTuple):
         if descriptors is None or len(descriptors.t_ns) == 0 or len(tracks.look) == 0:
             return None
         which = np.where((tracks.look >= 0) & descriptors.is_clear[tracks.look], tracks.look, -1)
-        calibration = calibrate(descriptors.values, tracks._replace(look=which), step_s)
+        calibration = calibrate(descriptors, tracks._replace(look=which), step_s)
         return None if calibration is None else cls(descriptors, calibration, step_s)
 
-    def between(self, tracks: Tracks) -> Sides:
-        """Compare parts of tracks."""
-        return Sides(self, tracks)
 
+class Windows:
+    """What is seen next to gaps between and within tracks (K,), which are numbered by ascending id."""
 
-class Sides:
-    """Compares what is seen on the two sides of gaps between and within tracks; made by ``Appearance.between``.
-
-    Tracks are numbered by ascending id.
-    """
-
-    def __init__(self, appearance: Appearance, tracks: Tracks) -> None:
-        descriptors, order = appearance.descriptors, tracks.order
+    def __init__(self, descriptors: Descriptors, tracks: Tracks, step_s: float) -> None:
+        order = tracks.order
         step, starts = tracks.step[order], run_starts(tracks.track[order])
-        self._calibration, self._values = appearance.calibration, descriptors.values
-        self._step_s = appearance.step_s
-        self._starts = np.append(np.flatnonzero(starts), len(order))
-        self._number = np.cumsum(starts) - 1  # of the track of each assignment
+        self._values, self._step_s = descriptors.values, step_s
+        self.starts = np.append(np.flatnonzero(starts), len(order))
+        number = np.cumsum(starts) - 1  # of the track of each assignment
         self._first_step, self._steps = int(step.min(initial=0)), int(np.ptp(step)) + 2 if len(step) else 2
-        self._when = self._number * self._steps + step - self._first_step
+        self._when = number * self._steps + step - self._first_step
         sample = tracks.look[order]
         is_seen = (sample >= 0) & descriptors.is_clear[sample]
-        self._at_border = (sample >= 0) & descriptors.at_border[sample]
-        self._seen, self._which = step[is_seen], sample[is_seen]
+        self.at_border = (sample >= 0) & descriptors.at_border[sample]
+        self._seen, self._which = np.append(step[is_seen], 0), np.append(sample[is_seen], 0)  # the last one of none
         self._known = np.append(0, np.cumsum(is_seen))  # the number of descriptors before each assignment
 
-    def of_tracks(self, end: Ints, begin: Ints) -> Floats:
-        """The log likelihood ratio (E,) that the end of one track and the beginning of another are one person.
-
-        A person who leaves the picture and comes back has two tracks. So where both are at its border, looking alike
-        says nothing.
-        """
-        stop, start = self._starts[end + 1], self._starts[begin]
-        ratio = self._compare(end, stop, begin, start)
-        return np.where(self._at_border[stop - 1] & self._at_border[start], np.minimum(ratio, 0), ratio)
-
-    def of_swaps(self, track: Ints, other: Ints, since: Ints, until: Ints) -> Floats:
-        """The log likelihood ratio (E,) that two tracks were exchanged from step ``since`` to ``until``."""
-        ratio = np.zeros(len(track))
-        for before, after, sign in ((track, other, 1), (other, track, 1), (track, track, -1), (other, other, -1)):
-            ratio += sign * self._compare(before, self._from(before, since), after, self._from(after, until + 1))
-        return ratio
-
-    def _from(self, track: Ints, step: Ints) -> Ints:
+    def since(self, track: Ints, step: Ints) -> Ints:
         """The first assignments of tracks (E,) at steps or later, or where the next track begins."""
         since = np.clip(step - self._first_step, 0, self._steps - 1)
         return np.searchsorted(self._when, track * self._steps + since)
 
-    def _compare(self, left: Ints, end: Ints, right: Ints, begin: Ints) -> Floats:
-        """The log likelihood ratio (E,) that ``left`` up to ``end`` and ``right`` from ``begin`` on are one person."""
-        if len(self._seen) == 0:
-            return np.zeros(len(left))
-        low, high = self._known[self._starts[left]], self._known[end]
+    def distances(self, left: Ints, end: Ints, right: Ints, begin: Ints) -> tuple[Floats, Floats, Bools]:
+        """The distances (E,) of ``left`` up to the assignment ``end`` to ``right`` from ``begin`` on, the seconds
+        between them, and whether something is seen of both.
+        """
+        low, high = self._known[self.starts[left]], self._known[end]
         before, is_before, last = self._window(high[:, None] - 1 - np.arange(WINDOW), low, high)
-        low, high = self._known[begin], self._known[self._starts[right + 1]]
+        low, high = self._known[begin], self._known[self.starts[right + 1]]
         after, is_after, first = self._window(low[:, None] + np.arange(WINDOW), low, high)
         distance = usual_distance(self._values, before, is_before, after, is_after)
-        ratio = self._calibration.log_ratio(distance, np.abs(first - last) * self._step_s)
-        return np.where(is_before.any(axis=1) & is_after.any(axis=1), ratio, 0.0)
+        return distance, np.abs(first - last) * self._step_s, is_before.any(axis=1) & is_after.any(axis=1)
 
     def _window(self, places: Ints, low: Ints, high: Ints) -> tuple[Ints, Bools, Ints]:
         """The descriptors at ``places`` (E, WINDOW), which of them are from ``low`` to before ``high`` and within
@@ -383,6 +313,37 @@ class Sides:
         step = self._seen[places]
         inside &= np.abs(step - step[:, :1]) * self._step_s <= WITHIN_S
         return self._which[places], inside, step[:, 0]
+
+
+class Sides:
+    """Compares what is seen on the two sides of gaps between and within tracks, which are numbered by ascending id."""
+
+    def __init__(self, appearance: Appearance, tracks: Tracks) -> None:
+        self._calibration = appearance.calibration
+        self._windows = Windows(appearance.descriptors, tracks, appearance.step_s)
+
+    def of_tracks(self, end: Ints, begin: Ints) -> Floats:
+        """The log likelihood ratio (E,) that the end of one track and the beginning of another are one person.
+
+        A person who leaves the picture and comes back has two tracks. So where both are at its border, looking alike
+        says nothing.
+        """
+        windows = self._windows
+        stop, start = windows.starts[end + 1], windows.starts[begin]
+        ratio = self._compare(end, stop, begin, start)
+        return np.where(windows.at_border[stop - 1] & windows.at_border[start], np.minimum(ratio, 0), ratio)
+
+    def of_swaps(self, track: Ints, other: Ints, since: Ints, until: Ints) -> Floats:
+        """The log likelihood ratio (E,) that two tracks were exchanged from step ``since`` to ``until``."""
+        ratio, at = np.zeros(len(track)), self._windows.since
+        for before, after, sign in ((track, other, 1), (other, track, 1), (track, track, -1), (other, other, -1)):
+            ratio += sign * self._compare(before, at(before, since), after, at(after, until + 1))
+        return ratio
+
+    def _compare(self, left: Ints, end: Ints, right: Ints, begin: Ints) -> Floats:
+        """The log likelihood ratio (E,) that ``left`` up to ``end`` and ``right`` from ``begin`` on are one person."""
+        distance, gap_s, are_seen = self._windows.distances(left, end, right, begin)
+        return np.where(are_seen, self._calibration.log_ratio(distance, gap_s), 0.0)
 
 
 # The appearance of tracks as rows: the mean histograms of the pictures in which they are seen clearly.

@@ -43,15 +43,6 @@ class ActiveTracks(NamedTuple):
     history: SmoothedHistory
     prediction: Forecast
 
-    @classmethod
-    def none(cls, length: int, horizon: int) -> ActiveTracks:
-        """No tracks."""
-        nothing = np.empty(0, np.int64)
-        flat = np.empty((0, 2))
-        history = SmoothedHistory(flat, flat, flat, np.empty((0, length - 1, 2)), nothing)
-        prediction = Forecast(np.empty((0, horizon, 2)), np.empty((0, horizon, 2, 2)))
-        return cls(nothing, nothing, nothing, nothing, history, prediction)
-
 
 class ConsistencyPass(OnlinePass):
     """Algorithm 1 over one log."""
@@ -69,7 +60,10 @@ class ConsistencyPass(OnlinePass):
         self._holt = Holt(options.alpha, options.beta)
         self._length = max(self._predictor.past, options.min_history, 2)
         self._histories = Histories(self._length)
-        self._tracks = ActiveTracks.none(self._length, horizon)
+        none, nothing = np.empty(0, np.int64), np.empty((0, self._length, 2))
+        history = SmoothedHistory.of_observations(self._holt, nothing, np.empty((0, self._length), bool))
+        forecast = Forecast(np.empty((0, horizon, 2)), np.empty((0, horizon, 2, 2)))
+        self._tracks = ActiveTracks(none, none, none, none, history, forecast)
         self.noise_m = DEFAULT_NOISE_M if options.noise_m is None else options.noise_m
         self._online = FrameCollector(TRACKS), FrameCollector(PREDICTIONS)
         self._next_id = 1
@@ -172,11 +166,6 @@ class ConsistencyPass(OnlinePass):
 # Letters: K tracks, N observations, T predicted steps.
 
 
-def mahalanobis(off: Floats, cov: Floats) -> Floats:
-    """Eq. 1: the lengths of ``off`` (..., 2) in standard deviations of ``cov`` (..., 2, 2)."""
-    return np.asarray(np.sqrt(np.maximum(mahalanobis_squared(off, cov), 0.0)))
-
-
 def paper_covariance(first: Ints, steps: int, sigma_m: float) -> Floats:
     """The paper's covariance, (u - t) sigma^2 per axis, for ``steps`` steps u from t + ``first``; (K, steps, 2, 2)."""
     ahead = first[:, None] + np.arange(steps)
@@ -203,7 +192,8 @@ def prediction_distances(
         track_cov = paper_covariance(age + 1, steps, sigma_m)
         observation_cov = paper_covariance(np.ones(len(observations.mean), np.int64), steps, sigma_m)
     off = tracks.mean[row, at][:, None] - observations.mean[None, :, :steps]
-    distance = mahalanobis(off, track_cov[:, None] + observation_cov[None])
+    squared = mahalanobis_squared(off, track_cov[:, None] + observation_cov[None])  # Eq. 1
+    distance = np.sqrt(np.maximum(squared, 0.0))
     counted = np.broadcast_to(overlaps[:, None], distance.shape)
     if kind == "mean":
         total = np.where(counted, distance, 0.0).sum(axis=-1)

@@ -36,13 +36,16 @@ if TYPE_CHECKING:
 
 #: Links have weights by the length of their gap: no step between, and up to so many seconds.
 GAPS_S: Final = (1.7, 5.0)
+#: The log odds that are added to links of an online track from one step to the next, no farther than at this speed and
+#: with no other track beside: however sharply a person turns there, it is the same one.
+_ALONE, _WALK_M_PER_S = 8.0, 1.1
 #: The number of ends and beginnings with the usual shares that count beside those of a log.
 _USUAL_ENDS: Final = 20.0
 #: A person who is lost beside another one may be hidden by that one, or in one detection with that one; from this
 #: distance on nothing speaks for it, and at half of it half as much.
 _BESIDE_M: Final = 2.0
-#: A long tracklet has so many samples, few are fewer than that; people are counted in squares of this size.
-_LONG, _FEW, _CELL_M = 8, 4, 1.0
+#: Few samples of a tracklet are fewer than that.
+_FEW: Final = 4
 #: Links are kept from these odds on, as a share of those of the least confidence: pieces of a person that stay apart
 #: cost more than wrong ones that go together. (Chosen on synthetic crowds.)
 _ENOUGH: Final = 1 / 5
@@ -85,8 +88,8 @@ class Tracklets(NamedTuple):
 class Hypotheses(NamedTuple):
     """The hypotheses about the tracklets of a log.
 
-    ``before`` and ``after`` (E,) are the tracklets of candidate links, ``gap_s`` (E,) the seconds between them and
-    ``gap`` (E,) the class of that; ``terms`` (E, F) are those of links, ``leaves`` and ``comes`` (K, G) of ends where a
+    ``before`` and ``after`` (E,) are the tracklets of candidate links, ``gap`` (E,) the class of the seconds between
+    them; ``terms`` (E, F) are those of links, ``leaves`` and ``comes`` (K, G) of ends where a
     person leaves, and of beginnings where one comes.
     ``evidence`` (E,) is the log likelihood ratio of what else tells whether both are one person.
     """
@@ -94,7 +97,6 @@ class Hypotheses(NamedTuple):
     tracklets: Tracklets
     before: Ints
     after: Ints
-    gap_s: Floats
     gap: Ints
     terms: Floats
     leaves: Floats
@@ -105,7 +107,7 @@ class Hypotheses(NamedTuple):
     def of(
         cls, model: MotionModel, tracks: Tracks, max_gap_s: float, asked: tuple[Ints, Ints] | None = None
     ) -> Hypotheses:
-        """The hypotheses about tracks as they are now, without ``evidence``.
+        """The hypotheses about tracks as they are now, with the ``evidence`` of those that go on alone.
 
         ``asked`` are assignments before and after that are of one person, however far apart.
         """
@@ -123,6 +125,10 @@ class Hypotheses(NamedTuple):
             before, after = np.unique(np.concatenate([[before, after], more], axis=1), axis=1)
         gaps = ends.gaps(before, after)
         gap_s, alone = gaps.seconds, motion_terms(model, ends_alone.gaps(before, after))
+        same_track, near = tracklets.online[before] == tracklets.online[after], tuple(map(_largest, beside))
+        apart_m = np.hypot(*(tracks.xy_m[tracklets.first[after]] - tracks.xy_m[tracklets.last[before]]).T)
+        is_alone = (tracklets.begins[after] - tracklets.ends[before] == 1) & (apart_m < _WALK_M_PER_S * gap_s)
+        is_alone &= same_track & (near[0][before] + near[1][after] == 0)
         so_far, left = _samples(tracks, tracklets)
         of_ids, of_tracks = _rates(tracks, tracklets)
         terms = {
@@ -132,7 +138,7 @@ class Hypotheses(NamedTuple):
             "misfit to noise alone": alone["misfit to noise"],
             "log gap": np.log(gap_s + 0.2),
             "same input id": tracklets.source[before] == tracklets.source[after],
-            "same track": tracklets.online[before] == tracklets.online[after],
+            "same track": same_track,
             "beside one track": _largest(beside[0][before].minimum(beside[1][after])),
             "samples before": np.log(tracklets.samples[before]),
             "samples after": np.log(tracklets.samples[after]),
@@ -146,12 +152,11 @@ class Hypotheses(NamedTuple):
             tracklets,
             before,
             after,
-            gap_s,
             np.searchsorted(bounds, gap_s),
             columns(CHOICES.terms, terms),
-            _end_terms(model, tracks, tracklets, tracked[0], _largest(beside[0]), leaving=True),
-            _end_terms(model, tracks, tracklets, tracked[1], _largest(beside[1]), leaving=False),
-            np.zeros(len(before)),
+            _end_terms(model, tracks, tracklets, tracked[0], near[0], leaving=True),
+            _end_terms(model, tracks, tracklets, tracked[1], near[1], leaving=False),
+            np.where(is_alone, _ALONE, 0.0),
         )
 
     def scored(self) -> Scored:
@@ -300,16 +305,12 @@ def _end_terms(
     ``state`` (C,) are the states of assignments, ``beside`` (K,) is how near another track is there, from 0 to 1.
     """
     at = tracklets.last if leaving else tracklets.first
-    here, is_long = tracks.xy_m[at], tracklets.samples >= _LONG
-    sides = np.concatenate([tracks.xy_m[tracklets.first[is_long]], tracks.xy_m[tracklets.last[is_long]]])
-    low, high = np.percentile(tracks.xy_m, [1, 99], axis=0)
-    ends_here = np.maximum(_around(sides, here) - is_long + 0.5, 0.1) / (_around(tracks.xy_m, here) + 5)
+    here, (low, high) = tracks.xy_m[at], np.percentile(tracks.xy_m, [1, 99], axis=0)
     border_m = np.maximum(np.minimum(here - low, high - here).min(axis=1), 0.0)
     steps = tracks.step.max() - tracklets.ends if leaving else tracklets.begins - tracks.step.min()
     left_s = steps * model.step_s
     terms = {
         "end": np.ones(len(at)),
-        "ends here": np.log(ends_here),
         "beside a track": beside,
         "border": np.log(border_m + 0.5),
         "speed": np.log(np.hypot(*state.mean[at, 2:].T) + 0.1),
@@ -321,15 +322,6 @@ def _end_terms(
         "few": tracklets.samples < _FEW,
     }
     return columns(CHOICES.end_terms, terms)
-
-
-def _around(points: Floats, xy: Floats) -> Ints:
-    """The number of points (N, 2) in the square of each position (K, 2) and in the eight around it, (K,)."""
-    from scipy.spatial import cKDTree
-
-    corner = np.concatenate([points, xy]).min(axis=0)
-    squares, here = ((places - corner) // _CELL_M for places in (points, xy))
-    return np.asarray(cKDTree(squares).query_ball_point(here, 1.5, p=np.inf, return_length=True))
 
 
 def _shifts(which: Ints, link: Floats, end: Floats, gap: Ints, usual: Floats) -> Floats:

@@ -20,7 +20,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.assignment import max_weight_matching
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
@@ -28,7 +27,9 @@ from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, filtered_rows, joined_parts, mapped_rows
 from mcaptrack.schema.resampling import interval_ns
-from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence
+from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Descriptors, Evidence, Sides
+from mcaptrack.transforms.retrack.hypotheses import named
+from mcaptrack.transforms.retrack.linking import best_links
 from mcaptrack.transforms.retrack.motion_model import Tracks
 from mcaptrack.transforms.retrack.weights import Logistic, columns, probability
 
@@ -123,11 +124,8 @@ def link_in_picture(
         if not (holds[first] and holds[other]):
             root[other] = first
             holds[first] |= holds[other]
-    is_cut = np.append(False, pieces.source[1:] == pieces.source[:-1])[: len(root)]
-    names = pieces.source.copy()
-    names[is_cut] = pieces.source.max(initial=0) + 1 + np.arange(is_cut.sum())
     begin_ns = observed.t_ns[pieces.frame[pieces.first[:-1]]] if len(root) else root
-    linked = Linked(observed, pieces.source, begin_ns, names[root], calibration)
+    linked = Linked(observed, pieces.source, begin_ns, named(root, pieces.source), calibration)
 
     def renamed(joined: JoinedFrames) -> Rows:
         rows = joined.rows
@@ -271,7 +269,7 @@ def _appearance(
     seen = Appearance.of(looks, samples, 1 / rate_hz)
     if seen is None or not seen.calibration.tells_apart:
         return seen and seen.calibration, None
-    return seen.calibration, seen.between(samples).of_tracks
+    return seen.calibration, Sides(seen, samples).of_tracks
 
 
 def _links(
@@ -284,15 +282,11 @@ def _links(
     i, j, features = find_candidates(pieces, max_gap_s, across_classes)
     odds = _PAIRS.log_odds(features) + (0.0 if seen is None else seen(i, j))
     least = min_confidence / (1 - min_confidence) * _SHARE_OF_ODDS
-    gain = _LINKS.log_odds(among_others(i, j, odds)) - np.log(least)
-    good = gain > 0
-    if not good.any():
-        return i[:0], j[:0]
-    count = len(pieces.source)
-    (i, j), gain = max_weight_matching((i[good], j[good]), np.round(gain[good], 6), (count, count))
-    likely = probability(gain + np.log(least))
+    log_odds = _LINKS.log_odds(among_others(i, j, odds))
+    best = best_links(i, j, log_odds - np.log(least), len(pieces.source))
+    i, j, likely = i[best], j[best], probability(log_odds[best])
     is_short = np.diff(pieces.first) * pieces.usual_s < CUT_S
-    as_a_whole, made = np.ones(count), np.zeros(len(i), bool)
+    as_a_whole, made = np.ones(len(pieces.source)), np.zeros(len(i), bool)
     for link in np.argsort(pieces.t_s[pieces.first[j]], kind="stable").tolist():
         chance = likely[link] * as_a_whole[i[link]]
         made[link] = chance > least / (1 + least)

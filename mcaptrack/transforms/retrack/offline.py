@@ -21,7 +21,7 @@ from mcaptrack.schema.classes import majority
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import spans_of
 from mcaptrack.schema.resampling import ANGLES, LINEAR
-from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, appearance_rows
+from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Sides, appearance_rows
 from mcaptrack.transforms.retrack.decisions import (
     CERTAIN,
     PERSON,
@@ -240,7 +240,7 @@ def hypotheses_of(log: WholeLog, tracks: Tracks, is_final: bool = False) -> Hypo
     hypotheses = Hypotheses.of(log.model, tracks, log.max_gap_s, log.answers.joined(tracks))
     looks = np.zeros(len(hypotheses.before))
     if log.appearance is not None:
-        sides = log.appearance.between(tracks._replace(track=hypotheses.tracklets.of))
+        sides = Sides(log.appearance, tracks._replace(track=hypotheses.tracklets.of))
         looks = sides.of_tracks(hypotheses.before, hypotheses.after)
     looks = log.answers.weighed(hypotheses, tracks, looks, is_final)
     return hypotheses._replace(evidence=hypotheses.evidence + looks)
@@ -249,7 +249,7 @@ def hypotheses_of(log: WholeLog, tracks: Tracks, is_final: bool = False) -> Hypo
 def _without_swaps(log: WholeLog, tracks: Tracks) -> Tracks:
     """Undo swaps of tracks that met."""
     ids, row, trajectories = to_trajectories(tracks.step, tracks.track, tracks.xy_m)
-    seen = None if log.appearance is None else log.appearance.between(tracks)
+    seen = None if log.appearance is None else Sides(log.appearance, tracks)
     owner, _ = resolve_swaps(log.model, trajectories, seen)
     return tracks._replace(track=ids[owner[row]])
 

@@ -307,15 +307,8 @@ class KeptIds(OnlinePass):
     def __init__(self, options: RetrackOptions, movers: Movers, frames: FrameColumns) -> None:
         super().__init__(frames, options.rate_hz, LAST_NS / NS_PER_S)
         self.noise_m = (DEFAULT_NOISE_M if options.noise_m is None else options.noise_m) / movers.unit_m
-        self._forecaster = Forecaster(
-            options.predictor,
-            options.horizon_s,
-            options.min_history,
-            options.rate_hz,
-            options.class_names,
-            options.class_limits,
-            adapt=options.adapt,
-        )
+        settings = options.predictor, options.horizon_s, options.min_history, options.rate_hz
+        self._forecaster = Forecaster(*settings, options.class_names, options.class_limits, adapt=options.adapt)
         source = column(frames, "track_id")
         ids, first, which = np.unique(source, return_index=True, return_inverse=True)
         number = np.empty(len(ids), np.int64)
