@@ -15,6 +15,7 @@ import pytest
 from mcaptrack.cli import common
 from mcaptrack.pipeline import LAYOUTS, layout_path
 from tests.commands import call, done
+from tests.tiers import thorough
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
@@ -105,6 +106,7 @@ def test_lines_of_json_of_one_log_and_of_a_fault_of_the_program(folder, monkeypa
     assert call("check", "none.mcap").err.startswith("mcaptrack: none.mcap")
 
 
+@thorough
 def test_many_inputs_are_ingested_by_workers_and_once(folder, monkeypatch):
     Path("labels").mkdir()
     for name in ("x", "y"):

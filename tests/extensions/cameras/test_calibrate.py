@@ -130,6 +130,7 @@ class TestCorrections:
         assert found["b"].why.startswith("it can't be compared: ")
         assert found["b"].before is None
 
+    @thorough
     def test_a_lens_stays_right(self) -> None:
         """A camera that was moved and turned: its correction is such a movement, for the same lens."""
         lens = Lens((700.0, 700.0), (480.0, 270.0))
