@@ -168,9 +168,6 @@ def test_a_header_has_four_names_and_no_number(tmp_path):
     assert delimited.header_of(Path("a"), "abcd") == []
 
 
-# Folders of YOLO
-
-
 # Times
 
 
