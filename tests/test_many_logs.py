@@ -31,6 +31,7 @@ def folder(template, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@thorough
 def test_results_for_stdout_come_in_the_order_of_the_logs_and_list_on_stdin(folder, monkeypatch):
     names = ["logs/deep/b.mcap", "logs/a.mcap"]
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("\n".join(names).encode())))

@@ -70,6 +70,7 @@ def test_the_source_distribution_has_every_file_of_the_repository(sdist):
     assert built - kept == {"PKG-INFO"}
 
 
+@thorough
 def test_the_source_distribution_builds_the_same_wheel(sdist, wheel, tmp_path):
     (again,) = WheelBuilder(str(sdist)).build(directory=str(tmp_path), versions=["standard"])
     assert Path(again).read_bytes() == wheel.read_bytes()

@@ -196,6 +196,7 @@ def homography(path: Path, topic: str) -> np.ndarray:
 
 
 class TestLogs:
+    @thorough
     def test_the_given_plane_stays_and_the_corrected_one_is_used(
         self, wrong: Path, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path
     ) -> None:
