@@ -104,7 +104,10 @@ def corners(row: Row) -> tuple[float, ...]:
 
 
 def by_frame(rows: Sequence[Row]) -> dict[int, list[Row]]:
-    return {frame: [row for row in rows if row.frame == frame] for frame in sorted({row.frame for row in rows})}
+    """The rows of each frame from the first to the last."""
+    numbers = [row.frame for row in rows]
+    frames = range(min(numbers), max(numbers) + 1) if rows else ()
+    return {frame: [row for row in rows if row.frame == frame] for frame in frames}
 
 
 def shares(row: Row) -> tuple[float, ...]:

@@ -27,9 +27,9 @@ NAN = float("nan")
         ("frame", ["0", "2147483647"], ["-1", "2147483648", "0.5"], "the frame (a count of pictures, no time) has to be a whole number from 0 to 2147483647, not {:g}"),
         ("id", ["-1", "0", "9007199254740991"], ["-2", "9007199254740992", "1.5"], "the id has to be a whole number from -1 to 9007199254740991, not {:g}"),
         ("class", ["-1", "1", "2147483647"], ["-2", "2147483648", "2.5"], "the class has to be a whole number from -1 to 2147483647, not {:g}"),
-        ("score", ["1e9", "-1e9"], ["1.5e9", "-1.5e9"], "a score can't be {:g}"),
-        ("x", ["1e8", "-1e8"], ["1.5e8", "-1.5e8"], "a coordinate can't be {:g}; at most 1e+08"),
-        ("h", ["0", "1e8"], ["1.5e8"], "a coordinate can't be {:g}; at most 1e+08"),
+        ("score", ["1e9", "-1e9"], ["1.1e9", "-1.1e9"], "a score can't be {:g}"),
+        ("x", ["1e8", "-1e8"], ["1.1e8", "-1.1e8"], "a coordinate can't be {:g}; at most 1e+08"),
+        ("h", ["0", "1e8"], ["1.1e8"], "a coordinate can't be {:g}; at most 1e+08"),
         ("w", ["0"], ["-0.5"], "a box can't be {:g} wide and 6 high"),
     ],
 )  # fmt: skip
@@ -166,9 +166,6 @@ def test_a_header_has_four_names_and_no_number(tmp_path):
     assert delimited.header_of(Path("a"), "a,b,c,5") == []
     assert delimited.header_of(Path("a"), '"a b", "c;d",e,f') == ["a b", "c;d", "e", "f"]
     assert delimited.header_of(Path("a"), "abcd") == []
-
-
-# Folders of YOLO
 
 
 # Times

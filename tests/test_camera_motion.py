@@ -17,6 +17,7 @@ from mcaptrack.schema import CAMERA_MOTION, Frame
 from mcaptrack.schema.camera_motion import frames_to_path, pose_to_rows, rows_to_verdict
 from mcaptrack.transforms.detect.background import Registration, Steadiness
 from mcaptrack.transforms.motion import EstimateMotion
+from tests.tiers import thorough
 from tests.worlds import ns
 
 WIDTH, HEIGHT = 480, 360
@@ -325,6 +326,7 @@ def test_a_camera_above_a_plain_floor_stands_still_while_people_walk():
         np.testing.assert_array_equal(pose.to_reference, IDENTITY)
 
 
+@thorough
 def test_leaves_that_sway_in_half_of_the_picture_are_no_motion_of_the_camera():
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
     share, image = np.clip((0.6 * HEIGHT - y) / 20, 0, 1), picture(SCENE, pose())

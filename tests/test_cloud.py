@@ -354,6 +354,7 @@ class TestDoctor:
         assert f"{store.endpoint}, region us-east-1" in page
         assert re.search("^  credentials +the environment$", page, re.M)
 
+    @thorough
     def test_what_may_not_be_done_is_one_line(self, store):
         store.put("night/a.mcap", b"x")
         with store.failing(lambda request: "denied" if request.method == "PUT" else ""):
@@ -427,6 +428,7 @@ def test_a_log_that_is_replaced_during_a_run_is_one_line(store, bare):
     assert "was replaced by another version while it was being read; try again" in err.splitlines()[-1]
 
 
+@thorough
 def test_a_whole_run_whose_credentials_expire_is_one_line_and_can_be_run_again(store, bare, expected):
     url, number = store.put("night/b.mcap", bare), count()
     with store.failing(lambda _: "expired" if next(number) > 1 else ""):

@@ -38,8 +38,8 @@ COMMANDS = GROUP.commands
 #: Pages that take long, and whose commands other tests run; those of README.md tools/readme.py runs in an environment of
 #: its own.
 LONG = {
-    "README.md", "camera-motion.md", "corrections.md", "extend.md", "fleet.md", "python.md", "results.md",
-    "robots.md", "sql.md", "stages.md", "tutorial.md",
+    "README.md", "camera-motion.md", "corrections.md", "demo.md", "extend.md", "fleet.md", "python.md", "results.md",
+    "robots.md", "sql.md", "stages.md", "troubleshooting.md", "tutorial.md",
 }  # fmt: skip
 #: What a page finds where it names it: a copy of a prepared file or folder.
 PREPARED = {

@@ -604,6 +604,7 @@ def test_an_exporter_does_not_replace_the_log(site, tracked):
     assert tracked.read_bytes() == before
 
 
+@thorough
 def test_many_logs_are_exported_by_a_package_each_to_its_own_file(site, tracked, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(site))
     Path("c.mcap").write_bytes(tracked.read_bytes())

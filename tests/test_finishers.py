@@ -24,6 +24,7 @@ from mcaptrack.schema import TRACKS
 from tests.commands import done
 from tests.logs import provenance_of
 from tests.test_extensions import add, site  # noqa: F401  # a fixture
+from tests.tiers import thorough
 
 TOPIC = "/camera/tracks/crowded"
 #: What a package has: a finisher that makes a channel of no rows, or another one.
@@ -87,6 +88,7 @@ print(result.stages, result.crowded)
     assert again == str(("crowded",)) + f" {{{TOPIC!r}: {crowded(path, 1)}}}"
 
 
+@thorough
 def test_later_runs_do_it_again_and_one_line_says_where_nothing_can(site, path, run):  # noqa: F811
     assert run(path).finished.keys() <= {"zones"}
     assert run(path, crowded=2).stages == ("crowded",)

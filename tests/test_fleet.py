@@ -239,6 +239,7 @@ def test_a_fleet_that_is_killed_takes_its_workers_along_and_can_be_started_again
     assert not is_running(worker)
 
 
+@thorough
 def test_two_fleets_share_the_work_and_do_no_log_twice(folder):
     for number in range(8):
         (folder / f"{number}.mcap").write_text(f"wait {folder / 'go'}")

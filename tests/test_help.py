@@ -285,15 +285,6 @@ class TestPage:
                 assert err.startswith(f"mcaptrack: {where} has to be ") is not is_taken, (case, text, err)
                 assert err.count("\n") == 1
 
-    @EVERY_COMMAND
-    def test_nan_is_refused(self, command):
-        for setting in COMMANDS[command].settings.values():
-            if setting.kind is float:
-                chosen = next((case.chosen for case in BOUNDED if case[::2][:2] == (command, setting.name)), ())
-                words = [command, *WORDS[command], *chosen, f"--{setting.name}=nan"]
-                _, _, err = call(*words)
-                assert err.startswith(f"mcaptrack: --{setting.name} has to be "), err
-
     def test_all_numbers_have_a_lower_and_an_upper_bound(self):
         bounded = {(one.command, one.name) for one in BOUNDED if math.isfinite(one.least) and math.isfinite(one.most)}
         numbers = {

@@ -157,6 +157,7 @@ def test_entry_points_of_a_folder_that_is_gone_do_not_count(gone, tmp_path):
 
 
 @pytest.mark.parametrize("gone", EXTENSIONS[:1])
+@thorough
 def test_a_folder_that_no_entry_point_leads_to_is_no_extension(gone, tmp_path):
     house_without([gone], tmp_path)
     (tmp_path / "mcaptrack" / "extensions" / gone).symlink_to(ROOT / "mcaptrack" / "extensions" / gone)

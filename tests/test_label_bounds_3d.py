@@ -376,15 +376,6 @@ def test_times_are_exact_in_every_unit(tmp_path):
         assert read_labels(table(tmp_path, row), role="truth").frame.tolist() == [1_000_000_002], name
 
 
-# KITTI
-
-
-# nuScenes
-
-
-# Argoverse 2
-
-
 # Into a log
 
 

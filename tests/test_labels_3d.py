@@ -122,15 +122,6 @@ def test_rows_without_a_box_are_frames_and_detections_need_no_ids(tmp_path):
     assert np.isnan(found.rows["vy_m_per_s"][1])
 
 
-# KITTI
-
-
-# nuScenes
-
-
-# Argoverse 2
-
-
 # Into a log
 
 

@@ -15,6 +15,7 @@ import pytest
 from mcaptrack.cli import common
 from mcaptrack.pipeline import LAYOUTS, layout_path
 from tests.commands import call, done
+from tests.tiers import thorough
 
 pytestmark = pytest.mark.usefixtures("never_waits")
 
@@ -30,6 +31,7 @@ def folder(template, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@thorough
 def test_results_for_stdout_come_in_the_order_of_the_logs_and_list_on_stdin(folder, monkeypatch):
     names = ["logs/deep/b.mcap", "logs/a.mcap"]
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("\n".join(names).encode())))
@@ -105,6 +107,7 @@ def test_lines_of_json_of_one_log_and_of_a_fault_of_the_program(folder, monkeypa
     assert call("check", "none.mcap").err.startswith("mcaptrack: none.mcap")
 
 
+@thorough
 def test_many_inputs_are_ingested_by_workers_and_once(folder, monkeypatch):
     Path("labels").mkdir()
     for name in ("x", "y"):

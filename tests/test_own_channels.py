@@ -429,6 +429,7 @@ class TestWriting:
         (channel,) = mcaptrack.info(tmp_path / "a.mcap").channels
         assert channel.written_by == name
 
+    @thorough
     def test_rows_about_anything_make_no_camera_and_run_goes_on(self, tmp_path):
         path = tmp_path / "a.mcap"
         write_clip(tmp_path / "clip.mp4", frames=20)

@@ -23,6 +23,7 @@ from mcaptrack import __version__
 from mcaptrack.cli import app
 from tests.commands import call
 from tests.sources import PACKAGE, texts
+from tests.tiers import thorough
 from tools.pages import with_links_that_lead
 
 ROOT = Path(__file__).parent.parent
@@ -57,6 +58,7 @@ def metadata(wheel, shipped) -> Message:
     return message_from_bytes(zipfile.ZipFile(wheel).read(name))
 
 
+@thorough
 def test_the_source_distribution_has_every_file_of_the_repository(sdist):
     if not (ROOT / ".git").exists():
         pytest.skip("this is no clone")
@@ -68,6 +70,7 @@ def test_the_source_distribution_has_every_file_of_the_repository(sdist):
     assert built - kept == {"PKG-INFO"}
 
 
+@thorough
 def test_the_source_distribution_builds_the_same_wheel(sdist, wheel, tmp_path):
     (again,) = WheelBuilder(str(sdist)).build(directory=str(tmp_path), versions=["standard"])
     assert Path(again).read_bytes() == wheel.read_bytes()

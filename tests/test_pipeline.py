@@ -114,6 +114,7 @@ class TestCompleteRun:
         assert rows["/camera/retracks/online", "metres"]["mode"] == "online"
 
 
+@thorough
 def test_new_detections_give_a_new_estimate_of_the_scale(footage, tmp_path):
     path = tmp_path / "a.mcap"
     ingest(footage.video, path, IngestOptions())

@@ -188,6 +188,7 @@ def test_what_is_missing_is_made_again_and_what_was_edited_stays(tmp_path):
     assert contents(tmp_path) == whole
 
 
+@thorough
 def test_a_ledger_counts_a_log_as_done_only_with_its_products(tmp_path):
     logs = [log_of(tmp_path / f"{name}.mcap") for name in ("a", "b", "c")]
     given = {"ledger": tmp_path / "ledger.jsonl", "jobs": 1}

@@ -268,7 +268,7 @@ def words_of(line: str) -> list[str]:
     return shown.decode().split("\0")[:-1]
 
 
-@pytest.mark.parametrize("where", one_in(6, SCENES))
+@pytest.mark.parametrize("where", one_in(12, SCENES))
 def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, request):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))

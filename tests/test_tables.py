@@ -237,9 +237,6 @@ def test_the_page_of_the_tables_has_every_column_with_unit_and_meaning():
             assert (unit, meaning) == tuple(field.metadata[key].decode() for key in (b"unit", b"description"))
 
 
-# Columns that are added later
-
-
 # Text
 
 

@@ -32,6 +32,7 @@ from tests.space_logs import (
     scene_update,
     write,
 )
+from tests.tiers import thorough
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,6 +288,7 @@ def rows_of(path: Path) -> dict[str, np.ndarray]:
     return {topic: rows.rows for topic, rows in found.items()}
 
 
+@thorough
 def test_limits_of_motion_reach_every_stage_and_are_recorded(street, tmp_path):
     """Channels that were made with other limits are made again; without the option, they stay as they are."""
     path = tmp_path / "a.mcap"

@@ -21,6 +21,7 @@ from mcaptrack.schema import TRACKS, WORLDS, Frame
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.retrack import decisions, offline
 from tests.commands import done
+from tests.tiers import thorough
 from tests.worlds import assert_same_rows, crossing_tracks, noisy_tracks
 
 QUICK = [Phase.explicit, Phase.generate]
@@ -105,6 +106,7 @@ def test_without_noise_a_world_is_what_was_decided(seed):
         assert decided.get(at, -1) == track
 
 
+@thorough
 def test_links_hold_in_as_many_worlds_as_are_likely():
     """One end that may go on as one beginning: the noise of a gain g makes the link hold where g + noise > 0."""
     frames = scene(7)

@@ -47,6 +47,7 @@ def test_mutants_are_read_or_refused(commands, tmp_path):
     assert not faults, "\n".join(faults)
 
 
+@thorough
 def test_the_same_seed_makes_the_same(tmp_path):
     for seed in range(len(bag_mutants.KINDS)):
         names = []

@@ -28,7 +28,7 @@ from mcaptrack.sources.ingest import IngestOptions, ingest, plain_yaml
 from tests import bounded
 from tests.commands import start
 from tests.extensions.bags.bags import ROS2, STRING1, database
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 
 TOPICS = [(1, "/a", STRING1, "cdr", "")]
 
@@ -534,6 +534,7 @@ def endless_bag(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "sent"), one_in(2, [(endless_database, signal.SIGINT), (endless_bag, signal.SIGTERM)])
 )
+@thorough
 def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent):
     name = "a.db3" if make is endless_database else "a.bag"
     make(folder / name)

@@ -429,6 +429,7 @@ class Fix:
     lon: float | None = None
 
 
+@thorough
 def test_rows_of_a_schema_of_the_user_are_messages_of_the_recording_and_of_a_bag(tmp_path):
     path = drive(tmp_path / "drive", shots=4)
     recorded = raw(path)

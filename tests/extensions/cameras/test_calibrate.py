@@ -130,6 +130,7 @@ class TestCorrections:
         assert found["b"].why.startswith("it can't be compared: ")
         assert found["b"].before is None
 
+    @thorough
     def test_a_lens_stays_right(self) -> None:
         """A camera that was moved and turned: its correction is such a movement, for the same lens."""
         lens = Lens((700.0, 700.0), (480.0, 270.0))
@@ -195,6 +196,7 @@ def homography(path: Path, topic: str) -> np.ndarray:
 
 
 class TestLogs:
+    @thorough
     def test_the_given_plane_stays_and_the_corrected_one_is_used(
         self, wrong: Path, right: tuple[Path, mcaptrack.CalibrateResult], tmp_path: Path
     ) -> None:

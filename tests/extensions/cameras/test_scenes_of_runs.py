@@ -73,6 +73,7 @@ def test_named_cameras_are_run_and_fused_alone_and_others_join_later(path: Path)
     assert channel.parameters["cameras"] == ["east", "north", "south"]
 
 
+@thorough
 def test_a_tracker_of_boxes_is_for_the_cameras(path: Path) -> None:
     with collected():
         result = mcaptrack.run(path, camera="east,south", tracker="ocsort", predictor="cv", tables=False)

@@ -17,13 +17,17 @@ from tests.label_cases import Row, Writer, as_json, read, refused, said, table
 
 
 def annotations(rows: Sequence[Row]) -> Any:
-    kinds = {"person": 1, "77": 77, None: None}
+    kinds = {"person": 1, "car": 2, "77": 77, None: None}
     images = [{"id": n, "frame_id": n, "width": 640, "height": 480} for n in sorted({row.frame for row in rows})]
     entries = [
         {"image_id": row.frame, "track_id": row.id, "bbox": list(row.box), "score": row.score, "category_id": kinds[row.kind]}
         for row in rows
     ]  # fmt: skip
-    return {"images": images, "annotations": entries, "categories": [{"id": 1, "name": "person"}]}
+    return {
+        "images": images,
+        "annotations": entries,
+        "categories": [{"id": kinds[kind], "name": kind} for kind in ("person", "car")],
+    }
 
 
 WRITERS = {

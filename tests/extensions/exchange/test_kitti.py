@@ -9,7 +9,6 @@ import pytest
 from mcaptrack.errors import McaptrackError
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.tables.compared import compare_files
-from tests import test_label_bounds
 from tests.label_cases import Row, Writer, corners, number, per_frame, text
 from tests.test_compared import by_trackeval, crowd, same_as_trackeval, scores
 from tests.test_label_files import FORMATS, Read, assert_read, assert_refused, written
@@ -93,15 +92,6 @@ REFUSED = {
 @pytest.mark.parametrize(("name", "role", "text", "words"), REFUSED.values(), ids=REFUSED)
 def test_what_is_no_file_of_labels_is_refused_in_these_words(name, role, text, words, tmp_path):
     assert_refused(name, role, text, words, tmp_path)
-
-
-LINE = "{frame} {id} Pedestrian 0 0 0 {x} 20 {right} 50 1 1 1 1 1 1 0 {score}"
-BOUNDS = [bound for bound in test_label_bounds.BOUNDS if bound[0] in ("frame", "id", "score") and "mot" in bound[1]]
-
-
-@pytest.mark.parametrize(("name", "column", "value", "is_taken"), test_label_bounds.tried(BOUNDS))
-def test_a_number_is_taken_up_to_its_bound_and_no_further(name, column, value, is_taken, tmp_path):
-    test_label_bounds.assert_bound("kitti", LINE, column, value, is_taken, tmp_path)
 
 
 def line_of(frame, who, kind, x, *, truncated=0, occluded=0, height=50.0, more=()):

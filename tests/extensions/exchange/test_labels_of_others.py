@@ -15,7 +15,8 @@ from mcaptrack.extensions.exchange.masks import box_of_mask
 from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels import of_packages
 from mcaptrack.sources.ingest.labels.reading import label_file, read_labels
-from tests.label_cases import WALK, writers
+from tests.extensions.exchange.test_youtube_vis import youtube_vis
+from tests.label_cases import WALK, Row, writers
 from tests.test_labels_of_others import (
     ALL,
     NEITHER,
@@ -30,15 +31,8 @@ from tests.test_labels_of_others import (
     written,
 )
 
-
-def voc(folder: Path, number: int, rows: list[tuple[Any, ...]]) -> None:
-    objects = "".join(
-        f"<object><name>{row[2]}</name><bndbox><xmin>{row[3]}</xmin><ymin>{row[4]}</ymin><xmax>{row[3] + row[5]}</xmax>"
-        f"<ymax>{row[4] + row[6]}</ymax></bndbox></object>"
-        for row in rows
-    )
-    size = "<size><width>640</width><height>480</height></size>"
-    written(folder / f"p{number}.xml", f"<annotation><filename>p{number}.jpg</filename>{size}{objects}</annotation>")
+WRITERS = writers()
+ROWS = [Row(frame, track, box, kind=label, score=score) for frame, track, label, *box, score in SCENE]
 
 
 def old_labelme(folder: Path, number: int, rows: list[tuple[Any, ...]]) -> None:
@@ -48,17 +42,6 @@ def old_labelme(folder: Path, number: int, rows: list[tuple[Any, ...]]) -> None:
         objects += f"<object><name>{label}</name><polygon>{corners}</polygon><attributes>track_id={track}</attributes></object>"
     size = "<imagesize><nrows>480</nrows><ncols>640</ncols></imagesize>"
     written(folder / f"p{number}.xml", f"<annotation><filename>p{number}.jpg</filename>{size}{objects}</annotation>")
-
-
-def labelme(folder: Path, number: int, rows: list[tuple[Any, ...]]) -> None:
-    shapes = [
-        {"label": row[2], "points": [[row[3] + row[5], row[4]], [row[3], row[4] + row[6]]], "shape_type": "rectangle"}
-        for row in rows
-    ]
-    written(
-        folder / f"p{number}.json",
-        {"shapes": shapes, "imagePath": f"p{number}.jpg", "imageWidth": 640, "imageHeight": 480},
-    )
 
 
 def kitti(with_id: bool, with_score: bool) -> Callable[[Path, int, list[tuple[Any, ...]]], None]:
@@ -88,23 +71,29 @@ def each(folder: Path, write: Callable[[Path, int, list[tuple[Any, ...]]], None]
     return folder
 
 
-def via(rows: list[tuple[Any, ...]]) -> list[dict[str, Any]]:
-    return [
-        {
-            "shape_attributes": {"name": "rect", "x": x, "y": y, "width": w, "height": h},
-            "region_attributes": {"class": label, "track": str(track)},
-        }
-        for _, track, label, x, y, w, h, _ in rows
-    ]
+def by_writer(name: str, folder: Path, place: str = "") -> Path:
+    """The scene by the writer of a format, at a place in the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = WRITERS[name].write(folder, ROWS)
+    target = folder / place if place else path
+    target.parent.mkdir(parents=True, exist_ok=True)
+    return path.rename(target)
 
 
-def via_csv() -> str:
+def via_project(folder: Path) -> Path:
+    files = json.loads(by_writer("via", folder).read_text())
+    for file in files.values():
+        file["regions"] = {str(number): region for number, region in enumerate(file["regions"])}
+    return written(folder / "a.json", {"_via_settings": {}, "_via_img_metadata": files})
+
+
+def via_csv(folder: Path) -> Path:
     out = "filename,file_size,file_attributes,region_count,region_id,region_shape_attributes,region_attributes\n"
-    for number, rows in frames():
-        for region in via(rows) or [{"shape_attributes": {}, "region_attributes": {}}]:
+    for file in json.loads(by_writer("via", folder).read_text()).values():
+        for region in file["regions"] or [{"shape_attributes": {}, "region_attributes": {}}]:
             cells = [json.dumps(value).replace('"', '""') for value in region.values()]
-            out += f'p{number}.jpg,9,"{{}}",1,0,"{cells[0]}","{cells[1]}"\n'
-    return out
+            out += f'{file["filename"]},9,"{{}}",1,0,"{cells[0]}","{cells[1]}"\n'
+    return written(folder / "a.csv", out)
 
 
 def runs(x: int, y: int, w: int, h: int) -> list[int]:
@@ -127,68 +116,12 @@ def packed(counts: list[int]) -> str:
     return out
 
 
-def youtube_vis(key: str, box: Callable[..., Any]) -> dict[str, Any]:
-    tracks = []
-    for track, label in ((1, 7), (2, 9)):
-        places = {row[0]: box(*row[3:7]) for row in SCENE if row[1] == track}
-        tracks.append(
-            {"id": track, "video_id": 1, "category_id": label, key: [places.get(number) for number in range(4)]}
-        )
-    video = {
-        "id": 1,
-        "width": 640,
-        "height": 480,
-        "length": 4,
-        "file_names": [f"v/{number:05d}.jpg" for number in range(4)],
-    }
-    return {
-        "videos": [video],
-        "annotations": tracks,
-        "categories": [{"id": 7, "name": "person"}, {"id": 9, "name": "car"}],
-    }
-
-
-def datumaro() -> dict[str, Any]:
-    items = [
-        {
-            "id": f"p{number}",
-            "annotations": [
-                {
-                    "type": "bbox", "bbox": row[3:7], "label_id": ("person", "car").index(row[2]),
-                    "attributes": {"track_id": row[1], "score": row[7]},
-                }
-                for row in rows
-            ],
-            "image": {"size": [480, 640]},
-        }
-        for number, rows in frames()
-    ]  # fmt: skip
-    return {"categories": {"label": {"labels": [{"name": "person"}, {"name": "car"}]}}, "items": items}
-
-
-def darknet() -> list[dict[str, Any]]:
-    names = ("center_x", "center_y", "width", "height")
-    return [
-        {
-            "frame_id": number + 1, "filename": f"p{number}.jpg",
-            "objects": [
-                {
-                    "class_id": 0, "name": label, "confidence": score,
-                    "relative_coordinates": dict(
-                        zip(names, ((x + w / 2) / 640, (y + h / 2) / 480, w / 640, h / 480), strict=True)
-                    ),
-                }
-                for _, _, label, x, y, w, h, score in rows
-            ],
-        }
-        for number, rows in frames()
-    ]  # fmt: skip
-
-
-def coco() -> dict[str, Any]:
-    boxes = [{"image_id": row[0], "bbox": row[3:7], "category_id": 7 if row[1] == 1 else 9} for row in SCENE]
-    images = [{"id": number, "file_name": f"p{number}.jpg", "width": 640, "height": 480} for number in range(4)]
-    return {"images": images, "annotations": boxes, "categories": youtube_vis("bboxes", lambda *_: None)["categories"]}
+def with_masks(folder: Path) -> Path:
+    content = json.loads(by_writer("youtube-vis", folder).read_text())
+    for track in content["annotations"]:
+        boxes = track.pop("bboxes")
+        track["segmentations"] = [box and {"size": [480, 640], "counts": packed(runs(*box))} for box in boxes]
+    return written(folder / "a.json", content)
 
 
 def mots(rows: Any = SCENE) -> str:
@@ -228,22 +161,22 @@ def test_highd_has_corners_and_ind_has_centres_in_metres(tmp_path):
 
 #: What writes the scene, the format that it is found to be of, and what beside boxes and classes it holds.
 KINDS: dict[str, tuple[Callable[[Path], Path], str, str]] = {
-    "voc": (lambda p: each(p / "voc", voc), "voc", NEITHER),
-    "voc, inside": (lambda p: each(p / "Annotations", voc).parent, "voc", NEITHER),
+    "voc": (lambda p: by_writer("voc", p), "voc", NO_SCORES),
+    "voc, inside": (lambda p: by_writer("voc", p / "x", "Annotations").parent, "voc", NO_SCORES),
     "labelme xml": (lambda p: each(p / "x", old_labelme), "voc", NO_SCORES),
-    "labelme": (lambda p: each(p / "x", labelme), "labelme", NEITHER),
+    "labelme": (lambda p: by_writer("labelme", p), "labelme", NO_IDS),
     "deepstream": (lambda p: each(p / "x", kitti(False, True)), "kitti-frames", NO_IDS),
     "deepstream tracks": (lambda p: each(p / "x", kitti(True, True)), "kitti-frames", ALL),
     "kitti": (lambda p: each(p / "training/label_2", kitti(False, False)).parent.parent, "kitti-frames", NEITHER),
-    "via": (lambda p: written(p / "a.json", {f"p{k}.jpg99": {"filename": f"p{k}.jpg", "size": 99, "regions": via(rows)} for k, rows in frames()}), "via", NO_SCORES),
-    "via project": (lambda p: written(p / "a.json", {"_via_settings": {}, "_via_img_metadata": {f"p{k}": {"filename": f"p{k}.jpg", "regions": {str(n): region for n, region in enumerate(via(rows))}} for k, rows in frames()}}), "via", NO_SCORES),
-    "via csv": (lambda p: written(p / "a.csv", via_csv()), "via", NO_SCORES),
-    "datumaro": (lambda p: written(p / "annotations/default.json", datumaro()).parent.parent, "datumaro", ALL),
-    "darknet": (lambda p: written(p / "a.json", darknet()), "darknet", NO_IDS),
-    "youtube-vis": (lambda p: written(p / "a.json", youtube_vis("bboxes", lambda *box: box)), "youtube-vis", NO_SCORES),
-    "youtube-vis masks": (lambda p: written(p / "a.json", youtube_vis("segmentations", lambda *box: {"size": [480, 640], "counts": packed(runs(*box))})), "youtube-vis", NO_SCORES),
+    "via": (lambda p: by_writer("via", p), "via", NO_SCORES),
+    "via project": (via_project, "via", NO_SCORES),
+    "via csv": (via_csv, "via", NO_SCORES),
+    "datumaro": (lambda p: by_writer("datumaro", p, "annotations/default.json").parent.parent, "datumaro", ALL),
+    "darknet": (lambda p: by_writer("darknet", p), "darknet", NO_IDS),
+    "youtube-vis": (lambda p: by_writer("youtube-vis", p), "youtube-vis", ALL),
+    "youtube-vis masks": (with_masks, "youtube-vis", ALL),
     "mots": (lambda p: written(p / "a.txt", mots()), "mots", NO_SCORES),
-    "coco folder": (lambda p: written(written(p / "annotations/instances_a.json", coco()).with_name("image_info_a.json"), {"images": []}).parent.parent, "coco", NEITHER),
+    "coco folder": (lambda p: written(by_writer("coco", p, "annotations/instances_a.json").with_name("image_info_a.json"), {"images": []}).parent.parent, "coco", ALL),
     "yolo of datumaro": (lambda p: each(p / "obj_train_data", yolo, ("../obj.names", "person\ncar\n"), ("../train.txt", "data/p0.jpg")).parent, "yolo", ALL),
     "yolo of ultralytics": (lambda p: each(p / "labels/train", yolo, ("../../data.yaml", "names: [person, car]\n")).parent.parent, "yolo", ALL),
 }  # fmt: skip
@@ -261,7 +194,7 @@ def test_one_scene_says_the_same_in_every_kind_of_file(name, tmp_path):
         ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]><annotation/>', "a document type"),
         (
             "a.json",
-            youtube_vis("bboxes", lambda *box: box) | {"videos": [{"id": 1}, {"id": 2}]},
+            youtube_vis(ROWS) | {"videos": [{"id": 1}, {"id": 2}]},
             "give one file for each",
         ),
         ("a.txt", "0 1 2 480 640 ^^\n", "not MOTS"),
@@ -282,9 +215,6 @@ def test_one_of_several_splits_is_given(tmp_path):
     assert label_file(path).path == path / "labels/train"
     words = "holds labels in 2 places, labels/train, labels/val; give one of them"
     assert_not_read("a/labels/val/p0.txt", row, words, tmp_path)
-
-
-WRITERS = writers()
 
 
 @pytest.mark.parametrize("names", [*permutations(("voc", "labelme", "kitti-frames"), 2)])

@@ -3,29 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from tests.extensions.exchange.test_supervision import WRITERS
+from tests.label_cases import Row
 from tests.test_own_boxes import IDS, assert_numbered, assert_refused, table, written
-
-CLASSES = ["person", "bicycle", "dog"]
-
-
-#: Frame, left, top, width, height, score, class, id: dyadic, so that every format holds them exactly.
-Row = tuple[int, float, float, float, float, float, str, int]
-
-
-def _sink(row: Row) -> dict[str, object]:
-    frame, x, y, w, h, score, name, one = row
-    head = {"x_min": x, "y_min": y, "x_max": x + w, "y_max": y + h, "class_id": CLASSES.index(name)}
-    return head | {"confidence": score, "tracker_id": one, "class_name": name, "frame_index": frame}
-
-
-def as_supervision(folder: Path, rows: list[Row]) -> Path:
-    table = [_sink(row) for row in rows]
-    return written(folder, "s.csv", "\n".join([",".join(table[0]), *(",".join(map(str, r.values())) for r in table)]))
 
 
 def coco_with(tmp_path, images=None, box=(1, 2, 30, 40), category="3", name="person"):
@@ -59,7 +43,7 @@ def test_yolo_as_it_comes_from_tools(tmp_path):
 
 
 def test_only_frame_index_of_supervision_counts_from_0(tmp_path):
-    text = as_supervision(tmp_path, [(1, 1.0, 2.0, 3.0, 4.0, 0.5, "person", 7)]).read_text()
+    text = WRITERS["supervision"].write(tmp_path, [Row(1)]).read_text()
     for column, first in (("frame_index", 0), ("frame_number", 1)):
         assert table(tmp_path, text.replace("frame_index", column)).first_frame == first
 

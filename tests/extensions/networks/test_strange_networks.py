@@ -44,7 +44,7 @@ from tests.extensions.networks.onnx_graphs import (
     tensor,
     value,
 )
-from tests.tiers import one_in
+from tests.tiers import one_in, thorough
 
 SIZE = (512, 384)
 PICTURE = blue_blocks(SIZE, (64, 32, 32, 32), (224, 160, 32, 32))
@@ -304,6 +304,7 @@ def refuses_to_start() -> None:
 
 
 @pytest.mark.parametrize("use", one_in(2, USES))
+@thorough
 def test_a_network_that_breaks_its_process_is_named(use):
     def kill() -> None:
         os.kill(at_work(os.getpid()), signal.SIGSEGV)

@@ -245,6 +245,7 @@ def test_nothing_is_left_of_a_clip_that_fails(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@thorough
 def test_a_log_with_pictures_that_cannot_be_decoded_is_processed_and_drawn_without_them(tmp_path):
     whole, path, output = tmp_path / "whole.mcap", tmp_path / "eye.mcap", tmp_path / "eye.mp4"
     write_log(whole, "/eye/image")

@@ -20,6 +20,7 @@ from tests.commands import call, done
 from tests.extensions.report.test_report import _ELEMENTS, _NASTY
 from tests.logs import some_log
 from tests.reader import Reader
+from tests.tiers import thorough
 
 #: 2026-11-01, midnight.
 FIRST_S = 1_793_491_200
@@ -165,6 +166,7 @@ def folder(tmp_path_factory) -> Path:
     return place
 
 
+@thorough
 def test_the_page_about_tables_links_to_pages_beside_logs(folder, tmp_path):
     said = done("report", folder / "tables", "-o", tmp_path / "fleet.html", "--json")
     assert json.loads(said.out)["summary"]["logs"] == 2

@@ -179,6 +179,7 @@ def log_tracks(path) -> list:
         return [(frame.t_ns, frame.rows["track_id"].tolist()) for frame in opened.frames("/camera/retracks", TRACKS)]
 
 
+@thorough
 def test_answers_about_tracks_that_are_gone_are_left_out_and_said(own):
     review = mcaptrack.review(own)
     name = next(iter(review.questions))
@@ -293,6 +294,7 @@ def test_the_page_keeps_each_answer_at_once_and_takes_it_back(seen, tmp_path, mo
             urllib.request.urlopen(review.address + "yes-0")
 
 
+@thorough
 def test_every_option_of_the_command_has_an_effect(seen, tmp_path, monkeypatch):
     own, opened = shutil.copyfile(seen, tmp_path / "walk.mcap"), []
     monkeypatch.setattr(asking, "_LEAST", 0.0)
