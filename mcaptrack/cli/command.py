@@ -253,7 +253,10 @@ def is_on_command_line(parameter: str) -> bool:
 
 
 def warn_unused(reason: str, *parameters: str) -> None:
-    """Warn of options on the command line that have no effect in this call; ``reason`` says why."""
+    """Warn of options on the command line that have no effect in this call; ``reason`` says why.
+
+    ``parameters`` are the names of the options in Python.
+    """
     command: Any = RUNNING.get().command
     for setting in command.settings.values():
         if setting.parameter in parameters and is_on_command_line(setting.parameter):

@@ -66,7 +66,10 @@ _MIN_GAP_BYTES: Final = 64 * 2**10
 
 
 class Message(NamedTuple):
-    """A recorded message; times in nanoseconds."""
+    """A recorded message; times in nanoseconds.
+
+    ``t_ns`` is the log time and ``publish_ns`` the publish time; ``sequence`` is its number.
+    """
 
     t_ns: int
     sequence: int

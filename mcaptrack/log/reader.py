@@ -51,6 +51,9 @@ class Channel(NamedTuple):
     """A channel of a log, or all channels of a topic: ``messages`` is their total, the rest describes the first one.
 
     ``schema_name`` of rows is that of their schema, mcaptrack.Tracks, also where they are ROS messages.
+
+    ``id`` is its number in the file, ``message_encoding`` the encoding of payloads, as in "protobuf" or "cdr", and
+    ``metadata`` its texts by key.
     """
 
     id: int
@@ -265,6 +268,8 @@ def find_topic(name: str, topics: Collection[str], where: Location, prefix: str 
 
     "tracks" is /camera/tracks. A name that is none of the topics is that below the camera, or comes back as it is.
     Raises McaptrackError, with the topics, if there are several.
+
+    ``where`` names the log in the error.
     """
     below = f"{prefix}/{name}"
     if name in topics or (prefix and below in topics):

@@ -403,6 +403,8 @@ def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Ite
     """Write a new log, which is published at ``path`` when the block succeeds.
 
     ``header`` is the header of another log.
+
+    ``profile`` is that of the MCAP registry, such as "ros2".
     """
     refuse_earlier_results(path)
     is_half_written = journal.is_left_behind(path)
