@@ -212,8 +212,8 @@ class RecordingReader:
     as_log: Any = None
 
     def __init__(self) -> None:
-        self.findings = ReadingNotes()
-        self.closing = ExitStack()
+        self.findings: ReadingNotes = ReadingNotes()
+        self.closing: ExitStack = ExitStack()
 
     def close(self) -> None:
         """Close its files."""

@@ -93,7 +93,7 @@ class Command(TyperCommand):
         super().__init__(name, **arguments)
         function = arguments["callback"]
         self.parameters: tuple[Parameter, ...] = function.parameters
-        self.settings = declared_settings(name, self.parameters)
+        self.settings: dict[str, Setting] = declared_settings(name, self.parameters)
         self.most_used: tuple[str, ...] = function.most_used
         self.settable: tuple[str, ...] = function.settable
         self.set_parameters: list[Parameter] = function.set_parameters

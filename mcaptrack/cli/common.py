@@ -67,7 +67,8 @@ class Talk:
     """Prints notes and progress to stderr: progress on a terminal only; with ``quiet`` only warnings."""
 
     def __init__(self, quiet: bool, verbose: bool = False) -> None:
-        self.quiet, self.verbose = quiet, verbose
+        self.quiet: bool = quiet
+        self.verbose: bool = verbose
         self._bar: Any = None
         self._tasks: dict[str, Any] = {}
         self._shown = 0.0

@@ -512,7 +512,8 @@ class Messages:
     """
 
     def __init__(self, source: ByteSource, index: Index) -> None:
-        self.source, self.index = source, index
+        self.source: ByteSource = source
+        self.index: Index = index
         self._opened: OrderedDict[int, Bytes] = OrderedDict()  # the last chunks that were opened, for other channels
         self._opened_bytes = 0
         self._asked: OrderedDict[tuple[tuple[int, ...], Span], MessageBatches] = OrderedDict()

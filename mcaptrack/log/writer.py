@@ -75,9 +75,10 @@ class LogWriter:
 
     def __init__(self, sink: Sink, offset: int = 0, crc: int | None = 0, index: Index | None = None) -> None:
         index = index or Index()
-        self._sink, self.offset = sink, offset
+        self._sink = sink
+        self.offset: int = offset
         #: The checksum of the data section; only of what this writer added, if the rest is not known.
-        self.crc = crc or 0
+        self.crc: int = crc or 0
         self._crc_known = crc is not None
         self.schemas: dict[int, SchemaRecord] = index.schemas
         self.channels: dict[int, ChannelRecord] = index.channels

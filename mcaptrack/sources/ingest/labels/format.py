@@ -52,7 +52,8 @@ class LabelFile:
     """A file or folder that may hold labels, of which formats look at the beginning; what was read is kept."""
 
     def __init__(self, path: Path, lines: Lines | None = None) -> None:
-        self.path, self._lines = path, lines
+        self.path: Path = path
+        self._lines = lines
 
     @cached_property
     def is_folder(self) -> bool:
