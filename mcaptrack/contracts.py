@@ -99,7 +99,11 @@ class LabelFormat(Protocol):
 
 
 class Box(NamedTuple):
-    """A box in a picture, in pixels; ``score`` is from 0 to 1."""
+    """A box in a picture, in pixels; ``score`` is from 0 to 1.
+
+    ``x_px`` and ``y_px`` are the left upper corner, ``w_px`` and ``h_px`` width and height. A score that isn't known is
+    NaN, a ``class_name`` "".
+    """
 
     x_px: float
     y_px: float
@@ -115,6 +119,8 @@ class Box3d(NamedTuple):
     ``stamp_ns`` is 0 and ``frame_id`` "" where the message states none. ``source_id`` is a number or a text, None where
     there is none. ``velocity`` is along the axes of the frame in m/s. ``has_heading`` is false where the message says
     that the orientation is not known.
+
+    ``score`` is from 0 to 1, NaN where it isn't known; ``class_name`` is "" then.
     """
 
     stamp_ns: int
@@ -206,8 +212,8 @@ class RecordingReader:
     as_log: Any = None
 
     def __init__(self) -> None:
-        self.findings = ReadingNotes()
-        self.closing = ExitStack()
+        self.findings: ReadingNotes = ReadingNotes()
+        self.closing: ExitStack = ExitStack()
 
     def close(self) -> None:
         """Close its files."""
@@ -272,6 +278,8 @@ class SectionTable(NamedTuple):
 
     ``columns`` are the heads of the cells. The role gives the colour: "tracks", "samples", "online", "offline" or
     "truth".
+
+    ``caption`` is a sentence above it.
     """
 
     caption: str
@@ -285,6 +293,8 @@ class ReportSection(NamedTuple):
 
     ``short`` is its link at the top. ``figures`` are made by ``figure`` of ``mcaptrack.viewing.charts``. ``data``
     stands in the JSON below the name of the section.
+
+    ``title`` is its heading, ``tables`` come before the figures, and ``note`` is a sentence below them.
     """
 
     short: str

@@ -86,6 +86,8 @@ def offer(name: str, names: Iterable[str], has: str = "it has") -> str:
 def call(function: str, *values: str | Path, **parameters: Any) -> str:
     """A call to propose in a message, in backquotes. Placeholders for the user to fill in are in capitals.
 
+    ``function`` is its name, ``values`` its arguments without a name, and ``parameters`` those with one.
+
     Examples
     --------
     >>> call("ingest", "LABELS", into=Path("my log.mcap"))
@@ -116,6 +118,8 @@ def command(*parts: str | Path) -> str:
     """A command to propose at a terminal or on a page, in backquotes and quoted for a shell.
 
     A path is never mistaken for an option, whatever its name. Placeholders for the user to fill in are in capitals.
+
+    ``parts`` are the words after ``mcaptrack``.
 
     Examples
     --------

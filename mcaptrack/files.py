@@ -90,7 +90,10 @@ def publish_folder(folder: Path) -> Iterator[Path]:
 
 
 def publish_bytes(path: Path, data: bytes) -> None:
-    """Write a small file atomically. Raises McaptrackError if it can't be written."""
+    """Write a small file atomically. Raises McaptrackError if it can't be written.
+
+    ``data`` is its content.
+    """
     with publish_stream(path) as stream:
         stream.write(data)
 
@@ -226,7 +229,10 @@ def place_of(location: Location) -> Location:
 
 
 def is_same_file(path: Location, other: Location) -> bool:
-    """Whether two paths lead to the same existing file."""
+    """Whether two paths lead to the same existing file.
+
+    ``other`` is the second of them.
+    """
     if isinstance(path, Url) or isinstance(other, Url):
         return path == other
     return path.exists() and other.exists() and path.samefile(other)
@@ -283,7 +289,10 @@ def read_json(
 
 
 def unreadable(path: Path, error: OSError | ValueError) -> McaptrackError:
-    """The fault of a file that can't be read: one that isn't there, or why the system refuses it."""
+    """The fault of a file that can't be read: one that isn't there, or why the system refuses it.
+
+    ``error`` is what the system raised.
+    """
     if isinstance(error, FileNotFoundError):
         return McaptrackError(missing(path))
     return McaptrackError(f"{path} can't be read: {getattr(error, 'strerror', None) or str(error).splitlines()[0]}")
@@ -314,7 +323,10 @@ def missing(path: Path) -> str:
 
 
 def refuse_special(path: Path) -> None:
-    """Raise McaptrackError for a pipe, a device or a socket (reading may never end), and an impossible name."""
+    """Raise McaptrackError for a pipe, a device or a socket (reading may never end), and an impossible name.
+
+    ``path`` may name a file, a folder or nothing.
+    """
     try:
         mode = path.stat().st_mode
     except OSError as error:

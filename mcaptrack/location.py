@@ -158,7 +158,10 @@ def sibling(location: P, end: str, *, of: str | None = None) -> P:
 
 
 def shortened(name: str, most_bytes: int) -> str:
-    """A name, of which no more than this is kept if it is longer, with a digest of the whole name after it."""
+    """A name, of which no more than this is kept if it is longer, with a digest of the whole name after it.
+
+    ``most_bytes`` is the largest length in UTF-8.
+    """
     raw = _raw(name)
     if len(raw) <= most_bytes:
         return name
@@ -170,7 +173,10 @@ def _raw(name: str) -> bytes:
 
 
 def local_name(location: Location, suffix: str) -> Path:
-    """The default path of a file that is made of a log: beside a file, or for an object in the working folder."""
+    """The default path of a file that is made of a log: beside a file, or for an object in the working folder.
+
+    ``location`` is the log, and ``suffix`` takes the place of its .mcap.
+    """
     return sibling(Path(location.name) if isinstance(location, Url) else location, suffix)
 
 

@@ -108,6 +108,8 @@ def warn(message: str, code: Code = "other") -> None:
     """Warn of something that changes results or casts doubt on them: what, where, and what to do.
 
     A log that keeps the warning names no file, so the name of the log that it is about goes.
+
+    ``message`` is one line, and ``code`` says which kind of warning it is, for programs.
     """
     line, log = " ".join(message.splitlines()), _LOG.get()
     _pass_on(Notice(line.removeprefix(f"{log}: "), code, log), _LISTENER.get())

@@ -7,8 +7,9 @@ import doctest
 import importlib
 import inspect
 import re
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,6 +63,73 @@ def test_transforms_have_a_summary_of_one_sentence_known_sections_and_their_pape
         assert PAPERS.get(name, "") in text.partition("References")[2]
     assert all("Examples\n" in inspect.getdoc(stage.default) for stage in STAGES.values())
     assert set(PAPERS) <= {name for kind in BUILT_IN.values() for name in kind}
+
+
+#: Rooms that offer what they import; other public modules have ``__all__``.
+ROOMS = ("foxglove", "log", "pipeline", "schema", "tables")
+#: Words for what a parameter or a field holds, in the place of its name.
+SAID = {
+    "path": "file|log|folder|place|recording|store", "opened": "log|camera|channel|scene", "log": "log", "prefix": "camera|scene",
+    "topic": "channel", "t": "time", "xy": "position|track", "sha256": "digest", "px": "pixel", "schema name": "schema", "url": "URL",
+    "table": "answer|table|rows", "resident bytes": "memory", "provenance": "made", "image": "picture", "width": "width|size",
+    "scene": "SceneUpdate", "sight": "ground|picture|annotations", "payload": "message", "doc": "description",
+}  # fmt: skip
+#: Units at the end of names, and plural forms.
+UNIT = re.compile(r"(_(ns|s|px|m|rad|m2|bytes))?$")
+
+
+def public() -> dict[str, Any]:
+    """The functions and classes that public modules offer, by where they are defined."""
+    modules = [path for path in sorted(ROOT.rglob("*.py")) if re.search("^__all__\\b", path.read_text("utf-8"), re.M)]
+    modules += [ROOT / room / "__init__.py" for room in ROOMS]
+    out = {}
+    for path in modules:
+        module = importlib.import_module(
+            ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
+        )
+        for name in getattr(module, "__all__", vars(module)):
+            value = inspect.unwrap(getattr(module, name))
+            is_own = getattr(value, "__module__", "").startswith("mcaptrack") and not name.startswith("_")
+            if is_own and (inspect.isfunction(value) or inspect.isclass(value)):
+                out[f"{value.__module__}.{value.__qualname__}"] = value
+    return out
+
+
+def undocumented(value: Any) -> list[str]:
+    """The parameters, or the fields, of which the docstring says neither the name nor what they hold."""
+    if inspect.isclass(value):
+        text = "\n".join(
+            inspect.getdoc(base) or "" for base in value.__mro__ if base.__module__.startswith("mcaptrack")
+        )
+        own = fields(value) if is_dataclass(value) else ()
+        names = [f.name for f in own if "help" not in f.metadata and "context" not in f.metadata] or getattr(
+            value, "_fields", ()
+        )
+    else:
+        text, names = inspect.getdoc(value) or "", inspect.signature(value).parameters
+    for name in re.findall(r"``mcaptrack\.(\w+)``, which explains them", text):
+        text += inspect.getdoc(getattr(mcaptrack, name)) or ""
+    return [name for name in names if not name.startswith("_") and not is_said(name, text)]
+
+
+def is_said(name: str, text: str) -> bool:
+    stem = UNIT.sub("", name).replace("_", " ")
+    words = [SAID.get(stem, "")] if stem in SAID else [SAID.get(word, word.removesuffix("s")) for word in stem.split()]
+    return bool(re.search(rf"\b{name}\b", text)) or all(re.search(rf"\b(?:{word})", text, re.I) for word in words)
+
+
+def raises_silently(value: Any) -> bool:
+    """Whether a function raises what its docstring doesn't say."""
+    source = inspect.getsource(value) if inspect.isfunction(value) else ""
+    return bool(re.search(r"^\s+raise [A-Z]", source, re.M)) and "raise" not in (inspect.getdoc(value) or "").lower()
+
+
+def test_public_names_say_what_their_parameters_and_fields_hold_and_what_they_raise():
+    names = public()
+    assert len(names) > 350
+    wrong = {name: undocumented(value) for name, value in names.items()}
+    assert {name: silent for name, silent in wrong.items() if silent} == {}
+    assert [name for name, value in names.items() if raises_silently(value)] == []
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -170,6 +170,17 @@ def test_labels_of_built_in_formats_import_no_package_and_stay_as_they_are(site)
     assert not is_imported("semicolons")
 
 
+def test_a_package_may_read_xml(site):
+    code = "from mcaptrack.contracts import LabelBoxes\nclass Part:\n    def recognises(self, path):\n        return b'<yard' in path.read_bytes()\n    def read(self, path):\n        return LabelBoxes(frame=[0], boxes=[[1, 2, 3, 4]])\n"
+    add(site, "label_format", "yard", code)
+    Path("a.xml").write_text("<?xml version='1.0'?><yard/>")
+    Path("b.xml").write_text("<court/>")
+    done("ingest", "a.xml", "--as", "detections", "--fps", "10", "-o", "a.mcap")
+    assert provenance_of("a.mcap", "/camera/detections").parameters["format"] == "yard"
+    said = one_line("ingest", "b.xml", "--as", "detections", "--fps", "10", "-o", "b.mcap")
+    assert "b.xml:1: XML that begins with <court> is of no label format (mot, " in said
+
+
 def test_a_label_file_of_several_formats_is_refused_and_a_broken_one_is_named(site):
     Path("a.boxes").write_text(BOXES)
     code = "class Part:\n    def recognises(self, path):\n        return True\n    def read(self, path): ...\n"

@@ -71,7 +71,10 @@ def paths_of(paths: PathLike | Sequence[PathLike] | None) -> list[Path]:
 
 
 def locations_of(paths: PathLike | Sequence[PathLike]) -> list[Location]:
-    """Return one location, or several, as a list."""
+    """Return one location, or several, as a list.
+
+    ``paths`` are of files, or URLs in a store.
+    """
     return [as_location(path) for path in _each(paths)]
 
 
@@ -91,6 +94,8 @@ def split_names(parameter: str, value: str | Sequence[str] | None) -> tuple[str,
     """Return names that were given as a sequence, or as text with commas between them.
 
     Raises McaptrackError for an empty name; ``parameter`` is what they were given as.
+
+    ``value`` is that sequence or text, or None for no names.
     """
     if value is None:
         return ()
@@ -128,7 +133,10 @@ def warnings_about(log: object) -> Iterator[list[Notice]]:
 
 
 def warn_unused(reason: str, **is_unused: bool) -> None:
-    """Warn of parameters that have no effect in this call, as far as they were given; ``reason`` says why."""
+    """Warn of parameters that have no effect in this call, as far as they were given; ``reason`` says why.
+
+    ``is_unused`` says of each parameter, by its name, whether it was given.
+    """
     for name, is_given in is_unused.items():
         if is_given:
             notices.warn(f"`{name}=` changes nothing here: {reason}", "option-not-used")
@@ -144,5 +152,8 @@ class Notes(list[str]):
 
 
 def detail(note: str) -> None:
-    """Log a detail."""
+    """Log a detail.
+
+    ``note`` is a line of text.
+    """
     _LOGGER.debug(note)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mcaptrack.pipeline.write import Made, RunState
 
 #: The option of ``run`` that a finisher gets, if it has a parameter of this name.
-_FORCE: Final = "force"
+FORCE: Final = "force"
 
 
 class PartsOfRun:
@@ -103,7 +103,7 @@ class PartsOfRun:
     def _made(self, entry: Entry, values: Mapping[str, object], force: bool = False) -> Any:
         """Return what a function makes of these values of options."""
         own = {name: values[name] for name in self._options[entry] if name in values}
-        own |= {_FORCE: force} if _FORCE in inspect.signature(entry.cls).parameters else {}
+        own |= {FORCE: force} if FORCE in inspect.signature(entry.cls).parameters else {}
         with blamed(entry, "failed"):
             return entry.cls(**own)
 
@@ -126,7 +126,7 @@ def _options_of(entry: Entry) -> dict[str, inspect.Parameter]:
     own = {
         name: parameter.replace(kind=parameter.KEYWORD_ONLY, annotation=hints.get(name, Any))
         for name, parameter in parameters.items()
-        if name != _FORCE
+        if name != FORCE
     }
     for name, parameter in own.items():
         if parameter.default is parameter.empty:

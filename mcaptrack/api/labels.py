@@ -118,7 +118,10 @@ def label_options(
     ground_plane: PathLike | None = None,
     point: Point = "foot",
 ) -> IngestOptions:
-    """Return options as values. Raises McaptrackError for texts that say none."""
+    """Return options as values. Raises McaptrackError for texts that say none.
+
+    The parameters are those of ``mcaptrack.ingest``, which explains them.
+    """
     from mcaptrack.api.common import optional_path
     from mcaptrack.schema.classes import ClassMap
     from mcaptrack.sources.ingest import IngestOptions
@@ -146,7 +149,10 @@ def label_options(
 
 
 def warn_of_unused(options: IngestOptions, reason: str, *but: str) -> None:
-    """Warn of options of label files that were given and change nothing, apart from some; ``reason`` says why."""
+    """Warn of options of label files that were given and change nothing, apart from some; ``reason`` says why.
+
+    ``but`` are the names of those that do change something.
+    """
     for given in [options.given(name) for name in _NAMES if name not in but]:
         if given:
             notices.warn(f"{given} changes nothing here: {reason}", "option-not-used")

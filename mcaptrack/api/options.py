@@ -119,7 +119,11 @@ def min_iou(shown: str | None = None) -> Option:
 
 
 def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown: str | None = None) -> Option:
-    """The option that chooses a detector, tracker or so on of the registry by name; ``shown`` is its default."""
+    """The option that chooses a detector, tracker or so on of the registry by name; ``shown`` is its default.
+
+    ``kind`` is that of the registry; ``intro`` is the beginning of its help, with {kind} in the place of the kind, and
+    ``panel`` the heading in the help above it.
+    """
     from mcaptrack.registry import names, own
 
     text = (
@@ -150,4 +154,7 @@ MinIou = Annotated[float, min_iou()]
 
 
 def no_progress(stage: str, done: int, total: int) -> None:
-    """Ignore the progress."""
+    """Ignore the progress.
+
+    ``stage`` is what is done, ``done`` and ``total`` are numbers of its steps.
+    """

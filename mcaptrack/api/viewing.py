@@ -173,25 +173,28 @@ class LogServer:
             self._server = Server(files, 0, host=host, index=index)
         self._thread: threading.Thread | None = None
         self._views = views  # a temporary file with views that the log lacks
-        self.address = self._server.root
-        self.logs = tuple(self._server.address(name) for name in contents.files)
-        self.layouts = {name: self._server.address(file) for name, (file, _) in contents.layouts.items()}
+        self.address: str = self._server.root
+        self.logs: tuple[str, ...] = tuple(self._server.address(name) for name in contents.files)
+        self.layouts: dict[str, str] = {
+            name: self._server.address(file) for name, (file, _) in contents.layouts.items()
+        }
         first = next(iter(self.layouts.values()), None)
 
         def links_to(layout: str | None, at_ns: int) -> dict[str, str]:
             return viewer_links(self.logs, layout, lichtblick, at_ns if at_ns > contents.start_ns else None)
 
-        self.lichtblick = {
+        self.lichtblick: dict[str, str] = {
             name: links_to(address, contents.at_ns)["Lichtblick"] for name, address in self.layouts.items()
         }
-        self.links = links_to(first, contents.at_ns)
+        self.links: dict[str, str] = links_to(first, contents.at_ns)
         of_events = self.layouts.get(links.EVENT_LAYOUT, first)
-        self.events = tuple(
+        self.events: tuple[LinkedEvent, ...] = tuple(
             event._replace(link=links_to(of_events, event.opens_ns(contents.start_ns))["Lichtblick"])
             for event in contents.events
         )
-        self.at_s = contents.seconds(contents.at_ns)
-        self.notes, self.warnings = contents.notes, contents.warnings
+        self.at_s: float = contents.seconds(contents.at_ns)
+        self.notes: tuple[str, ...] = contents.notes
+        self.warnings: tuple[Notice, ...] = contents.warnings
 
     def _pages(self, contents: _Contents) -> dict[str, Page]:
         """Return our pages on a log, by name."""

@@ -103,7 +103,7 @@ class Command(TyperCommand):
         super().__init__(name, **arguments)
         function = arguments["callback"]
         self.parameters: tuple[Parameter, ...] = function.parameters
-        self.settings = declared_settings(name, self.parameters)
+        self.settings: dict[str, Setting] = declared_settings(name, self.parameters)
         self.most_used: tuple[str, ...] = function.most_used
         self.elsewhere: Mapping[str, Elsewhere] = function.elsewhere
         self.settable: Mapping[str, Settable] = function.settable
@@ -275,7 +275,10 @@ def is_option_given(parameter: str) -> bool:
 
 
 def warn_unused(reason: str, *parameters: str) -> None:
-    """Warn of options on the command line that have no effect in this call; ``reason`` says why."""
+    """Warn of options on the command line that have no effect in this call; ``reason`` says why.
+
+    ``parameters`` are the names of the options in Python.
+    """
     for parameter in filter(is_on_command_line, parameters):
         warn(f"`{parameter}=` changes nothing here: {reason}", "option-not-used")
 

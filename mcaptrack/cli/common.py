@@ -67,7 +67,8 @@ class Talk:
     """Prints notes and progress to stderr: progress on a terminal only; with ``quiet`` only warnings."""
 
     def __init__(self, quiet: bool, verbose: bool = False) -> None:
-        self.quiet, self.verbose = quiet, verbose
+        self.quiet: bool = quiet
+        self.verbose: bool = verbose
         self._bar: Any = None
         self._tasks: dict[str, Any] = {}
         self._shown = 0.0
@@ -182,7 +183,10 @@ def check_paths(values: Mapping[str, Any]) -> None:
 
 
 def expand(paths: Sequence[Path], *, each: bool = False, folders: bool = False) -> list[Location]:
-    """Return the inputs that arguments name; see ``fleet.expansion.find_inputs``."""
+    """Return the inputs that arguments name; see ``fleet.expansion.find_inputs``.
+
+    ``paths`` are those arguments, ``each`` and ``folders`` as there.
+    """
     from mcaptrack.fleet.expansion import find_inputs
 
     return [found_log.path for found_log in find_inputs(paths, each=each, folders=folders)]
@@ -287,6 +291,8 @@ def print_json(data: dict[str, Any]) -> None:
     """Print a JSON object to stdout, with the version of the schema, the inputs that failed and all warnings.
 
     The output is flushed, so that other programs get it while this one continues, as ``view`` does.
+
+    ``data`` is that object, with values of JSON.
     """
     added = {
         "failed": [failure._asdict() for failure in _BATCH.get().failed],

@@ -89,7 +89,8 @@ class Called(Generic[T]):
     most_used: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
-        self.name, self.values = name, values
+        self.name: str = name
+        self.values: Mapping[str, Any] = values
 
     @classmethod
     def declaration(cls, name: str) -> Callable[..., T]:

@@ -92,9 +92,9 @@ class EachLog(Called[T]):
     """
 
     #: Whether logs, or files beside them, are changed.
-    writes: ClassVar = True
+    writes: ClassVar[bool] = True
     #: Whether results are what is printed to stdout: one after the other, in the order of the logs.
-    prints_results: ClassVar = False
+    prints_results: ClassVar[bool] = False
     #: Whether all logs have one output, a folder.
     shares_output = False
     #: Whether the output of a log is a folder itself.
@@ -105,7 +105,7 @@ class EachLog(Called[T]):
     def __init__(self, name: str, values: Mapping[str, Any]) -> None:
         super().__init__(name, values)
         self.inputs: Sequence[NamedLog] = ()
-        self.many = ManyOptions(**{option: values[option] for option in NAMES if option in values})
+        self.many: ManyOptions = ManyOptions(**{option: values[option] for option in NAMES if option in values})
 
     @classmethod
     def options(cls, name: str) -> list[Parameter]:

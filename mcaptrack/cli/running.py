@@ -31,7 +31,7 @@ class RunsStages(EachLog["RunResult"]):
     """A command that runs stages on each log."""
 
     #: Whether the numbers of events are what is asked for.
-    shows_events: ClassVar = False
+    shows_events: ClassVar[bool] = False
 
     def show(self, log: Location, done: RunResult, talk: common.Talk) -> None:
         """Print what was made, and commands to run next."""

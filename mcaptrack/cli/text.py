@@ -49,7 +49,10 @@ def printable(text: str) -> str:
 
 
 def counted(count: int, singular: str) -> str:
-    """A count with its noun: 1 track, 2 tracks, 1,000 tracks."""
+    """A count with its noun: 1 track, 2 tracks, 1,000 tracks.
+
+    ``singular`` is the noun for one; an s makes it several.
+    """
     return f"{count:,} {singular}{'' if count == 1 else 's'}"
 
 
@@ -176,6 +179,9 @@ def print_table(
 
 
 def show_left_out(names: Sequence[str], where: str = "--json") -> None:
-    """Print which columns a table has no room for, and where they are."""
+    """Print which columns a table has no room for, and where they are.
+
+    ``names`` are those of the columns; nothing is printed without any.
+    """
     if names:
         show(f"no room for {', '.join(names)}: a wider window, a pipe and {where} have all")

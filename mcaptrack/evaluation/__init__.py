@@ -89,7 +89,11 @@ class EvaluateOptions:
 
 @dataclass
 class Candidate:
-    """Tracks to be scored: their name and frames, and the forecasts made from them, if any."""
+    """Tracks to be scored: their name and frames, and the forecasts made from them, if any.
+
+    ``mode`` is "online" or "offline" for re-tracked ones, None for others. ``group`` is a name shared by the tracks of
+    several sequences, if theirs differ; ``classes`` are the names of the classes in the rows, by class id.
+    """
 
     name: str
     mode: str | None
@@ -111,7 +115,11 @@ class Labelled(NamedTuple):
 
 @dataclass
 class EvaluationInput:
-    """One sequence: its ground truth and the tracks to be scored against it."""
+    """One sequence: its ground truth and the tracks to be scored against it.
+
+    ``name`` is that of the sequence. ``candidates`` are those tracks; ``classes`` are the names of the classes of the
+    ground truth by class id, and ``labelled`` says which of its frames were labelled.
+    """
 
     name: str
     ground_truth: Sequence[Frame]
@@ -171,6 +179,9 @@ class EvaluationRow:
     ``class_means`` are then the means of rates over classes, as TrackEval gives them ("class averaged"). ``averages``
     are scores averaged over recalls (AMOTA), of 3D tracks (``is_3d``) with scores; ``scored`` are the matchups that
     they are from.
+
+    ``sequence``, ``mode`` and ``group`` are as for ``EvaluationInput`` and ``Candidate``; ``rules`` are those of
+    "trackeval" or "motmetrics"; ``displacement`` are the errors of forecasts, None without any.
     """
 
     sequence: str
@@ -225,7 +236,11 @@ def ground_truth_of_log(opened: log.Log, prefix: str) -> list[Frame]:
 
 
 def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> EvaluationInput:
-    """The ground truth of a camera and its tracks, at the video rate and at the prediction rate."""
+    """The ground truth of a camera and its tracks, at the video rate and at the prediction rate.
+
+    ``topics`` are the tracks, by default those that the camera usually has. Raises McaptrackError if the log has no
+    ground truth, or no tracks.
+    """
     ground_truth = ground_truth_of_log(opened, prefix)
     names_of_usual = (*SCORED, FULL) if has_positions(ground_truth, "bev-iou") else SCORED
     usual = [f"{prefix}/{name}" for name in names_of_usual]
@@ -298,7 +313,10 @@ def evaluate(
 
 
 def set_means(results: Sequence[EvaluationRow]) -> None:
-    """Set averages over recalls, and ``class_means`` of rows of all classes together, where there are several."""
+    """Set averages over recalls, and ``class_means`` of rows of all classes together, where there are several.
+
+    ``results`` are the rows of all sequences; they are changed.
+    """
     for row in results:
         if row.scored:
             row.averages = averages(row.scored, row.similarity, row.gate, row.rules)
@@ -315,7 +333,10 @@ def set_means(results: Sequence[EvaluationRow]) -> None:
 
 
 def combined(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
-    """Combine all sequences: a row for each kind of tracks, similarity and gate."""
+    """Combine all sequences: a row for each kind of tracks, similarity and gate.
+
+    ``results`` are the rows of all sequences.
+    """
     groups: dict[tuple[Any, ...], list[EvaluationRow]] = {}
     for row in results:
         key = (row.group or row.tracks, row.mode, row.similarity, row.gate, row.rules, row.of_class)

@@ -52,7 +52,10 @@ PEOPLE: Final = Nouns()
 def nouns_of(
     ground_truth: Sequence[Frame], tracks: Sequence[Frame], classes: tuple[Mapping[int, str], Mapping[int, str]]
 ) -> Nouns:
-    """The nouns for objects: names of their classes, where any is no person. ``classes`` as in `find_events`."""
+    """The nouns for objects: names of their classes, where any is no person. ``classes`` as in `find_events`.
+
+    ``ground_truth`` and ``tracks`` are frames of rows; what is no person in them has another noun.
+    """
     sides = [_class_names(frames, names) for frames, names in zip((ground_truth, tracks), classes, strict=True)]
     names = {name for side in sides for name in side.values()}
     if names <= {_PERSON, _OBJECT}:
@@ -158,7 +161,10 @@ class _EventGroups:
 
 
 def describe(event: Any, where: str, frame_interval_s: float, nouns: Nouns = PEOPLE) -> str:
-    """One row of events as text; ``frame_interval_s`` is the usual time between two frames."""
+    """One row of events as text; ``frame_interval_s`` is the usual time between two frames.
+
+    ``where`` is the place and the time as the end of a clause, and ``nouns`` are those for objects.
+    """
     track, before = f"track {event['track_id']}", int(event["previous_id"])
     truth_id, source = int(event["truth_id"]), int(event["source_id"])
     person = f"{nouns.ground_truth.get(truth_id, nouns.usual)} {truth_id}"

@@ -129,7 +129,11 @@ class FleetResult(Generic[T]):
 
 @dataclass(frozen=True)
 class Running:
-    """A log that a worker is busy with: the stage, how much of it is done, since when, and its memory."""
+    """A log that a worker is busy with: the stage, how much of it is done, since when, and its memory.
+
+    ``done`` of ``total`` steps are done, None if it isn't known of how many; ``seconds`` have passed since the log
+    began, and ``resident_bytes`` of memory are used.
+    """
 
     log: Location
     stage: str = ""
@@ -141,7 +145,10 @@ class Running:
 
 @dataclass(frozen=True)
 class FleetStatus:
-    """The progress of a fleet: number of logs, by state of those that ended, and those that run."""
+    """The progress of a fleet: number of logs, by state of those that ended, and those that run.
+
+    ``running`` are those that run now, and ``seconds`` have passed since it began.
+    """
 
     logs: int
     ended: Mapping[State, int] = field(default_factory=dict)

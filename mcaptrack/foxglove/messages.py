@@ -48,12 +48,19 @@ def schema_record(schema_name: str) -> tuple[str, str, bytes]:
 
 
 def pack_picture(schema_name: str, t_ns: int, frame_id: str, image_format: str, data: bytes) -> bytes:
-    """A CompressedVideo or CompressedImage message."""
+    """A CompressedVideo or CompressedImage message.
+
+    ``schema_name`` says which of the two. ``t_ns`` is its time in ns, ``frame_id`` its frame of reference; ``data`` is
+    the picture in ``image_format``, as in "h264" or "jpeg".
+    """
     return pack_stamped(message_class(schema_name)(frame_id=frame_id, format=image_format, data=data), t_ns)
 
 
 def pack_transform(t_ns: int, parent_frame_id: str, frame_id: str) -> bytes:
-    """A FrameTransform message: a frame with the pose of its parent."""
+    """A FrameTransform message: a frame with the pose of its parent.
+
+    ``t_ns`` is its time in ns; ``frame_id`` and ``parent_frame_id`` name the two frames.
+    """
     message = message_class(TRANSFORM)(parent_frame_id=parent_frame_id, child_frame_id=frame_id)
     message.translation.SetInParent()
     message.rotation.w = 1.0
@@ -68,7 +75,10 @@ def pack_stamped(message: Any, t_ns: int) -> bytes:
 
 
 def pack_log(t_ns: int, level: str, name: str, text: str) -> bytes:
-    """A Log message; ``level`` is "DEBUG", "INFO", "WARNING" or "ERROR", ``name`` is that of the source."""
+    """A Log message; ``level`` is "DEBUG", "INFO", "WARNING" or "ERROR", ``name`` is that of the source.
+
+    ``t_ns`` is its time in ns, and ``text`` what it says.
+    """
     kind = message_class(LOG)
     return pack_stamped(kind(level=kind.Level.Value(level), name=name, message=text), t_ns)
 

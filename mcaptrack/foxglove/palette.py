@@ -57,7 +57,10 @@ _UNKNOWN: Final = (0.75, 0.75, 0.75)
 
 
 def class_colour(class_id: int, name: str = "") -> tuple[float, float, float]:
-    """The colour of a class: by its name, so that cars have one colour in all logs, else by its number; 0 is grey."""
+    """The colour of a class: by its name, so that cars have one colour in all logs, else by its number; 0 is grey.
+
+    ``class_id`` is that number. Returns red, green and blue from 0 to 1.
+    """
     parts = re.split(r"[\W_]+", name.casefold())
     index = next((_CLASSES[word] for word in parts if word in _CLASSES), None)
     if index is None and not class_id:

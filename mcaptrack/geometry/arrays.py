@@ -27,7 +27,10 @@ Record = TypeVar("Record", bound=tuple[Any, ...])
 
 
 def taken(record: Record, which: Bools | Ints | Indices | slice) -> Record:
-    """Some members of all arrays of a record."""
+    """Some members of all arrays of a record.
+
+    ``which`` is a mask, or are places, along the first axis of each.
+    """
     return type(record)(*(taken(part, which) if isinstance(part, tuple) else part[which] for part in record))
 
 

@@ -36,6 +36,8 @@ class GroundPlane:
     picture: a scale alone, or a plane that was estimated. With a ``lens``, pixels are those that it makes, and the
     homography is for pixels without its distortion, with a third component that is positive on the ground. Raises
     McaptrackError if the homography is not 9 finite numbers or is singular.
+
+    ``width_px`` and ``height_px`` are the size of the pictures, None if it isn't known.
     """
 
     homography: tuple[float, ...]

@@ -92,7 +92,10 @@ def _is_at(place: Location, part: Log | None) -> bool:
 
 
 def topics_with_schema(log: Log, names: Sequence[str]) -> list[Channel]:
-    """The channels with one of these schemas, sorted by topic."""
+    """The channels with one of these schemas, sorted by topic.
+
+    ``names`` are those of the schemas, as in mcaptrack.Tracks, and ``log`` is open for reading.
+    """
     return [channel for _, channel in sorted(log.channels.items()) if channel.schema_name in names]
 
 
@@ -166,6 +169,8 @@ def copy_attachments_and_metadata(
     """Copy the attachments of a log, and its metadata records except those named in ``without``.
 
     ``copied`` are digests of records that are there already, and are left out; those of new ones are added.
+
+    ``writer`` writes them into another log.
     """
     copied = set() if copied is None else copied
     with log.snapshot.reporting_damage():

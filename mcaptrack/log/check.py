@@ -53,7 +53,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass
 class CheckResult:
-    """The result of ``check``."""
+    """The result of ``check``.
+
+    ``path`` is the log; ``messages`` and ``chunks`` are their numbers; ``findings`` are its errors and warnings.
+    """
 
     path: Location
     messages: int = 0
@@ -207,7 +210,10 @@ def clock_jumps(opened: Log) -> list[ClockJump]:
 
 
 def jumps_text(jumps: list[ClockJump], start_ns: int) -> str:
-    """The jumps as a clause: how long the longest is, and when it begins in the log; "" if there are none."""
+    """The jumps as a clause: how long the longest is, and when it begins in the log; "" if there are none.
+
+    ``start_ns`` is the time of the first message.
+    """
     if not jumps:
         return ""
     longest = max(jumps, key=lambda jump: jump.after_ns - jump.before_ns)

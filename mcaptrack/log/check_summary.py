@@ -29,7 +29,11 @@ _STATISTICS: Final = {
 
 
 class Finding(NamedTuple):
-    """An error or a warning: its first offset in the file, and how often it occurs."""
+    """An error or a warning: its first offset in the file, and how often it occurs.
+
+    ``level`` is "error" or "warning", ``kind`` names what is wrong for programs, ``words`` for people. ``where`` is the
+    offset in bytes, and ``times`` the number of times.
+    """
 
     level: Level
     kind: str

@@ -57,7 +57,10 @@ class MessageHeads(NamedTuple):
 
 
 def message_head(buffer: Bytes, record: Record) -> tuple[int, int, int, int]:
-    """Channel, sequence, log time and publish time of a message record."""
+    """Channel, sequence, log time and publish time of a message record.
+
+    ``record`` is that of the message in ``buffer``. Times are in ns. Raises Damaged if it is too short.
+    """
     if record.end - record.body < records.MESSAGE_HEAD.size:
         raise Damaged(f"a message of {record.end - record.body} bytes", record.start)
     head: tuple[int, int, int, int] = records.MESSAGE_HEAD.unpack(
@@ -82,6 +85,9 @@ def open_chunk(buffer: Bytes, record: Record) -> Bytes:
     """The records inside a chunk, decompressed and verified. The declared size limits the memory used.
 
     A large uncompressed chunk stays in the file; its records are read on demand.
+
+    ``record`` is that of the chunk in ``buffer``. Raises Damaged if it can't be decompressed, or isn't what it
+    declares.
     """
     head = records.read_chunk(buffer, record)
     return _opened(head, _data(buffer, head), record.start)

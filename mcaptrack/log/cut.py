@@ -38,7 +38,10 @@ _IDS: Final = 2**16
 
 
 class Part(NamedTuple):
-    """The channels of a file to copy: for each its id in the new log, and the time of the first message to copy."""
+    """The channels of a file to copy: for each its id in the new log, and the time of the first message to copy.
+
+    ``ids`` are those ids by the id in this ``log``, and ``since_ns`` these times in ns.
+    """
 
     log: Log
     ids: dict[int, int]
@@ -51,6 +54,9 @@ def copy_messages(
     """Copy the messages of parts of logs before a time; the channels are added to the new log already.
 
     Returns a line for each chunk that is lost because it is damaged. Raises McaptrackError if a log changes meanwhile.
+
+    They are written by ``writer``, up to before ``end_ns``; ``progress`` is called with "cut", and the chunks that are
+    done and all.
     """
     lost: list[str] = []
     copies = [_Copy(writer, part, end_ns - 1) for part in parts]
@@ -183,7 +189,10 @@ class _Copy:
 
 
 def private_records(log: Log) -> Iterator[bytes]:
-    """The records outside of chunks of a kind that MCAP doesn't define. Known records are not read."""
+    """The records outside of chunks of a kind that MCAP doesn't define. Known records are not read.
+
+    ``log`` is open for reading.
+    """
     index, source = log.index, log.snapshot.source
     spans = [*zip(index.chunks.offsets.tolist(), index.chunks.ends.tolist(), strict=True), (index.data_end,) * 2]
     spans += [(it.offset, records.record_at(source, it.offset).end) for it in (*index.attachments, *index.metadata)]

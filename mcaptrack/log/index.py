@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from operator import attrgetter
-from typing import Final, NamedTuple, overload
+from typing import ClassVar, Final, NamedTuple, overload
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -126,7 +126,7 @@ class ChunkList:
             return NotImplemented
         return self._numbers == other._numbers and all(mine == two for mine, two in zip(self, other, strict=True))
 
-    __hash__ = None  # type: ignore[assignment]
+    __hash__: ClassVar[None] = None  # type: ignore[assignment]
 
     def at(self, offset: int) -> ChunkIndex | None:
         """The entry of the chunk at an offset of the file; None if there is none."""

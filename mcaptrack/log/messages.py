@@ -66,7 +66,10 @@ _MIN_GAP_BYTES: Final = 64 * 2**10
 
 
 class Message(NamedTuple):
-    """A recorded message; times in nanoseconds."""
+    """A recorded message; times in nanoseconds.
+
+    ``t_ns`` is the log time and ``publish_ns`` the publish time; ``sequence`` is its number.
+    """
 
     t_ns: int
     sequence: int
@@ -509,7 +512,8 @@ class Messages:
     """
 
     def __init__(self, source: ByteSource, index: Index) -> None:
-        self.source, self.index = source, index
+        self.source: ByteSource = source
+        self.index: Index = index
         self._opened: OrderedDict[int, Bytes] = OrderedDict()  # the last chunks that were opened, for other channels
         self._opened_bytes = 0
         self._asked: OrderedDict[tuple[tuple[int, ...], Span], MessageBatches] = OrderedDict()

@@ -51,6 +51,9 @@ class Channel(NamedTuple):
     """A channel of a log, or all channels of a topic: ``messages`` is their total, the rest describes the first one.
 
     ``schema_name`` of rows is that of their schema, mcaptrack.Tracks, also where they are ROS messages.
+
+    ``id`` is its number in the file, ``message_encoding`` the encoding of payloads, as in "protobuf" or "cdr", and
+    ``metadata`` its texts by key.
     """
 
     id: int
@@ -88,8 +91,11 @@ class Snapshot:
     def __init__(
         self, path: Location, file: ReadFile, source: ByteSource, index: Index, signature: Signature, is_certain: bool
     ) -> None:
-        self.path, self.file, self.source, self.index = path, file, source, index
-        self.messages = Messages(source, index)
+        self.path: Location = path
+        self.file: ReadFile = file
+        self.source: ByteSource = source
+        self.index: Index = index
+        self.messages: Messages = Messages(source, index)
         self._signature = signature
         self._is_certain = is_certain
         self._fresh: Messages | None = None  # the changed log, read again when it had this signature
@@ -265,6 +271,8 @@ def find_topic(name: str, topics: Collection[str], where: Location, prefix: str 
 
     "tracks" is /camera/tracks. A name that is none of the topics is that below the camera, or comes back as it is.
     Raises McaptrackError, with the topics, if there are several.
+
+    ``where`` names the log in the error.
     """
     below = f"{prefix}/{name}"
     if name in topics or (prefix and below in topics):
@@ -286,13 +294,14 @@ class Log:
     """
 
     def __init__(self, path: Location, folder: TemporaryDirectory[str] | None = None) -> None:
-        self.path = path
+        self.path: Location = path
         self._made = folder  # holds the content of a new log in a store, until it is written there
         place = path if folder is None else Path(folder.name, path.name)
-        self.real_path = place_of(place)
+        self.real_path: Location = place_of(place)
         self._lock: int | None = None
-        self.snapshot = open_snapshot(place)
-        self.index, self._messages = self.snapshot.index, self.snapshot.messages
+        self.snapshot: Snapshot = open_snapshot(place)
+        self.index: Index = self.snapshot.index
+        self._messages = self.snapshot.messages
         self.results: Log | None = None
         self.is_new = False  # just created; removed again if nothing is written to it
         self.is_outdated = False  # the file has been extended; this log still shows its old content

@@ -166,7 +166,10 @@ class Reader:
 
 
 def walk(buffer: Bytes, start: int, end: int) -> Iterator[Record]:
-    """The consecutive records between two offsets. Raises Damaged where there is no record."""
+    """The consecutive records between two offsets. Raises Damaged where there is no record.
+
+    ``start`` and ``end`` are those offsets in ``buffer``, in bytes.
+    """
     at = base = start
     near = buffer[start:start]
     while at < end:

@@ -75,9 +75,10 @@ class LogWriter:
 
     def __init__(self, sink: Sink, offset: int = 0, crc: int | None = 0, index: Index | None = None) -> None:
         index = index or Index()
-        self._sink, self.offset = sink, offset
+        self._sink = sink
+        self.offset: int = offset
         #: The checksum of the data section; only of what this writer added, if the rest is not known.
-        self.crc = crc or 0
+        self.crc: int = crc or 0
         self._crc_known = crc is not None
         self.schemas: dict[int, SchemaRecord] = index.schemas
         self.channels: dict[int, ChannelRecord] = index.channels
@@ -403,6 +404,8 @@ def create(path: Path, profile: str = "", *, header: bytes | None = None) -> Ite
     """Write a new log, which is published at ``path`` when the block succeeds.
 
     ``header`` is the header of another log.
+
+    ``profile`` is that of the MCAP registry, such as "ros2".
     """
     refuse_earlier_results(path)
     is_half_written = journal.is_left_behind(path)

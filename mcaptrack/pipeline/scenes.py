@@ -36,6 +36,8 @@ class Member(NamedTuple):
 
     ``drawn`` takes the schema and the frames of tracks or forecasts of the scene, and whether they are ground truth. It
     returns them at times of the camera, with boxes in its pictures, and its ground planes.
+
+    ``clock`` gives these times.
     """
 
     clock: PictureClock

@@ -181,7 +181,10 @@ def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> P
 
 
 def warn_if_weak(name: PredictorName) -> None:
-    """Warn that a predictor that comes with mcaptrack is less exact than constant velocity."""
+    """Warn that a predictor that comes with mcaptrack is less exact than constant velocity.
+
+    ``name`` is its name in the registry; nothing is said of others.
+    """
     if name in WEAK:
         warn(
             f"{name}, the paper's network, predicts less exactly than constant velocity (cv) on most recordings; "
@@ -216,7 +219,10 @@ def entry_of(name: PredictorName) -> tuple[Entry, Path | None]:
 
 
 def weights_sha256(name: PredictorName) -> str:
-    """SHA-256 of the weights of a predictor; "" if it has none. Raises McaptrackError as ``make`` does."""
+    """SHA-256 of the weights of a predictor; "" if it has none. Raises McaptrackError as ``make`` does.
+
+    ``name`` is its name in the registry, with FILE after a colon for weights of a user.
+    """
     entry, file = entry_of(name)
     if entry.is_built_in and _file_of(entry) is _NO_FILE:
         return ""

@@ -139,12 +139,18 @@ def are_covariances(cov: Floats) -> bool:
 
 
 def predict_among(predictor: AnyPredictor, xy_m: Floats, valid: Bools, people: PeopleSeen | None) -> Forecast:
-    """The forecasts of a batch; a predictor that uses other people gets them."""
+    """The forecasts of a batch; a predictor that uses other people gets them.
+
+    ``xy_m`` (B, L, 2) are past positions of B tracks in metres, of which ``valid`` (B, L) are known.
+    """
     if people is not None and uses_people(predictor):
         return predictor.predict(xy_m, valid, people=people)  # type: ignore[call-arg]
     return predictor.predict(xy_m, valid)
 
 
 def predict_together(predictor: Predictor, xy_m: Floats, valid: Bools) -> Forecast:
-    """The forecasts of tracks that are all seen at the same time, without other people."""
+    """The forecasts of tracks that are all seen at the same time, without other people.
+
+    ``predictor`` gets ``xy_m`` (B, L, 2), past positions in metres, of which ``valid`` (B, L) are known.
+    """
     return predict_among(predictor, xy_m, valid, PeopleSeen.together(xy_m, valid))

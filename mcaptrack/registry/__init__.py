@@ -353,6 +353,8 @@ def blamed(entry: Entry, what: str, guard: Guard | None = None) -> Iterator[None
 
     What it changes in this process is undone, with a warning; ``guard`` remembers that for all calls of one object.
     Interruptions pass as they are: Ctrl-C, and the exit that a signal asks for. Nothing is caught of our own code.
+
+    ``entry`` names the package, and ``what`` says what failed, as in "can't read FILE".
     """
     if entry.is_built_in:
         yield
@@ -371,7 +373,10 @@ def blamed(entry: Entry, what: str, guard: Guard | None = None) -> Iterator[None
 
 
 def of_type(entry: Entry, value: Any, wanted: type[T], function: str) -> T:
-    """Return what a function of an entry gave, if it is of this type. Raises McaptrackError, with both types."""
+    """Return what a function of an entry gave, if it is of this type. Raises McaptrackError, with both types.
+
+    ``value`` is what it gave and ``wanted`` the type; ``function`` names the function in the message.
+    """
     if not isinstance(value, wanted):
         gave, kind = type(value).__name__, wanted.__name__
         raise McaptrackError(f"{entry} gave {_a(gave)} {gave}; {function} has to give {_a(kind)} {kind}")

@@ -78,7 +78,10 @@ class FrameColumns(Sequence[Frame]):
         blocks: Sequence[Rows | Stored],
         file: SpillFile,
     ) -> None:
-        self.schema, self.t_ns, self.numbers, self.ends = schema, t_ns, numbers, ends
+        self.schema: Schema = schema
+        self.t_ns: Ints = t_ns
+        self.numbers: Ints = numbers
+        self.ends: Ints = ends
         self._first, self._blocks, self._file = first, blocks, file
         self._number = next(_NUMBERS)
         weakref.finalize(self, _forget, self._number)

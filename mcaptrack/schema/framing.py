@@ -135,7 +135,10 @@ def mapped_rows(schema: Schema, frames: Sequence[Frame], change: Callable[[Joine
 
 
 def filtered_rows(schema: Schema, frames: Sequence[Frame], keep: Callable[[JoinedFrames], Bools]) -> FrameColumns:
-    """Frames with some of their rows: ``keep`` gives a mask (N,) of the rows that it gets, some at a time."""
+    """Frames with some of their rows: ``keep`` gives a mask (N,) of the rows that it gets, some at a time.
+
+    ``schema`` is that of the rows.
+    """
     out, numbers = FrameCollector(schema), frame_numbers(frames)
     for low, high, joined in joined_parts(schema, frames):
         kept = keep(joined)
@@ -145,7 +148,10 @@ def filtered_rows(schema: Schema, frames: Sequence[Frame], keep: Callable[[Joine
 
 
 def has_any(schema: Schema, frames: Sequence[Frame], holds: Callable[[Rows], NDArray[Any]]) -> bool:
-    """Whether any row of frames is one for which ``holds`` gives true; it gets rows (N,) and returns a mask (N,)."""
+    """Whether any row of frames is one for which ``holds`` gives true; it gets rows (N,) and returns a mask (N,).
+
+    ``schema`` is that of the rows.
+    """
     return any(bool(holds(joined.rows).any()) for _, _, joined in joined_parts(schema, frames))
 
 

@@ -45,6 +45,8 @@ class Column:
     ``since`` is the version that added the column, "" for those that were there from the beginning; ``group`` counts
     the comments that say so up to it, because columns are added in groups. ``stated_unit`` is the unit of a column
     with a name that doesn't say it.
+
+    ``kind`` is its type in protobuf, ``doc`` its description.
     """
 
     name: str

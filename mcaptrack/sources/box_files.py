@@ -44,6 +44,10 @@ class ExportedBoxes:
     ``t_ns`` (F,) their times. ``id`` (N,) is -1 for detections. ``boxes`` (N, 4) are left, top, width and height in px;
     ``xy_m`` (N, 2) is NaN where it isn't known; ``score`` (N,) is float32, NaN where there is none. ``size`` is that of
     pictures, None if there are none. ``has_ids``: the rows are tracks.
+
+    ``class_id`` (N,) are classes, with ``names`` by class id; ``observed`` (N,) says which boxes were not filled in.
+    ``has_3d``: the channel has boxes in space. ``topic`` is the channel, and ``notes`` are lines on what was left out
+    of it.
     """
 
     topic: str

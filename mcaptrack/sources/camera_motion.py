@@ -128,6 +128,8 @@ def read_ground_truth(
     Labels got their positions from their boxes and the ground plane of the log. Where tracks are compensated for the
     motion of the camera, so are these, because the plane holds for one picture. Where tracks are in another frame of
     reference, labels are brought to it. Parameters are those of ``path_of``.
+
+    ``provenances`` and ``frames`` are those of channels that are not in the log yet.
     """
     camera = camera_at(opened, prefix)
     truth = opened.frames(camera.truth, TRACKS)

@@ -208,7 +208,10 @@ def provenance_of(opened: log.Log, topic: str) -> Provenance | None:
 
 
 def repaired_tracks(tracks: Sequence[Frame], origin: Provenance | None) -> Sequence[Frame]:
-    """Return tracks without ``source_id`` where it names detections instead of tracks."""
+    """Return tracks without ``source_id`` where it names detections instead of tracks.
+
+    ``origin`` is the provenance of the tracks, None if others recorded them.
+    """
     stage = STAGES.get(origin.transform) if origin else None
     is_from_boxes = stage is not None and stage.reads is DETECTIONS
     if not is_from_boxes or not has_any(TRACKS, tracks, lambda rows: rows["source_id"] >= 0):

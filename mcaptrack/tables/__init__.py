@@ -50,6 +50,8 @@ def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     """Columns of a Parquet file as arrays, missing numbers as NaN.
 
     Raises McaptrackError if it is no Parquet file or lacks a column.
+
+    ``names`` are those of the columns.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -165,7 +167,10 @@ def tidy(table: Any) -> Any:
 
 
 def pieces(table: Any, form: Literal["csv", "json", "jsonl"]) -> Iterator[bytes]:
-    """An answer as text; ``json`` is an array with an object for each row."""
+    """An answer as text; ``json`` is an array with an object for each row.
+
+    ``form`` is that format.
+    """
     flat = _for_text(table)
     if form == "csv":
         yield from text.csv(flat)
@@ -180,7 +185,10 @@ def pieces(table: Any, form: Literal["csv", "json", "jsonl"]) -> Iterator[bytes]
 
 
 def write_answer(path: Path, table: Any, form: str) -> None:
-    """Write an answer to a file, which appears when it is complete. Raises McaptrackError if it can't be written."""
+    """Write an answer to a file, which appears when it is complete. Raises McaptrackError if it can't be written.
+
+    ``form`` is its format: "csv", "json", "jsonl", "parquet" or "arrow".
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -206,6 +214,8 @@ _DECIMALS: Final = {"s": 0, "ms": 3, "us": 6, "ns": 9}
 def cells(table: Any, limit: int) -> tuple[list[bool], list[list[str | None]]]:
     """The first rows of an answer for a terminal: which columns are numbers, and the texts of each row, None for
     null.
+
+    ``limit`` is how many rows.
     """
     import pyarrow as pa
 

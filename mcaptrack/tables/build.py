@@ -25,6 +25,8 @@ class Pointers(NamedTuple):
     """The messages of one channel (M,): time, frame, number of rows (-1 for pictures), and their places in a file.
 
     ``chunk_offset`` is -1 for messages outside of chunks.
+
+    ``message_offset`` is the place of the message in its chunk, or in the file without one.
     """
 
     file: str
@@ -41,7 +43,10 @@ def table_of(schema: Schema) -> Table:
 
 
 def frames_table(topic: str, messages: Pointers, names: Sequence[str] = ()) -> Any:
-    """The rows of a channel in the table ``frames``, of which ``names`` are all topics and files."""
+    """The rows of a channel in the table ``frames``, of which ``names`` are all topics and files.
+
+    ``messages`` are those of the channel ``topic``.
+    """
     import pyarrow as pa
 
     file, t_ns, frame, rows, chunk, message = messages
@@ -107,6 +112,8 @@ def as_arrow(rows: Any) -> Any:
     """A table of any library that speaks Arrow (pyarrow, pandas, Polars, DuckDB) as one of pyarrow.
 
     Raises McaptrackError for what Arrow cannot hold.
+
+    ``rows`` is that table.
     """
     import pyarrow as pa
 

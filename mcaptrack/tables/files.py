@@ -47,6 +47,8 @@ def write(
     ``table`` is an Arrow table or ``TablePieces``; these are written piece by piece. ``provenance`` goes into the
     metadata, ``order`` names the columns by which rows are sorted. A file with the same content and metadata is left as
     it is, unless ``force``. Raises McaptrackError if the file can't be written.
+
+    ``form`` is the format.
     """
     if form == "parquet":
         file = ParquetTable(path, table.schema, provenance, order, force)
@@ -261,7 +263,10 @@ def _write_arrow(part: Path, table: Any, texts: Mapping[str, str]) -> None:
 
 
 def file_metadata(path: Path, form: TableFormat) -> dict[str, str] | None:
-    """The metadata of a file, read from its end; None if there is no such file."""
+    """The metadata of a file, read from its end; None if there is no such file.
+
+    ``form`` is its format.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -281,6 +286,8 @@ def verify(path: Path, form: TableFormat = "parquet") -> int:
     """Read a whole file and compare its content with the digest in its metadata; returns the number of rows.
 
     Raises McaptrackError if it can't be read, has no digest or holds something else.
+
+    ``form`` is its format.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -92,7 +92,10 @@ class MessageSource(NamedTuple):
 
 
 class MessagesTable(NamedTuple):
-    """A channel as a table, the paths of its fields, and of those that were left out."""
+    """A channel as a table, the paths of its fields, and of those that were left out.
+
+    ``pieces`` are its rows, some at a time.
+    """
 
     pieces: TablePieces
     fields: Sequence[Path]
@@ -167,7 +170,10 @@ class TypedMessages:
 
 
 def typed_table(described: TypedMessages) -> MessagesTable:
-    """The table of messages that are read as columns."""
+    """The table of messages that are read as columns.
+
+    ``described`` are those messages, with their types.
+    """
     source = described.source
 
     def pieces() -> Iterator[Any]:
@@ -240,7 +246,11 @@ def _flat(batch: Payloads, rows: Ints, flatten: Flatten, unread: UnreadMessages)
 
 
 def inferred_table(source: MessageSource, wanted: Callable[[Path], bool], blobs: bool) -> MessagesTable:
-    """The table of messages without types: fields have those of their values."""
+    """The table of messages without types: fields have those of their values.
+
+    ``source`` gives the messages, decoded; ``wanted`` says of the path of a field whether it becomes a column, and
+    ``blobs`` whether fields of bytes do.
+    """
     stored, unread = _Stored(wanted, blobs), UnreadMessages(source.where, source.total)
     heads = [_NO_MESSAGES]
     for batch in source.payloads(unread.lose):

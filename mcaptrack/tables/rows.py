@@ -261,6 +261,8 @@ def names_by_track(frames: FrameColumns, names: Mapping[int, str]) -> dict[int, 
     """The names of the classes of tracks by id, as far as they have one; ``names`` are those of classes by number.
 
     A track has the class of most of its rows; of several, the one that comes first.
+
+    ``frames`` have the rows of the tracks.
     """
     counts: Counter[tuple[int, int]] = Counter()  # rows by track and class, in the order in which these appear
     for _, _, joined in joined_parts(frames.schema, frames):

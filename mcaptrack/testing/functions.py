@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 from mcaptrack import log as logs
 from mcaptrack.api.common import as_path
 from mcaptrack.api.declared import Argument, PythonOnly, about, arguments_of, hints_of, options_of, words_of
-from mcaptrack.api.finishing import PartsOfRun
+from mcaptrack.api.finishing import FORCE, PartsOfRun
 from mcaptrack.api.options import PathLike, no_progress
 from mcaptrack.api.running import RunResult, Where, work
 from mcaptrack.api.stages import track
@@ -83,8 +83,11 @@ def check_command(function: Callable[..., Any], *arguments: Any, **options: Any)
         raise LawError(f"conforms: {name} returns a {type(result).__name__}, which can't be printed")
 
 
-def _check_declaration(function: Callable[..., Any], name: str) -> None:
-    """Check what a command says of itself: its help, and the types and the meaning of its parameters."""
+def _check_declaration(function: Callable[..., Any], name: str, given: Collection[str] = ()) -> None:
+    """Check what a function says of itself: its help, and the types and the meaning of its parameters.
+
+    Those that are ``given`` are no options of its own.
+    """
     if not hasattr(function, "most_used"):
         raise LawError(f"declares: {name} is not declared; put @declared() of mcaptrack.api.declared above it")
     try:
@@ -93,7 +96,7 @@ def _check_declaration(function: Callable[..., Any], name: str) -> None:
         raise LawError(f"declares: {name} has types that a command line can't say ({error!r})") from None
     if not words_of(function).text:
         raise LawError(f"declares: {name} has no docstring, which is the help of its command")
-    silent = [parameter.name for parameter in parameters if not parameter.help]
+    silent = [parameter.name for parameter in parameters if not (parameter.help or parameter.name in given)]
     silent += [parameter for parameter, argument in placed.items() if not argument.text]
     if silent:
         raise LawError(f"declares: {name} doesn't say what {silent[0]} means; its docstring may")
@@ -256,7 +259,7 @@ def check_report_section(function: Callable[..., Any], log: PathLike) -> None:
 def _part_of_run(kind: Kind, function: Callable[..., Any], name: str) -> Iterator[PartsOfRun]:
     """A part of ``run``, of which the declaration is checked; what this block changes in the process is a LawError."""
     entry = _entry_of(kind, function, name)
-    _check_declaration(function, entry.name)
+    _check_declaration(function, entry.name, [FORCE])
     with same_process(entry.name), collected():
         parts = PartsOfRun([entry])
         parts.options(())

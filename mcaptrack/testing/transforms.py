@@ -117,6 +117,11 @@ def sample_frames(schema: Schema, seed: int = 0, step_s: float = 0.0, colour: Co
     list of mcaptrack.schema.Frame
         12 pictures, 30 frames of detections or sightings, or 40 frames of tracks.
 
+    Raises
+    ------
+    LawError
+        For another schema.
+
     Examples
     --------
     >>> from mcaptrack.schema import TRACKS

@@ -25,7 +25,10 @@ _MAX_FIXED: Final = 1e6
 
 
 def number(value: float | int | None, digits: int = 2, unit: str = "") -> str:
-    """A number with ``digits`` decimals (none for an int) and its unit; a dash if it is missing or not finite."""
+    """A number with ``digits`` decimals (none for an int) and its unit; a dash if it is missing or not finite.
+
+    ``value`` is that number.
+    """
     if value is None or not math.isfinite(value):
         return NONE
     if isinstance(value, int):
@@ -36,17 +39,26 @@ def number(value: float | int | None, digits: int = 2, unit: str = "") -> str:
 
 
 def percent(value: float | None, digits: int = 1) -> str:
-    """A share between 0 and 1, in percent."""
+    """A share between 0 and 1, in percent.
+
+    ``value`` is the share, None if it isn't known; ``digits`` is the number of decimals.
+    """
     return number(None if value is None else 100 * value, digits, "%")
 
 
 def times(count: int) -> str:
-    """A number of times: once, twice, 3 times."""
+    """A number of times: once, twice, 3 times.
+
+    ``count`` is that number.
+    """
     return {1: "once", 2: "twice"}.get(count, f"{number(count)} times")
 
 
 def counted(count: int, singular: str, many: str = "") -> str:
-    """A count with its noun: 1 track, 2 tracks."""
+    """A count with its noun: 1 track, 2 tracks.
+
+    ``singular`` is the noun for one, and ``many`` that for several, by default with an s.
+    """
     return f"{number(count)} {singular if count == 1 else many or singular + 's'}"
 
 
@@ -65,7 +77,10 @@ def clock(seconds: float, span_s: float = 0.0) -> str:
 
 
 def tick_marks(span_s: float) -> list[tuple[str, str, str]]:
-    """The ticks of an axis of time: where each is, its text, and how the text is aligned."""
+    """The ticks of an axis of time: where each is, its text, and how the text is aligned.
+
+    ``span_s`` is how long the axis is, in seconds.
+    """
     return [
         (f"{100 * tick / span_s:.2f}%", clock(tick, span_s), "end" if tick > 0.97 * span_s else "mid" if tick else "")
         for tick in time_ticks(span_s).tolist()
@@ -118,7 +133,10 @@ def render(template: str, package: str = "", /, **values: Any) -> Markup:
 
 @cache
 def policy(script: str = "", more: str = "", package: str = "") -> str:
-    """The Content-Security-Policy of a page: it loads nothing, and of all scripts only this template's text runs."""
+    """The Content-Security-Policy of a page: it loads nothing, and of all scripts only this template's text runs.
+
+    ``script`` is the template, of ``package``; ``more`` is what it may do besides, in the words of a policy.
+    """
     parts = [
         "default-src 'none'",
         "img-src data:",

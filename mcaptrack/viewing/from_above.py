@@ -47,7 +47,10 @@ _APART_PX: Final = 1e-3
 
 
 class Sight(NamedTuple):
-    """The part of the ground in a picture: its middle in metres, pixels per metre, and width and height in pixels."""
+    """The part of the ground in a picture: its middle in metres, pixels per metre, and width and height in pixels.
+
+    ``x_m`` and ``y_m`` are that middle.
+    """
 
     x_m: float
     y_m: float
@@ -127,7 +130,10 @@ def grid(sight: Sight) -> Any:
 
 
 def robot(sight: Sight, at_m: Floats, heading_rad: float) -> Any:
-    """Annotations of a robot: an arrow ahead at its position (2,); none if it isn't known."""
+    """Annotations of a robot: an arrow ahead at its position (2,); none if it isn't known.
+
+    ``heading_rad`` is its heading, anticlockwise from x.
+    """
     out = message_class(ANNOTATIONS)()
     if np.isfinite([*at_m, heading_rad]).all():
         cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
@@ -137,7 +143,10 @@ def robot(sight: Sight, at_m: Floats, heading_rad: float) -> Any:
 
 
 def drawing(scene: Any, sight: Sight) -> Any:
-    """A SceneUpdate message as an ImageAnnotations message: cubes, cylinders, lines and texts."""
+    """A SceneUpdate message as an ImageAnnotations message: cubes, cylinders, lines and texts.
+
+    ``sight`` is the part of the ground that the picture shows.
+    """
     out = message_class(ANNOTATIONS)()
     for entity in scene.entities:
         for shapes, outline in ((entity.cylinders, _ROUND), (entity.cubes, _CORNERS)):
@@ -220,7 +229,10 @@ _MARGIN: Final = 1.2
 
 
 def sights(scenes: Iterable[Any], width_px: int, path: RobotPath | None, count: int) -> list[Sight]:
-    """The part of the ground in each picture: the surroundings of the robot, or all boxes and people of the scenes."""
+    """The part of the ground in each picture: the surroundings of the robot, or all boxes and people of the scenes.
+
+    ``width_px`` is the width of the pictures, ``count`` their number; ``path`` is that of the robot, None without one.
+    """
     if path is not None:
         placed = np.flatnonzero(np.isfinite(path.at_m).all(axis=1))
         if len(placed):
@@ -243,7 +255,10 @@ def size_from_above(width_px: int) -> tuple[int, int]:
 
 
 def sight_of(low: Floats, high: Floats, extent: Floats, width_px: int) -> Sight:
-    """The part of the ground in a picture that has the middle of two corners (2,), and shows an extent (2,) in m."""
+    """The part of the ground in a picture that has the middle of two corners (2,), and shows an extent (2,) in m.
+
+    ``low`` and ``high`` are those corners in m, and ``width_px`` is the width of the picture.
+    """
     width, height = size_from_above(width_px)
     x, y = ((low + high) / 2).tolist()
     return Sight(x, y, float(min(width / extent[0], height / extent[1])), width, height)

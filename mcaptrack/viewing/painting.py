@@ -40,7 +40,10 @@ class Stroke(NamedTuple):
 
 
 def strokes(annotations: Any) -> Iterator[Stroke]:
-    """The lines of an ImageAnnotations message: those with several colours as pairs of points of each."""
+    """The lines of an ImageAnnotations message: those with several colours as pairs of points of each.
+
+    ``annotations`` is that message.
+    """
     for part in annotations.points:
         kind = _KINDS.get(part.type)
         points = np.array([(point.x, point.y) for point in part.points], np.float64).reshape(-1, 2)
@@ -63,7 +66,10 @@ def strokes(annotations: Any) -> Iterator[Stroke]:
 
 
 def draw(image: Image, annotations: Any, scale: float = 1.0) -> Image:
-    """Draw an ImageAnnotations message on a picture, BGR (height, width, 3), that has ``scale`` times its size."""
+    """Draw an ImageAnnotations message on a picture, BGR (height, width, 3), that has ``scale`` times its size.
+
+    ``annotations`` is that message.
+    """
     import cv2
 
     paint, cover = np.zeros_like(image), np.zeros(image.shape[:2], np.uint8)
@@ -126,7 +132,10 @@ def text_size(text: str, size_px: float) -> tuple[int, int, int]:
 
 
 def put_text(image: Image, text: str, at: tuple[int, int], size_px: float, bgr: tuple[int, int, int]) -> None:
-    """Write a text of this size from its lower left corner on."""
+    """Write a text of this size from its lower left corner on.
+
+    It is drawn on ``image``, from the pixel ``at`` (x, y), in the colour ``bgr``: blue, green, red.
+    """
     import cv2
 
     size = size_px / _TEXT_PX
@@ -161,6 +170,9 @@ def message_at(
     """A function that reads the message at a time, for rising times, or the last one that is at most so much older.
 
     None if there is none.
+
+    ``coming`` are messages with their times in ns, rising; ``read`` decodes a payload; ``held_ns`` is how much older
+    one may be.
     """
     last: tuple[int, bytes] | None = None
     waiting = next(coming, None)
@@ -175,7 +187,11 @@ def message_at(
 
 
 def without_repeated(times: Ints, numbers: Ints, what: str) -> Ints:
-    """Leave out pictures, or scenes, that have the time of another, with a warning."""
+    """Leave out pictures, or scenes, that have the time of another, with a warning.
+
+    ``numbers`` (N,) are places of pictures in ``times`` (F,), in ns, and ``what`` calls them in the warning. Returns
+    those that are kept.
+    """
     _, first_of = np.unique(times[numbers], return_index=True)
     if len(first_of) < len(numbers):
         warn(f"{len(numbers) - len(first_of)} {what} have the time of another and are left out", "left-out")

@@ -17,6 +17,8 @@ def section_of(entry: Entry, opened: log.Log, prefix: str, names: Mapping[str, s
     """Return what the function of a section gives of a camera; None if it has nothing to say.
 
     Raises McaptrackError, with the entry, if it fails, or gives what can't stand in a page or in its data.
+
+    ``prefix`` is the camera, and ``names`` are those of tracks for people, by their role.
     """
     with blamed(entry, "failed"):
         given = entry.cls(opened, prefix, names)

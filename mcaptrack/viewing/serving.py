@@ -88,6 +88,8 @@ class Page:
     """A page of ours or a file to download: ``content`` makes it when it is asked for, ``policy`` says what it may load
     and run (a Content-Security-Policy). ``is_shared``: other origins may read it, as they may read files.
     ``is_action``: ``content`` changes something, so only POST does it: no link does, and no preview of one.
+
+    ``kind`` is the type of the content, as in text/html.
     """
 
     content: Callable[[], bytes | None]

@@ -175,7 +175,17 @@ def forecast_scores(mean_m: Floats, cov_m2: Floats, future_m: Floats, tails: Tai
 
 @dataclass(frozen=True)
 class Displacement:
-    """The errors of P matched forecasts of one or several sequences, and counts of the others."""
+    """The errors of P matched forecasts of one or several sequences, and counts of the others.
+
+    ``d_obs_m2`` (P,) is the mean squared distance of the matched pasts in m^2. ``ade_m``, ``fde_m`` and
+    ``ade_squared_m2`` (P,) are mean errors over the steps of a forecast, at its last step, and squared. ``covered`` (P,
+    levels) is the share of the future steps inside the ellipse of each level, ``nll`` (P,) the mean negative
+    log-likelihood of a future step in nats, both NaN without covariance. ``people`` counts those with a future,
+    ``false_forecasts`` the forecasts of none of them, in so many ``frames``. ``consistency_m`` are distances of
+    consecutive forecasts of one track over the steps that they share. ``error_m`` (P, T) is the distance of each step
+    from the ground truth, NaN beyond the horizon of shorter forecasts; ``straight_error_m`` (P, T) is the same if these
+    tracks went on at constant velocity.
+    """
 
     d_obs_m2: Floats
     ade_m: Floats

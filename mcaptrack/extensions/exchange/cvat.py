@@ -313,8 +313,9 @@ class Cvat(Format):
     row = "XML of CVAT for video or for images, or a zip file with it"
 
     def recognises(self, file: LabelFile) -> bool:
-        """Whether a file is XML, or a zip file: of label files, only those of CVAT are."""
-        return file.head.startswith((_ZIP, _EMPTY_ZIP, b"<"))
+        """Whether a file is a zip file, or XML of CVAT, of a tool that it is often taken for, or without a root."""
+        is_named = file.root in ("annotations", *_OTHER_XML)
+        return is_named or file.head.startswith((_ZIP, _EMPTY_ZIP) if file.root else (_ZIP, _EMPTY_ZIP, b"<"))
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""

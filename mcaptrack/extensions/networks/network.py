@@ -100,7 +100,10 @@ class NetworkLimits:
 
 @dataclass(frozen=True)
 class NetworkFile:
-    """An ONNX file: its bytes, and their digest."""
+    """An ONNX file: its bytes, and their digest.
+
+    ``data`` are the bytes, and ``sha256`` is the digest in hexadecimal.
+    """
 
     path: Path
     data: bytes = field(repr=False, compare=False)
@@ -117,7 +120,10 @@ def digest_of(path: Path) -> str:
 
 
 def read_file(path: Path, limits: NetworkLimits) -> NetworkFile:
-    """Read a file, once. Raises McaptrackError if that can't be done, or if it is larger than a network may be."""
+    """Read a file, once. Raises McaptrackError if that can't be done, or if it is larger than a network may be.
+
+    ``limits`` are those of the network.
+    """
     try:
         if path.stat().st_size > limits.memory_bytes:
             raise McaptrackError(

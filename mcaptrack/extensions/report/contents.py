@@ -76,7 +76,16 @@ class TrackSet:
 
 @dataclass
 class LogReport:
-    """A report on one log. ``data`` goes into the page as JSON; ``missing`` says why a section has nothing."""
+    """A report on one log. ``data`` goes into the page as JSON; ``missing`` says why a section has nothing.
+
+    ``file`` and ``name`` tell the log from others, ``prefix`` is the camera; it lasts from ``start_ns`` to ``end_ns``.
+    ``track_sets`` are the tracks by role, ``sequence`` is what is scored, ``results`` are the scores.
+    ``channel_events`` are the events of each channel, ``highlights`` the most important of them, and ``repairs`` those
+    of the re-tracked ones. ``planes`` are the ground planes, ``background`` is a picture of the scene and
+    ``forecast_scene`` a map of forecasts. ``people`` are scores by person, ``doubts`` and ``doubtful_tracks`` what
+    re-tracking is least sure of. ``notes`` and ``warnings`` are lines of text, ``html`` is the part of the page once it
+    is drawn. ``sections`` are those of packages, by name; ``has_only_people``: no other class occurs.
+    """
 
     file: str
     name: str
@@ -154,6 +163,8 @@ def gather(
     ``file`` and ``name`` tell it from the other logs of a page; by default those of its file, with and without suffix.
 
     Raises McaptrackError for a damaged log, and for one with several cameras if none is chosen.
+
+    ``progress`` is called with a line for each step.
     """
     prefix = pipeline.find_camera(opened, camera)
     file, name = file or opened.path.name, name or opened.path.stem

@@ -214,7 +214,10 @@ Link = Callable[[Row], str]
 
 
 def fleet_data(rows: Sequence[Row]) -> dict[str, Any]:
-    """All numbers of the page."""
+    """All numbers of the page.
+
+    ``rows`` are those of the table of runs, a row for each log.
+    """
 
     def kept(some: Sequence[Row]) -> list[dict[str, Any]]:
         return [{name: row.get(name) for name in _KEPT} for row in some]
@@ -238,7 +241,11 @@ def fleet_data(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def fleet_page(rows: Sequence[Row], title: str, element: str, data: Mapping[str, Any], link: Link) -> str:
-    """The page; ``data`` is what ``fleet_data`` gives, and goes into the element of that id."""
+    """The page; ``data`` is what ``fleet_data`` gives, and goes into the element of that id.
+
+    ``rows`` are as for ``fleet_data``, ``title`` is the heading, and ``link`` gives the address of the report on the
+    log of a row.
+    """
     by_name = {str(row["recording"]): row for row in rows}
 
     def listed(row: Row) -> dict[str, Any]:

@@ -161,7 +161,10 @@ def _tiles(scores: BeforeAfter) -> list[dict[str, str]]:
 
 
 def data(reports: Sequence[LogReport]) -> dict[str, Any]:
-    """All numbers. ``results`` are those of ``evaluate --json``, without curves, which each log has once, thinned."""
+    """All numbers. ``results`` are those of ``evaluate --json``, without curves, which each log has once, thinned.
+
+    ``reports`` are those on the logs of the page.
+    """
     results = [result for report in reports for result in report.results] + combined_results(reports)
     return {
         "schema_version": SCHEMA_VERSION,
@@ -234,7 +237,10 @@ def _parameters(channel: dict[str, Any]) -> list[str]:
 
 
 def draw(report: LogReport, at: int, total: int) -> None:
-    """Render the part of the page on one log, number ``at`` of ``total``, and release its tracks and pictures."""
+    """Render the part of the page on one log, number ``at`` of ``total``, and release its tracks and pictures.
+
+    ``report`` gets it as ``html``.
+    """
     report.html = render(
         "log.html",
         __package__ or "",
@@ -263,7 +269,10 @@ def draw(report: LogReport, at: int, total: int) -> None:
 
 
 def page(reports: Sequence[LogReport]) -> str:
-    """Return the whole page; logs that were not rendered yet are rendered first."""
+    """Return the whole page; logs that were not rendered yet are rendered first.
+
+    ``reports`` are those on its logs.
+    """
     for k, report in enumerate(reports):
         if not report.html:
             draw(report, k, len(reports))

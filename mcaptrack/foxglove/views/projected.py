@@ -42,6 +42,8 @@ class MovingCamera(NamedTuple):
     """M pictures of a calibrated camera: their log times, rising, their stamps, and the times at which the world is
     drawn on them, rising, in ns; the pose of the world in the camera for each, rotations (M, 3, 3) and translations
     (M, 3), NaN where it is not known; its lenses, which of them took each picture (M,), and the size of the pictures.
+
+    ``width_px`` and ``height_px`` are that size.
     """
 
     t_ns: Ints

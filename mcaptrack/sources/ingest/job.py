@@ -216,9 +216,12 @@ class IngestJob:
 
     def __init__(self, source: Path, options: IngestOptions, into: log.Log | None = None) -> None:
         self._close = ExitStack()
-        self.source, self.options, self.into, self.report = source, options, into, IngestReport()
+        self.source: Path = source
+        self.options: IngestOptions = options
+        self.into: log.Log | None = into
+        self.report: IngestReport = IngestReport()
         self.encoding: Encoding = encoding_for(into) if into else PROTOBUF
-        self.prefix = "/" + options.camera.strip("/")
+        self.prefix: str = "/" + options.camera.strip("/")
         #: The topic of the pictures that labels belong to; "" if there is none.
         self.pictures = ""
         source_options = (options.calibration, options.calibration_name, options.calibration_unit)

@@ -52,7 +52,8 @@ class LabelFile:
     """A file or folder that may hold labels, of which formats look at the beginning; what was read is kept."""
 
     def __init__(self, path: Path, lines: Lines | None = None) -> None:
-        self.path, self._lines = path, lines
+        self.path: Path = path
+        self._lines = lines
 
     @cached_property
     def is_folder(self) -> bool:
@@ -190,6 +191,8 @@ class LabelFile:
             is_of_pictures = {"data", "annotations"} <= set(self.keys) or "annotation_id" in self.keys
             hint = "; export tasks of Label Studio with pictures as COCO or Pascal VOC" if is_of_pictures else ""
             return f"{self.path} is JSON ({kind}{keys}) of no label format ({formats}){hint}"
+        if self.root:
+            return f"{self.path}:1: XML that begins with <{self.root[:40]}> is of no label format ({formats})"
         number, line = next(lines_of(self.path, MAX_LINE), (0, ""))
         if not number or self.is_json:
             return ""
