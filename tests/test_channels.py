@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import random
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType
 
 import mcaptrack
 from mcaptrack import log
@@ -22,7 +21,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.log import chunks, messages
 from mcaptrack.notices import collected
 from mcaptrack.tables import files
-from mcaptrack.tables import messages as tables_of_messages
 from mcaptrack.tables.export import channels
 from tests.logs import recorder
 
@@ -193,77 +191,6 @@ def test_pages_of_lists_and_structs_have_dictionaries_of_text() -> None:
         "a.list.element.x.list.element": "BYTE_STREAM_SPLIT",
         "b": "DELTA_BINARY_PACKED",
     }
-
-
-#: Messages that Arrow reads in another way than Python, or that others make so.
-ODD = (
-    (b'{"a": 9007199254740993}', b'{"a": 0.5}'), (b'{"a": 18446744073709551615}',), (b'{"a": [9007199254740993, 0.5]}',),
-    (b'{"s": "2020-01-01 00:00:00"}',), (b'{"s": ["2020-01-01"]}',), (b'{"s": "\\ud800"}',), (b'{"s": "\xff"}',),
-    (b'{"a":',), (b"",), (b"[1]",), (b"{}",), (b'{"a": 1, "a": 2}',), (b'{\n"a": 1\n}',), (b' {"a": 1}',), (b'{"a": Inf}',),
-    (b'{"a": Infinity}',), (b'{"a": 1e400}',), (b'{"a": 1}{"a": 2}',), (b'{"a": 1,', b'"b": 2}', b'{"a": 1}{"a": 2}'),
-    (b'{"a": 1}', b'{"a": 1}{"a": 2}'), (b'{"a": 1, "b": 2}', b'{"a": 1, "b": 2}{"a": 1, "b": 2}', b'{"a": 1,', b'"b": 2}'),
-    (b'{"v": [1, "x"]}',), (b'{"v": [[1]]}',), (b'{"v": [{"x": 1}]}',), (b'{"a": true}', b'{"a": 1}'),
-    (b'{"v": [{"at": {"sec": 1, "nanosec": 2}}]}',), (b'{"at": {"sec": 1}}',), (b'{"at": {"sec": 1, "nanosec": 2.5}}',),
-    (b'{"at": {"sec": 1, "nanosec": 5}}', b'{"at": {"sec": 1}}'), (b'{"at": {"sec": 1, "nanosec": 5}}', b'{"at": null}'),
-    (b'{"at": {"nanosec": 1, "sec": 2}}',), (b'{"at": {"sec": 99999999999, "nanosec": 1}}',), (b'{"sec": 1, "nanosec": 2}',),
-    (b'{"at": {"sec": 1, "nanosec": true}}',), (b'{"in": {"z": true}}', b'{"in": null}'), (b'{"in": {"y": 1}, "z": 1}',),
-    (b'{"in": {"x": 1}}', b'{"z": 1, "in": {"y": 1}}'), (b'{"in": {}}', b'{"in": 1}'), (b'{"a": 1}', b'{"b": 1}'),
-    (b'{"a": []}', b'{"a": ' + b"[" * 40 + b"]" * 40 + b"}"), (b'{"s": "' + b"]" * 10**5 + b'", "a": ' + b"[" * 10**5 + b"]" * 10**5 + b"}",),
-)  # fmt: skip
-
-
-def json_messages(draw: random.Random) -> Iterator[bytes]:
-    left_out = draw.choice(["", "", "a", "inner"])
-    for number in range(draw.choice([1, 30])):
-        message = {
-            "a": draw.choice([number, number + 0.5, None, -0.0]),
-            "at": {"sec": number, "nanosec": draw.randrange(10**9)},
-            "inner": {"v": [draw.random()] * draw.randrange(3), "s": draw.choice(["", "é\u0000日"])},
-            "s": draw.choice(["text", "a\nb"]),
-            "n": [],
-        }
-        if number or draw.random() < 0.5:
-            message.pop(left_out, None)
-        yield json.dumps(message, ensure_ascii=draw.random() < 0.5).encode()
-
-
-@pytest.mark.parametrize("part", range(2))
-def test_messages_in_json_read_at_once_equal_those_read_one_by_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int
-) -> None:
-    at_once, read = 0, tables_of_messages._json_columns
-
-    def counted(*arguments: Any) -> Any:
-        nonlocal at_once
-        columns = read(*arguments)
-        at_once += bool(columns)
-        return columns
-
-    for seed in range(part * 70, part * 70 + 70):
-        draw = random.Random(seed)
-        payloads = list(json_messages(draw)) if draw.random() < 0.5 else []
-        for odd in draw.sample(ODD, draw.choice([0, 0, 1])) + [ODD[seed % len(ODD)]] * (not payloads or seed % 3 > 0):
-            place = draw.randrange(len(payloads) + 1)
-            payloads[place:place] = odd
-        path = tmp_path / f"{seed}.mcap"
-        with path.open("wb") as stream:
-            writer = Writer(stream)
-            writer.start()
-            channel = writer.register_channel("/j", "json", writer.register_schema("J", "jsonschema", b"{}"))
-            for number, payload in enumerate(payloads):
-                writer.add_message(channel, number, payload, number)
-            writer.finish()
-        tables = []
-        for reader in (counted, lambda *_: {}):
-            monkeypatch.setattr(tables_of_messages, "_json_columns", reader)
-            with mcaptrack.open(path) as opened, collected():
-                try:
-                    table = opened.table("/j")
-                    tables.append((table.schema.to_string(), str(table.to_pylist())))  # NaN is not NaN
-                except McaptrackError as error:
-                    tables.append(("", str(error)))
-        assert tables[0] == tables[1], seed
-    assert at_once > 5
 
 
 def test_types_without_fields_have_tables_and_others_without_one_say_why(tmp_path: Path) -> None:

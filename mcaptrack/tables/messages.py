@@ -5,8 +5,7 @@ field is in the column's metadata. Columns have the types of the definition; mes
 that can't be read has no values, and costs the others nothing.
 
 Messages without a definition (JSON) have the types of their values, which are known when all were read, so they wait in
-a temporary file: numbers, texts, lists and structs; values that no type holds become JSON text. Messages that are alike
-are read at once.
+a temporary file: numbers, texts, lists and structs; values that no type holds become JSON text.
 """
 
 from __future__ import annotations
@@ -21,10 +20,9 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
-from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.log.messages import Payloads
 from mcaptrack.schema.spill import SpillFile, Stored
-from mcaptrack.sources.foreign.flatten import TIMES, UnreadMessages
+from mcaptrack.sources.foreign.flatten import UnreadMessages
 from mcaptrack.tables.build import Pointers, TablePieces, frames_table
 from mcaptrack.tables.fields import RECORDING
 
@@ -51,14 +49,8 @@ _UNITS: Final[Mapping[str, str]] = {
     "Pa": r"/FluidPressure\.fluid_pressure",
     "1": r"\.(orientation|rotation)\.[xyzw]",
 }
-#: Messages in JSON that are deeper are read one by one.
-_MAX_DEPTH: Final = 30
-_STRING: Final = re.compile(rb'"(?:[^"\\]|\\.)*"', re.DOTALL)
 #: A part of flat messages ends after so many of them.
 _PART_MESSAGES: Final = 4096
-#: Whole numbers below are exact in 64 bits of a float; seconds and nanoseconds below are together in 64 bits.
-_EXACT: Final = 2**53
-_SOON: Final = 2**32
 #: Bytes of rows after which a piece of the table ends, so that a table of pictures is made in pieces, too.
 PIECE_BYTES: Final = 32 * 2**20
 
@@ -246,13 +238,8 @@ def inferred_table(source: MessageSource, wanted: Callable[[Path], bool], blobs:
     for batch in source.payloads(unread.lose):
         unread.count(len(batch.t_ns))
         heads.append(batch._replace(data=_NO_MESSAGES.data))
-        for low in range(0, len(batch.t_ns), _PART_MESSAGES):
-            rows = np.arange(low, min(low + _PART_MESSAGES, len(batch.t_ns)))
-            if columns := _json_columns(batch, rows, source.flatten):
-                stored.put(len(rows), columns)
-                continue
-            for row in _flat(batch, rows, source.flatten, unread):
-                stored.add(row)
+        for row in _flat(batch, np.arange(len(batch.t_ns)), source.flatten, unread):
+            stored.add(row)
     stored.close()
     unread.warn("they have no values")
     types = stored.types()
@@ -269,83 +256,6 @@ def inferred_table(source: MessageSource, wanted: Callable[[Path], bool], blobs:
 
     table = TablePieces(_Rows(source, types).schema, source.total, pieces, PIECE_BYTES)
     return MessagesTable(table, list(types), list(stored.left_out))
-
-
-def _json_columns(batch: Payloads, rows: Ints, flatten: Flatten) -> Columns:
-    """Messages in JSON as columns, without a loop over their values; none unless all messages are alike.
-
-    Arrow's reader takes dates for times, rounds large numbers and refuses what JSON of Python allows: messages with
-    such values, or with other fields than the first one, are read one by one; so are deep ones, for which its stack
-    has no room.
-    """
-    import pyarrow as pa
-    import pyarrow.json as pj
-
-    payloads = [batch.data[start:end].tobytes() for start, end in zip(batch.start[rows], batch.end[rows], strict=True)]
-    if not all(start >= 0 for start in batch.start[rows]) or not all(
-        payload[:1] == b"{" and payload[-1:] == b"}" and not _is_deep(payload) for payload in payloads
-    ):  # so that no two of them are one
-        return {}
-    text = b"\n".join(payloads)
-    try:
-        table = pj.read_json(pa.BufferReader(text), pj.ReadOptions(use_threads=False, block_size=len(text) + 1))
-        columns = dict(_leaves(table.to_struct_array().combine_chunks(), ()))
-        are_alike = table.num_rows == len(payloads) and list(flatten(payloads[0])) == list(columns)
-    except (pa.ArrowException, McaptrackError, _Unlike):
-        return {}
-    return columns if are_alike else {}
-
-
-def _is_deep(text: bytes) -> bool:
-    """Whether lists and objects of JSON are more than a few deep within each other."""
-    if text.count(b"[") + text.count(b"{") <= _MAX_DEPTH:
-        return False
-    signs = np.frombuffer(_STRING.sub(b"", text), np.uint8)
-    steps = np.isin(signs, np.frombuffer(b"[{", np.uint8)).astype(np.int64)
-    return bool(np.cumsum(steps - np.isin(signs, np.frombuffer(b"]}", np.uint8))).max(initial=0) > _MAX_DEPTH)
-
-
-class _Unlike(Exception):
-    """Messages have values that Arrow reads in another way than Python."""
-
-
-def _leaves(message: Any, path: Path) -> Iterator[tuple[Path, Any]]:
-    """The columns of structs. Raises _Unlike for values that Arrow may have changed."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    if message.null_count:
-        raise _Unlike
-    for field, column in zip(message.type, message.flatten(), strict=True):
-        kind, values = field.type, column
-        if pa.types.is_struct(kind):
-            names = [inner.name for inner in kind]
-            if set(names) in TIMES:
-                parts = sorted(zip(names, column.flatten(), strict=True), key=lambda part: part[0].startswith("n"))
-                yield (*path, field.name), _times([values for _, values in parts])
-            else:
-                yield from _leaves(column, (*path, field.name))
-            continue
-        while pa.types.is_list(kind):
-            kind, values = kind.value_type, values.flatten()
-        if pa.types.is_floating(kind):
-            largest = pc.max(pc.abs(values)).as_py()
-            if largest is not None and not largest < _EXACT:
-                raise _Unlike
-        elif not (pa.types.is_integer(kind) or pa.types.is_boolean(kind) or kind in (pa.string(), pa.null())):
-            raise _Unlike
-        column.validate(full=True)
-        yield (*path, field.name), column
-
-
-def _times(parts: Sequence[Any]) -> Any:
-    """Seconds and nanoseconds as times."""
-    import pyarrow as pa
-
-    seconds, rest = (part.to_numpy() for part in parts)  # Arrow refuses nulls here, and parts of numbers as times
-    if max(np.abs(seconds).max(), np.abs(rest).max()) > _SOON:
-        raise _Unlike
-    return pa.array(seconds * NS_PER_S + rest, pa.timestamp("ns"))
 
 
 class _Stored:
@@ -368,6 +278,8 @@ class _Stored:
 
     def close(self) -> None:
         """End a part."""
+        import pyarrow as pa
+
         columns: dict[Path, Any] = {}
         for path in dict.fromkeys(path for row in self._rows for path in row if self._wanted(path)):
             values = [row.get(path) for row in self._rows]
@@ -375,16 +287,9 @@ class _Stored:
                 self.left_out[path] = None
                 continue
             columns[path] = _array(values)
-        rows, self._rows = self._rows, []
-        if rows:
-            self.put(len(rows), columns)
-
-    def put(self, count: int, columns: Columns) -> None:
-        """Add messages as columns."""
-        import pyarrow as pa
-
-        self.close()
-        columns = {path: column for path, column in columns.items() if self._wanted(path)}
+        count, self._rows = len(self._rows), []
+        if not count:
+            return
         for path, column in columns.items():
             self._types.setdefault(path, {})[column.type] = None
         table = pa.table(list(columns.values()), [str(number) for number in range(len(columns))])
