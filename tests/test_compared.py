@@ -103,7 +103,7 @@ def test_exported_tables_are_scored(tmp_path):
     with pytest.raises(McaptrackError, match="share no clock: one counts frames, the other does not"):
         scores(path, tmp_path / "points.txt", topics=("/camera/tracks",))
     (tmp_path / "no.parquet").write_bytes(b"PAR1 but not really")
-    with pytest.raises(McaptrackError, match="is no Parquet file"):
+    with pytest.raises(McaptrackError, match="can't be read as Parquet"):
         scores(tmp_path / "no.parquet", gt)
 
 

@@ -56,8 +56,8 @@ _SCALARS: Final = {
 _LINE: Final = "=" * 80
 _LITTLE_ENDIAN: Final = b"\0\1\0\0"
 _LAST_S: Final = 2**31 - 1
-#: Number of messages that are converted at once.
-_BLOCK: Final = 64
+
+
 _U4: Final = struct.Struct("<I")
 _TIME: Final = struct.Struct("<iI")
 _PADDING: Final = bytes(8)

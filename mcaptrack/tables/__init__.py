@@ -39,7 +39,7 @@ from mcaptrack.tables.build import (
 )
 from mcaptrack.tables.catalogue import join
 from mcaptrack.tables.fields import RECORDING, TABLES, table_version
-from mcaptrack.tables.files import FORMATS, ParquetTable, file_metadata, verify, write
+from mcaptrack.tables.files import FORMATS, ParquetTable, file_metadata, opened_parquet, verify, write
 from mcaptrack.tables.messages import MessageSource, MessagesTable, TypedMessages, inferred_table, typed_table
 from mcaptrack.tables.rows import TrackNames, names_by_track, rows_in_pieces, summary_table
 
@@ -54,15 +54,9 @@ def read_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
     ``names`` are those of the columns.
     """
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
-    try:
-        with path.open("rb") as stream:  # a single file: the names of its folders are no columns
-            table = pq.read_table(stream)
-    except OSError as error:
-        raise unreadable(path, error) from None
-    except pa.ArrowException as error:
-        raise McaptrackError(f"{path} is no Parquet file that can be read: {str(error).splitlines()[0]}") from None
+    with opened_parquet(path) as file:
+        table = file.read()
     missing = [name for name in names if name not in table.column_names]
     if missing:
         raise McaptrackError(f"{path} has no column {', '.join(missing)}; an exported table of tracks has")
@@ -83,8 +77,8 @@ _OF_TRACKS: Final = ("t_ns", "track_id", "x_m", "y_m")
 
 def holds_tracks(path: Path) -> bool:
     """Whether a Parquet file holds rows of tracks in metres. Raises McaptrackError if it is no Parquet file."""
-    file = _parquet(path)
-    return set(_OF_TRACKS) <= set(file.schema_arrow.names) and file.metadata.num_rows > 0
+    with opened_parquet(path) as file:
+        return set(_OF_TRACKS) <= set(file.schema_arrow.names) and file.metadata.num_rows > 0
 
 
 def read_tracks(path: Path) -> dict[str, list[Frame]]:
@@ -94,11 +88,12 @@ def read_tracks(path: Path) -> dict[str, list[Frame]]:
     """
     from mcaptrack.schema import TRACKS
 
-    names = _parquet(path).schema_arrow.names
-    missing = [name for name in _OF_TRACKS if name not in names]
-    if missing:
-        raise McaptrackError(f"{path} has no column {', '.join(missing)}; tracks need {', '.join(_OF_TRACKS)}")
-    table = _parquet(path).read([*_OF_TRACKS, *(name for name in ("topic", "observed") if name in names)])
+    with opened_parquet(path) as file:
+        names = file.schema_arrow.names
+        missing = [name for name in _OF_TRACKS if name not in names]
+        if missing:
+            raise McaptrackError(f"{path} has no column {', '.join(missing)}; tracks need {', '.join(_OF_TRACKS)}")
+        table = file.read([*_OF_TRACKS, *(name for name in ("topic", "observed") if name in names)])
     if table.num_rows == 0:
         raise McaptrackError(f"{path} has no rows")
     count = table.num_rows
@@ -117,16 +112,6 @@ def read_tracks(path: Path) -> dict[str, list[Frame]]:
         times, first = np.unique(t_ns[mine], return_index=True)
         out[name] = split_rows(times, range(len(times)), rows, np.append(first[1:], len(mine)))
     return out
-
-
-def _parquet(path: Path) -> Any:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        return pq.ParquetFile(pa.OSFile(os.fsencode(path)))  # a name with a colon would be taken for a URL
-    except (OSError, pa.ArrowException) as error:
-        raise McaptrackError(f"{path} can't be read as Parquet: {error}") from None
 
 
 # Answers of queries: Arrow tables of any types, as files, as text, and as cells for a terminal.

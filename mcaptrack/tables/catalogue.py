@@ -19,6 +19,7 @@ from mcaptrack.files import publish_stream
 from mcaptrack.location import Location
 from mcaptrack.tables.build import with_recording
 from mcaptrack.tables.fields import RECORDING, TABLES
+from mcaptrack.tables.files import opened_parquet
 
 #: The table, and its file with the rows of all logs.
 _TABLE: Final = "recordings"
@@ -123,14 +124,8 @@ def join(parts: Sequence[tuple[str, Any]], columns: Any = None) -> Any:
 
 
 def _columns(path: Path) -> Any:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        with path.open("rb") as stream:  # a name with a colon would be taken for a URL
-            return pq.read_schema(stream).remove_metadata()
-    except (OSError, pa.ArrowException) as error:
-        raise McaptrackError(f"{path} can't be read as Parquet: {str(error).splitlines()[0]}") from None
+    with opened_parquet(path) as file:
+        return file.schema_arrow.remove_metadata()
 
 
 def _dataset(files: Sequence[tuple[str, Path]], schema: Any) -> Any:

@@ -20,7 +20,7 @@ import numpy as np
 from mcaptrack.choices import TableFormat
 from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish
+from mcaptrack.files import publish, unreadable
 from mcaptrack.tables.build import PIECE_ROWS, pieces_of
 from mcaptrack.tables.fields import table_version
 
@@ -32,6 +32,21 @@ _BYTES_READ: Final = 4 * 2**20
 #: Smaller files leave so little memory behind that looking for it takes longer than they did.
 _BYTES_WORTH_RELEASING: Final = 64 * 1024
 _PREFIX: Final = "mcaptrack."
+
+
+@contextmanager
+def opened_parquet(path: Path) -> Iterator[Any]:
+    """Open a Parquet file as one of pyarrow. Raises McaptrackError if it can't be read, also later in the block."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with path.open("rb") as stream:  # a name would be taken for a URL, and those of its folders for columns
+            yield pq.ParquetFile(stream)
+    except (OSError, pa.ArrowException) as error:
+        if getattr(error, "errno", None):
+            raise unreadable(path, error) from None
+        raise McaptrackError(f"{path} can't be read as Parquet: {str(error).partition(chr(10))[0]}") from None
 
 
 def write(
