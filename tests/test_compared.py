@@ -307,7 +307,7 @@ TRICKS = {
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory) -> Path:
-    """A log of several trackers, with re-tracking of one, and ``copy`` and ``part``, which repeat it under other ids."""
+    """A log of several trackers, with re-tracking of one, and copies of it, or of its source, under other ids."""
     path = tmp_path_factory.mktemp("against") / "log.mcap"
     good, truth = tracked(2, 0.005), walk(lambda n: {p: (0.5 * n * (-1) ** p, 3.0 * p) for p in range(PEOPLE)}, TICKS)
     others = {name: changed(good, trick) for name, trick in TRICKS.items()}
@@ -316,7 +316,10 @@ def compared(tmp_path_factory) -> Path:
     with log.read(path) as opened:
         reference = list(opened.frames("/camera/retracks", TRACKS))
     copy = changed(reference, lambda rows, tick: renamed(rows, rows["track_id"] + 700))
-    for name, frames in {"copy": copy, "part": changed(copy, TRICKS["half"])}.items():
+    nudged = changed(copy, lambda rows, tick: moved(rows, 0.05, tick))
+    sources = changed(tracked(1, 0.03), lambda rows, tick: moved(renamed(rows, rows["track_id"] + 700), 0.3, tick))
+    copies = {"copy": copy, "part": changed(copy, TRICKS["half"]), "nudged": nudged, "sources": sources}
+    for name, frames in copies.items():
         replace_channel(path, f"/camera/{name}", frames)
     return path
 
@@ -343,7 +346,7 @@ def test_no_trick_makes_a_tracker_better(compared, trick):
     assert row.verdict == ("undecided" if trick == "twice" else "worse"), row
 
 
-@pytest.mark.parametrize("name", ["samples", "retracks/online", "copy", "part"])
+@pytest.mark.parametrize("name", ["samples", "retracks/online", "copy", "part", "nudged", "sources"])
 def test_relatives_of_the_reference_and_copies_of_it_are_never_better(compared, name):
     row = difference(compared, "split", name)
     assert row.idf1 > 0.05

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import random
+import shutil
 import zlib
 from collections.abc import Callable
 from importlib import import_module
@@ -89,12 +90,14 @@ def test_a_log_that_may_not_be_written_to_says_what_to_do(tmp_path, monkeypatch)
     def refused(name, flags, *rest):
         raise PermissionError(errno.EACCES, "Permission denied", name)
 
-    with log.read(path) as opened, monkeypatch.context() as patch:
-        patch.setattr(os, "open", refused)
-        with pytest.raises(
-            McaptrackError, match="can't be written to: Permission denied; write to another file with `output=`"
-        ):
-            opened.lock()
+    for name, more in (("a.mcap", ", or beside it with `sidecar=True`"), ("b.results.mcap", "")):
+        if name != path.name:  # results can't be beside results
+            shutil.copy(path, tmp_path / name)
+        with log.read(tmp_path / name) as opened, monkeypatch.context() as patch:
+            patch.setattr(os, "open", refused)
+            with pytest.raises(McaptrackError) as raised:
+                opened.lock()
+        assert str(raised.value).endswith(f"Permission denied; write to another file with `output=`{more}")
     with log.read(path) as opened, log.extend(opened, tmp_path / "copy.mcap") as writer:
         writer.add_channel("/new", SCHEMA, "json", {})
     assert contents(path) == {"/video": contents(path)["/video"]}

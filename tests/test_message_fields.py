@@ -515,6 +515,18 @@ def test_channels_that_begin_without_things_are_read(name, encoding, tmp_path):
     assert [row["x_m"] for frame in found.frames for row in frame.rows] == [1.5] * 10
 
 
+def test_a_head_drawn_above_a_body_is_no_second_person(tmp_path):
+    unstamped = HEAD | {"stamp": {"sec": 0, "nanosec": 0}}
+    body = {"header": unstamped, "type": 3, "id": 7, "ns": "body", "scale": SIZE | {"x": 0.5, "y": 0.5}, "pose": POSE}
+    head = body | {"type": 2, "ns": "head", "scale": {"x": 0.25, "y": 0.25, "z": 0.25}}
+    other = body | {"ns": "visitor", "pose": {"position": AT | {"x": 4.5}, "orientation": {"w": 1.0}}}
+    messages = [{"markers": [head, body, other]}]
+    path = write(tmp_path / "a.mcap", {"/people_markers": ("visualization_msgs/MarkerArray", messages)}, "cdr")
+    found, said = read(path, "/people_markers")
+    assert found.frames[0].rows[["x_m", "height_m"]].tolist() == [(1.5, 1.75), (4.5, 1.75)]
+    assert "1 markers that are parts of larger ones with their id are left out" in dict(said)["left-out"]
+
+
 def test_json_needs_no_schema(tmp_path):
     with recorder(tmp_path / "a.mcap") as writer:
         thing = {"label": "person", "score": 0.5, "pos_x": 1.5, "pos_y": -2.25}

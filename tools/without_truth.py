@@ -28,7 +28,7 @@ from crowds import SHAPES, faults, scenes
 from reproduce import on_clock
 
 import mcaptrack
-from mcaptrack.evaluation.against import Candidates, compare
+from mcaptrack.evaluation.against import Candidates, compare, copied
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.evaluation.people import person_scores
 from mcaptrack.schema import Frame
@@ -77,8 +77,9 @@ def signs(seeds: list[int], count: int) -> None:
             by_truth, by_reference = (
                 {name: person_scores(side, tracks, RULE) for name, tracks in made.items()} for side in (true, reference)
             )
+            related = {name: how for name, tracks in made.items() if (how := copied(reference, tracks, RULE))}
             for names in combinations(made, 2):
-                row = compare(*names, [Candidates(by_reference, {})])
+                row = compare(*names, [Candidates(by_reference, related)])
                 wanted = by_truth[names[1]].idf1() - by_truth[names[0]].idf1()
                 kind = f"{sum(name.startswith('same') for name in names)} on the reference's detections"
                 table[kind, int(np.digitize(abs(row.idf1), [0.05, 0.1, 0.2]))].append(

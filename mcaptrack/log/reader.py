@@ -33,6 +33,7 @@ from mcaptrack.log.chunks import MAX_NS
 from mcaptrack.log.index import Index, ends_with_magic, read_index, starts_with_magic
 from mcaptrack.log.journal import changed, find_journal, recover_hint
 from mcaptrack.log.messages import ChannelRows, Message, MessageLocations, Messages, Payloads, Span, TimeOutOfRange
+from mcaptrack.log.recording_files import RESULTS_SUFFIX
 from mcaptrack.log.records import Damaged
 from mcaptrack.log.remote import RemoteFile
 from mcaptrack.objects import Version
@@ -366,9 +367,9 @@ class Log:
             try:
                 handle = os.open(self.real_path, os.O_RDWR)
             except OSError as error:
+                beside = "" if self.path.name.endswith(RESULTS_SUFFIX) else ", or beside it with `sidecar=True`"
                 raise McaptrackError(
-                    f"{self.path} can't be written to: {error.strerror}; "
-                    "write to another file with `output=`, or beside it with `sidecar=True`"
+                    f"{self.path} can't be written to: {error.strerror}; write to another file with `output=`{beside}"
                 ) from None
             try:
                 in_place.lock(self.real_path, handle)

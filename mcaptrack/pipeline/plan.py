@@ -245,7 +245,7 @@ class _Planner:
             return camera.boxes
         return usual
 
-    def _other_boxes(self, boxes: str) -> Iterator[str]:
+    def _other_boxes(self, boxes: str | None) -> Iterator[str]:
         """Notes on channels with boxes, or with what may be people, that are not read."""
         if boxes and boxes not in self.sources.values():
             yield f"boxes that others detected are in {boxes}; `topic=` takes them instead"

@@ -118,7 +118,7 @@ def encoding_for(opened: log.Log) -> Encoding:
     if holds_packed(opened):
         raise McaptrackError(
             f"messages of {opened.path} are compressed one by one; results in {opened.path.name} would not be, "
-            "and ROS tools could not read them; leave `sidecar=False` out, or use `sidecar=True`"
+            "and ROS tools could not read them; use `sidecar=True`, and neither `sidecar=False` nor `output=`"
         )
     profile, library = log.header(opened)
     is_ros1 = profile == Profile.ROS1 and not library.startswith(log.LIBRARY)

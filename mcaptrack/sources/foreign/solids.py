@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from math import isfinite, isnan, nan
+from math import dist, isfinite, isnan, nan, prod
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -199,9 +199,28 @@ def marker_solids(message: Any) -> Message3d:
         if not drawn:
             without += integer(marker.type) != _TEXT or integer(marker.id) not in labels
         out.boxes += [_of_solid(marker, solid, labels) for solid in drawn]
+    count, out.boxes = len(out.boxes), _without_parts(out.boxes)
+    parts = count - len(out.boxes)
+    out.ignored |= {"markers that are parts of larger ones with their id": parts} if parts else {}
     out.ignored |= {"markers that are no solids": without} if without else {}
     out.is_measured = bool(out.boxes) or not (markers and (out.ignored or not added))
     return out
+
+
+def _without_parts(boxes: list[Box3d]) -> list[Box3d]:
+    """Boxes without those that are above, below or inside of the largest with the same id: heads of bodies."""
+    largest: dict[Any, Box3d] = {}
+    for box in boxes:
+        if box.source_id is not None and prod(box.size) > prod(largest.get(box.source_id, box).size):
+            largest[box.source_id] = box
+        largest.setdefault(box.source_id, box)
+
+    def is_part(box: Box3d) -> bool:
+        whole = largest[box.source_id]
+        near = dist(box.centre[:2], whole.centre[:2]) < max(whole.size[:2]) / 2
+        return box.source_id is not None and box is not whole and box.frame_id == whole.frame_id and near
+
+    return [box for box in boxes if not is_part(box)]
 
 
 def _of_marker(marker: Any) -> Iterator[Solid]:

@@ -416,7 +416,7 @@ def test_a_recording_with_compressed_messages_is_not_mixed_with_others(tmp_path)
     result = call("ingest", tmp_path / "gt.txt", *words, "--in-place")
     assert (result.code, result.err.count("\n")) == (1, 1)
     assert "compressed one by one; results in bag.mcap would not be" in result.err
-    assert "leave --in-place out, or use --sidecar" in result.err
+    assert "use --sidecar, and neither --in-place nor -o" in result.err
     assert (path.read_bytes(), metadata(path)) == before
 
 

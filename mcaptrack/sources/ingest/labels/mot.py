@@ -46,8 +46,10 @@ class Mot(Format):
     in_parts = True
 
     def recognises(self, file: LabelFile) -> bool:
-        """Whether the first row has commas and 6 to 10 columns, and isn't that of a table."""
-        return "," in file.row and 6 <= len(file.cells) <= 10 and states_number(file.cells[2]) and not is_table(file)
+        """Whether the first row has commas and 6 to 10 columns, or is 10 numbers, and isn't that of a table."""
+        if "," not in file.row:
+            return len(file.cells) == 10 and all(map(states_number, file.cells))
+        return 6 <= len(file.cells) <= 10 and states_number(file.cells[2]) and not is_table(file)
 
     def read(self, file: LabelFile, asked: Asked) -> BoxTable:
         """The rows of a file."""

@@ -56,7 +56,7 @@ def lines_of(path: Path, most: int = MAX_ROW, has_comments: bool = False) -> Lin
                 if line.strip() and (has_comments or not line.lstrip().startswith("#")):
                     yield number, line
     except UnicodeError:
-        raise McaptrackError(f"{path} is not text in UTF-8 or UTF-16, as labels and homographies are") from None
+        raise McaptrackError(f"{path} is not text in UTF-8 or UTF-16; save it as UTF-8") from None
     except OSError as error:
         raise unreadable(path, error) from None
 
