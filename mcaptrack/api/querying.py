@@ -157,7 +157,7 @@ class TableList:
     channels: tuple[str, ...]
 
 
-@done_by("query --tables")
+@done_by("query", tables=True)
 def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, PathLike] | None = None) -> TableList:
     """List the tables that queries can name, with their columns, units and meanings.
 

@@ -32,13 +32,12 @@ def _command(match: re.Match[str]) -> str:
         options = {keyword.arg or "": ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, AssertionError):
         return match[0]
-    parts = getattr(getattr(mcaptrack, name, None), "done_by", name).split()
+    line, more = getattr(getattr(mcaptrack, name, None), "done_by", ((name,), {}))
     arguments_: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
-    for parameter, value in options.items():
-        flag = flag_of(parameter, value, parts[0])
+    for parameter, value in (options | more).items():
+        flag = flag_of(parameter, value, line[0])
         arguments_ += [flag] if isinstance(value, bool) else [flag, str(value)]
-    flags = [part for part in parts if part.startswith("-")]
-    return command(*(part for part in parts if part not in flags), *arguments_, *flags)
+    return command(*line, *arguments_)
 
 
 def _option(match: re.Match[str]) -> str:
