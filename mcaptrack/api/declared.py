@@ -315,15 +315,15 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     return call
 
 
-def done_by(command: str, **options: Any) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Declare a function that is ``checked``, and that a command does, maybe with options: "models get".
+def done_by(*command_line: str, **options: bool) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Declare a function that is ``checked``, and that a command does with these words and options.
 
     Messages that name a call of it name that command on the command line.
     """
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         call = checked(function)
-        vars(call).update(done_by=(command, options))
+        vars(call).update(done_by=(command_line, options))
         return call
 
     return decorate

@@ -32,18 +32,17 @@ def _command(match: re.Match[str]) -> str:
         options = {keyword.arg or "": ast.literal_eval(keyword.value) for keyword in call.keywords}
     except (SyntaxError, ValueError, AssertionError):
         return match[0]
-    done_by, more = getattr(getattr(mcaptrack, name, None), "done_by", (name, {}))
-    parts = done_by.split()
+    line, more = getattr(getattr(mcaptrack, name, None), "done_by", ((name,), {}))
     arguments_: list[str | Path] = [Path(value) if value.startswith("-") else value for value in values]
     for parameter, value in (options | more).items():
-        flag = flag_of(parameter, value, parts[0])
+        flag = flag_of(parameter, value, line[0])
         if flag.endswith("="):  # Python alone has it
             return match[0]
         if flag.startswith("--set "):
             arguments_ += ["--set", f"{parameter}={_text(value)}"]
         else:
             arguments_ += [flag] if isinstance(value, bool) else [flag, str(value)]
-    return command(*parts, *arguments_)
+    return command(*line, *arguments_)
 
 
 def _option(match: re.Match[str]) -> str:

@@ -9,6 +9,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.camera_path import CameraPath
+from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job, fits, read_frames
 from mcaptrack.pipeline.staleness import OFF
@@ -59,8 +60,10 @@ def detects_motion(provenance: Provenance | None) -> bool:
     stage = STAGES.get(provenance.transform) if provenance and "transform" not in provenance.plugins else None
     if provenance is None or stage is None or stage.reads is not VIDEO:
         return False
-    name = provenance.parameters.get("detector", "")
-    return traits_of(stage.built_in().get(str(name), stage.default)).needs_still_camera
+    name = str(provenance.parameters.get("detector", ""))
+    if missing_extension(name, "detector"):  # as of another package
+        return False
+    return traits_of(stage.built_in().get(name, stage.default)).needs_still_camera
 
 
 def motion_input(state: RunState, transform: Transform) -> SideInput | None:

@@ -15,13 +15,32 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
+from mcaptrack.schema import DETECTIONS
+from mcaptrack.schema.provenance import Provenance
+from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.charts import WIDTH, Axis, Line, line_chart, round_most, thinned, time_ticks
 
-__all__ = ["NONE", "clock", "counted", "number", "percent", "plain", "policy", "render", "short", "tick_marks", "times"]
+__all__ = [
+    "NONE", "clock", "counted", "number", "percent", "plain", "policy", "render", "short", "tick_marks", "times",
+    "tracker_name",
+]  # fmt: skip
 
 #: Printed in place of a number that is missing.
 NONE: Final = "\N{EN DASH}"
 _MAX_FIXED: Final = 1e6
+
+
+#: How trackers are called; channels of earlier versions that name none were made by the first.
+_TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
+_FIRST_TRACKER: Final = next(iter(_TRACKERS))
+
+
+def tracker_name(provenance: Provenance | None) -> str:
+    """Return the name of the tracker of a channel, by how it was made."""
+    stage = STAGES.get(provenance.transform) if provenance else None
+    if provenance is None or stage is None or stage.reads is not DETECTIONS:
+        return "tracks as given"
+    return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
 
 def number(value: float | int | None, digits: int = 2, unit: str = "") -> str:

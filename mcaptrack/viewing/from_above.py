@@ -15,10 +15,9 @@ from mcaptrack.foxglove.messages import message_class
 from mcaptrack.foxglove.views import styles
 from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.pipeline import RobotPath
-from mcaptrack.viewing.legend import BACKGROUND
-from mcaptrack.viewing.painting import text_size
+from mcaptrack.viewing.painting import BACKGROUND
 
-__all__ = ["ABOVE_PX", "LabelPlaces", "Sight", "drawing", "grid", "ground", "robot", "sight_of", "sights"]
+__all__ = ["ABOVE_PX", "Sight", "drawing", "grid", "ground", "robot", "sight_of", "sights"]
 
 _GRID: Final = (0.2, 0.22, 0.25, 1.0)
 _INK: Final = (0.85, 0.87, 0.9, 1.0)
@@ -39,13 +38,6 @@ _TEXT, _LEAST_TEXT_PX = 1 / 60, 11.0
 _BESIDE_PX: Final = np.array([8.0, -8.0])
 
 
-#: Labels that moved away come back by this part of a line a picture, and move by so many lines at most.
-_BACK: Final = 0.1
-_MOST_SHIFT: Final = 5.0
-#: Labels may overlap by less than this.
-_APART_PX: Final = 1e-3
-
-
 class Sight(NamedTuple):
     """The part of the ground in a picture: its middle in metres, pixels per metre, and width and height in pixels.
 
@@ -63,46 +55,6 @@ class Sight(NamedTuple):
         x = self.width_px / 2 + (points_m[:, 0] - self.x_m) * self.px_per_m
         y = self.height_px / 2 - (points_m[:, 1] - self.y_m) * self.px_per_m
         return np.stack([x, y], axis=-1)
-
-
-class LabelPlaces:
-    """Keeps labels of drawings apart, picture after picture: those that come later move up, and come back slowly.
-
-    Labels that would have to move by more than some lines stay where they are.
-    """
-
-    def __init__(self) -> None:
-        self._shifts: dict[str, float] = {}
-        self._taken: list[tuple[float, float, float, float]] = []
-        self._now: dict[str, float] = {}
-
-    def next_picture(self) -> None:
-        """Begin another picture."""
-        self._shifts, self._now, self._taken = self._now, {}, []
-
-    def spread(self, drawn: Any) -> Any:
-        """Move the texts of annotations away from each other and from those before in this picture; returns them."""
-        for text in drawn.texts:
-            width, above, below = text_size(text.text, text.font_size)
-            wide, high = width + 2.0, above + below + 1.0
-            x, y = text.position.x, text.position.y
-            back_px = _BACK * high
-            shift = max(0.0, self._shifts.get(text.text, 0.0) - back_px)
-            for _ in range(len(self._taken)):
-                low = y - shift
-                hit = [
-                    top
-                    for left, top, right, bottom in self._taken
-                    if left < x + wide and x < right and top < low - _APART_PX and low - high < bottom - _APART_PX
-                ]
-                if not hit:
-                    break
-                shift = y - min(hit)
-            shift = shift if shift <= _MOST_SHIFT * high else 0.0
-            self._now[text.text] = shift
-            self._taken.append((x, y - shift - high, x + wide, y - shift))
-            text.position.y = y - shift
-        return drawn
 
 
 def ground(sight: Sight) -> Image:

@@ -14,8 +14,20 @@ from numpy.typing import NDArray
 from mcaptrack.geometry.arrays import Floats, Image, Ints
 from mcaptrack.notices import warn
 
-__all__ = ["CLOSED", "draw", "message_at", "put_text", "scaled", "strokes", "text_size", "without_repeated"]
+__all__ = [
+    "BACKGROUND",
+    "CLOSED",
+    "draw",
+    "message_at",
+    "put_text",
+    "scaled",
+    "strokes",
+    "text_size",
+    "without_repeated",
+]
 
+#: The colour of what is drawn on where there is no picture: blue, green, red.
+BACKGROUND: Final = (32, 28, 26)
 #: The size of text that OpenCV draws at a scale of 1, and the least one in a video.
 _TEXT_PX: Final = 24.0
 _LEAST_TEXT_PX: Final = 9.0

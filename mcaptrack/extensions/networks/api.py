@@ -67,7 +67,7 @@ def models(
     return (catalogue.find(name),) if name else tuple(catalogue.CATALOGUE.values())
 
 
-@done_by("models get")
+@done_by("models", "get")
 def get_model(name: str, *, source: PathLike | None = None) -> Path:
     """Fetch the weights of a detector of the catalogue, once, into the user's folder of caches.
 

@@ -16,7 +16,7 @@ from mcaptrack.extensions.notebook.pictures import Clip
 from mcaptrack.foxglove.views import SUFFIXES
 from mcaptrack.transforms import FULL
 from mcaptrack.viewing.formatting import render
-from mcaptrack.viewing.legend import BACKGROUND
+from mcaptrack.viewing.painting import BACKGROUND
 
 #: The least width of a player in pixels: there is room for what it is controlled with.
 _LEAST_PX: Final = 420

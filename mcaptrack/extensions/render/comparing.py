@@ -18,6 +18,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.event_text import describe
+from mcaptrack.extensions.render.legend import INK
 from mcaptrack.extensions.render.video import (
     RenderOptions,
     SceneDrawing,
@@ -39,9 +40,9 @@ from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.transforms import FULL
+from mcaptrack.viewing.formatting import tracker_name
 from mcaptrack.viewing.from_above import sights
-from mcaptrack.viewing.legend import BACKGROUND, INK, tracker_name
-from mcaptrack.viewing.painting import draw, put_text, scaled, text_size
+from mcaptrack.viewing.painting import BACKGROUND, draw, put_text, scaled, text_size
 
 #: The largest width of a comparison in pixels, unless one is given.
 _WIDTH_PX: Final = 1920

@@ -14,6 +14,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.evaluation.occupancy import Occupancy, occupancy
+from mcaptrack.extensions.render.legend import INK
 from mcaptrack.extensions.render.video import RenderOptions
 from mcaptrack.files import publish_bytes
 from mcaptrack.foxglove.views.styles import GROUND_TRUTH, RETRACKED, TRACKED
@@ -29,8 +30,7 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import encode_image
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import ABOVE_PX, sight_of
-from mcaptrack.viewing.legend import BACKGROUND, INK
-from mcaptrack.viewing.painting import draw, put_text, scaled, text_size
+from mcaptrack.viewing.painting import BACKGROUND, draw, put_text, scaled, text_size
 
 #: The formats of a heat map by the suffix of its file.
 SUFFIXES: Final = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}

@@ -18,6 +18,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.render.blur.people import HiddenPeople, hide
+from mcaptrack.extensions.render.legend import LabelPlaces, with_legend
 from mcaptrack.foxglove.views.ground import lifetime_ns
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
@@ -27,7 +28,6 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import ABOVE_PX, Sight, sights
-from mcaptrack.viewing.legend import with_legend
 from mcaptrack.viewing.painting import draw, message_at, scaled, without_repeated
 
 _GIF_FPS: Final = 10.0
@@ -190,7 +190,7 @@ class SceneDrawing:
 
     def __init__(self, opened: log.Log, topics: Sequence[str], span: tuple[int, int]) -> None:
         self._views = views_at(opened, topics, span, is_held=True)
-        self._places = from_above.LabelPlaces()
+        self._places = LabelPlaces()
 
     def drawn(self, image: Image, t_ns: int, sight: Sight) -> Image:
         """The picture with the scenes at a time."""

@@ -44,8 +44,7 @@ from mcaptrack.sources.cameras import provenance_of, repaired_tracks
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.viewing.background import SceneBackground, background_picture, moment_picture
-from mcaptrack.viewing.formatting import clock, plain, short
-from mcaptrack.viewing.legend import tracker_name
+from mcaptrack.viewing.formatting import clock, plain, short, tracker_name
 from mcaptrack.viewing.sections import section_of
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.

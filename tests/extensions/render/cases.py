@@ -45,7 +45,7 @@ PROPOSALS = {
 DEEP = {
     "render": (
         "it writes pictures as their channel says, and draws what views draw",
-        "cli.many foxglove.views.ground foxglove.views.projected foxglove.views.styles geometry.pinhole "
+        "cli.many foxglove.views.ground foxglove.views.people foxglove.views.projected foxglove.views.styles geometry.pinhole "
         "schema.resampling sources.calibrations sources.fixed_frame sources.foreign.definitions "
         "sources.video.pixels",
     )

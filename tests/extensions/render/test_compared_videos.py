@@ -14,13 +14,13 @@ import mcaptrack
 from mcaptrack import log, notices
 from mcaptrack.evaluation.occupancy import Occupancy
 from mcaptrack.extensions.render import comparing, heat_map
+from mcaptrack.extensions.render.legend import LabelPlaces
 from mcaptrack.foxglove import ANNOTATIONS
 from mcaptrack.foxglove.messages import message_class
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.pipeline.write import Made
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
-from mcaptrack.viewing import from_above
 from tests.commands import call, printed
 from tests.logs import write_with_views
 from tests.worlds import ns
@@ -84,7 +84,7 @@ def test_logs_without_pictures_are_compared_from_above(tmp_path):
 
 def test_labels_from_above_never_overlap():
     """Eight people walk at random in a narrow place; labels are boxes of their text, measured here."""
-    rng, places = np.random.default_rng(3), from_above.LabelPlaces()
+    rng, places = np.random.default_rng(3), LabelPlaces()
     at = rng.uniform(0, 60, (8, 2)) + 200
     before: dict[str, float] = {}
     moved = 0

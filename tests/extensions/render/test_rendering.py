@@ -19,11 +19,11 @@ from scipy.spatial.transform import Rotation
 import mcaptrack
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.render.legend import with_legend
 from mcaptrack.extensions.render.video import RenderOptions, render
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
-from mcaptrack.viewing.legend import with_legend
 from mcaptrack.viewing.painting import draw, message_at
 from tests.commands import call, done, printed
 from tests.logs import recorder

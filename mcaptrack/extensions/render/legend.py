@@ -1,10 +1,10 @@
-"""A strip below the pictures of a video that says what is drawn on them, with samples in the same styles."""
+"""A strip below the pictures of a video that says what is drawn on them, in the same styles; and labels kept apart."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,15 +14,10 @@ from mcaptrack.foxglove.views.people import ellipse_points, segments
 from mcaptrack.foxglove.views.styles import TrackStyle
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.registry import names as names_of
-from mcaptrack.schema import DETECTIONS
-from mcaptrack.schema.provenance import Provenance
-from mcaptrack.transforms import STAGES
-from mcaptrack.viewing.painting import draw, put_text, text_size
+from mcaptrack.viewing.painting import BACKGROUND, draw, put_text, text_size
 
-__all__ = ["BACKGROUND", "INK", "tracker_name", "with_legend"]
-
-#: The colours of the strip and of its text: blue, green, red.
-BACKGROUND, INK = (32, 28, 26), (235, 230, 225)
+#: The colour of text: blue, green, red.
+INK = (235, 230, 225)
 #: Narrower videos have no legend: it couldn't be read.
 _LEAST_PX: Final = 240
 #: The height of text as a part of the width of the strip; the other sizes in heights of text.
@@ -92,14 +87,48 @@ def _draw_sample(drawn: Annotations, text: str, style: TrackStyle, left: float, 
     drawn.loops(_FIRST, np.add(around, [left, middle])[None], rgb, alpha, style.thickness * unit, dashes=style.dashes)
 
 
-#: How trackers are called; channels of earlier versions that name none were made by the first.
-_TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
-_FIRST_TRACKER: Final = next(iter(_TRACKERS))
+#: Labels that moved away come back by this part of a line a picture, and move by so many lines at most.
+_BACK: Final = 0.1
+_MOST_SHIFT: Final = 5.0
+#: Labels may overlap by less than this.
+_APART_PX: Final = 1e-3
 
 
-def tracker_name(provenance: Provenance | None) -> str:
-    """Return the name of the tracker of a channel, by how it was made."""
-    stage = STAGES.get(provenance.transform) if provenance else None
-    if provenance is None or stage is None or stage.reads is not DETECTIONS:
-        return "tracks as given"
-    return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
+class LabelPlaces:
+    """Keeps labels of drawings apart, picture after picture: those that come later move up, and come back slowly.
+
+    Labels that would have to move by more than some lines stay where they are.
+    """
+
+    def __init__(self) -> None:
+        self._shifts: dict[str, float] = {}
+        self._taken: list[tuple[float, float, float, float]] = []
+        self._now: dict[str, float] = {}
+
+    def next_picture(self) -> None:
+        """Begin another picture."""
+        self._shifts, self._now, self._taken = self._now, {}, []
+
+    def spread(self, drawn: Any) -> Any:
+        """Move the texts of annotations away from each other and from those before in this picture; returns them."""
+        for text in drawn.texts:
+            width, above, below = text_size(text.text, text.font_size)
+            wide, high = width + 2.0, above + below + 1.0
+            x, y = text.position.x, text.position.y
+            back_px = _BACK * high
+            shift = max(0.0, self._shifts.get(text.text, 0.0) - back_px)
+            for _ in range(len(self._taken)):
+                low = y - shift
+                hit = [
+                    top
+                    for left, top, right, bottom in self._taken
+                    if left < x + wide and x < right and top < low - _APART_PX and low - high < bottom - _APART_PX
+                ]
+                if not hit:
+                    break
+                shift = y - min(hit)
+            shift = shift if shift <= _MOST_SHIFT * high else 0.0
+            self._now[text.text] = shift
+            self._taken.append((x, y - shift - high, x + wide, y - shift))
+            text.position.y = y - shift
+        return drawn
