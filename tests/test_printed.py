@@ -305,10 +305,10 @@ def of_mistakes(to: Transcript) -> None:
         to.run(f"run x.mcap --timeout={time}")
     to.run("run x.mcap --ledger x.mcap")
     write_clip(Path("clip.mp4"), options={"bf": "0"})
-    for words in ("--set quality=60", "--image-format jpeg --set quality=0", "--image-format png --set quality=9",
+    for words in ("--quality 60", "--image-format jpeg --quality 0", "--image-format png --quality 9",
                   "--image-format jpeg --set keyframe_interval_s=1", "--set keyframe_interval_s=0"):  # fmt: skip
         to.run(f"ingest clip.mp4 -o c.mcap {words}")
-    to.run("ingest truth.txt -o c.mcap --set quality=20")
+    to.run("ingest truth.txt -o c.mcap --quality 20")
     to.lines.append(f"c.mcap is there: {Path('c.mcap').exists()}")
     to.run("run x.mcap", run=McaptrackError("give `fps=25` or `force=True`; `mcaptrack.run('a b.mcap', events=False)`"))
 

@@ -110,7 +110,7 @@ class IngestResult:
 
 @declared(
     most_used=("output", "into", "role", "ground_plane", "truth", "detections", "fps", "camera", "force"),
-    settable=("quality", "keyframe_interval_s", "stream", "calibration_unit"),
+    settable=("keyframe_interval_s", "calibration_unit"),
     heading="Start here",
     printed_by="mcaptrack.cli.ingest:Ingest",
 )
