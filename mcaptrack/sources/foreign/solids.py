@@ -208,7 +208,7 @@ def marker_solids(message: Any) -> Message3d:
 
 
 def _without_parts(boxes: list[Box3d]) -> list[Box3d]:
-    """Boxes without those that are above, below or inside of the largest with the same id: heads of bodies."""
+    """Boxes without what is round, and above, below or inside of the largest with the same id: heads of bodies."""
     largest: dict[Any, Box3d] = {}
     for box in boxes:
         if box.source_id is not None and prod(box.size) > prod(largest.get(box.source_id, box).size):
@@ -217,8 +217,10 @@ def _without_parts(boxes: list[Box3d]) -> list[Box3d]:
 
     def is_part(box: Box3d) -> bool:
         whole = largest[box.source_id]
-        near = dist(box.centre[:2], whole.centre[:2]) < max(whole.size[:2]) / 2
-        return box.source_id is not None and box is not whole and box.frame_id == whole.frame_id and near
+        if box.source_id is None or box.has_heading or box.frame_id != whole.frame_id:
+            return False
+        is_smaller = prod(box.size) < prod(whole.size)
+        return is_smaller and dist(box.centre[:2], whole.centre[:2]) < max(whole.size[:2]) / 2
 
     return [box for box in boxes if not is_part(box)]
 
