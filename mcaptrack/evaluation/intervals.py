@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from mcaptrack import notices
 
-#: Intervals of counts, and of other numbers, are wider than 90 % of the worlds by this share of the median on both sides,
-#: for what worlds get wrong alike. (Chosen on drawn scenes, as are the values below.)
+#: Intervals of counts, and of other numbers, are wider than 90 % of the worlds by this share of the median on both
+#: sides, for what worlds get wrong alike. (Chosen on drawn scenes, as are the values below.)
 WIDER, WIDER_MEAN = 0.06, 0.1
 #: There are no intervals for fewer people; where larger shares of tracks begin, and end, in the middle of the seen area
 #: even if all go on that can; and where some worlds have so many times more people than others.
