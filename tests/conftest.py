@@ -192,6 +192,6 @@ def bare(template, tmp_path_factory) -> Path:
 def with_worlds(tmp_path_factory) -> Path:
     """A log of walkers with nine worlds. Tests must not change it."""
     path = tmp_path_factory.mktemp("worlds") / "log.mcap"
-    write_channels(path, samples=noisy_tracks(np.random.default_rng(5), people=14, ticks=80, hidden=0.03))
+    write_channels(path, samples=noisy_tracks(np.random.default_rng(7), people=24, ticks=80, hidden=0.03))
     done("retrack", path, "--worlds", "9", "-q")
     return path

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mcaptrack import notices
 
-#: Intervals are wider than 90 % of the worlds by this share of the median on both sides, for what worlds get wrong
-#: alike. (Chosen on drawn scenes.)
-WIDER: Final = 0.06
-#: There are no intervals for fewer people, where more than this share of tracks begin in the middle of the seen area,
-#: and where some worlds have so many times more people than others.
-_FEW, _LATE, _APART = 10, 0.5, 3.0
+#: Intervals of counts, and of other numbers, are wider than 90 % of the worlds by this share of the median on both
+#: sides, for what worlds get wrong alike. (Chosen on drawn scenes, as are the values below.)
+WIDER, WIDER_MEAN = 0.06, 0.1
+#: There are no intervals for fewer people; where larger shares of tracks begin, and end, in the middle of the seen area
+#: even if all go on that can; and where some worlds have so many times more people than others.
+_FEW, _LATE, _LOST, _APART = 15, 0.1, 0.4, 3.0
 
 
 class WorldInterval(NamedTuple):
@@ -38,7 +38,8 @@ class WorldInterval(NamedTuple):
         low, middle, high = np.quantile(some, (0.05, 0.5, 0.95)).tolist()
         if has_none:
             return cls(middle, None, None)
-        low, high = low - WIDER * abs(middle), high + WIDER * abs(middle)
+        wider = (WIDER if is_count else WIDER_MEAN) * abs(middle)
+        low, high = low - wider, high + wider
         low = low if some.min() < 0 else max(low, 0.0)
         return cls(middle, float(np.floor(low)), float(np.ceil(high))) if is_count else cls(middle, low, high)
 
@@ -54,19 +55,25 @@ class WorldInterval(NamedTuple):
         return middle + ("" if self.low is None else f" ({self.low:.{digits}f} to {self.high:.{digits}f})") + unit
 
 
-def lacks_intervals(worlds: Sequence[tuple[int, float]]) -> bool:
+def lacks_intervals(worlds: Sequence[tuple[int, float, float]]) -> bool:
     """Whether the log can't tell how sure numbers are; then it is said why.
 
-    Of each world there are the number of its people, and the share of them who are first seen in the middle.
+    Of each world there are the number of its people, and the shares of tracks that are ``late`` and ``lost`` (see
+    ``WorldTracks``).
     """
-    people, late = np.array(worlds, float).T
+    people, late, lost = np.array(worlds, float).T
     low, middle, high = np.quantile(people, (0.05, 0.5, 0.95)).tolist()
+    least_late, least_lost = np.quantile([late, lost], 0.05, axis=1).tolist()
     if middle < _FEW:
         why = f"there are only {middle:g} people; how often they are missed can't be told from fewer than {_FEW}"
     elif high > _APART * low:
         why = f"there are {low:g} to {high:g} people, by which tracks are taken for some"
-    elif (share := float(np.median(late))) > _LATE:
-        why = f"{share:.0%} of the tracks begin in the middle of the seen area, so that many people are never seen"
+    elif least_late > _LATE or least_lost > _LOST:
+        share, verbs = (least_late, "begin") if least_late > _LATE else (least_lost, "end")
+        why = (
+            f"{share:.0%} of the tracks {verbs} in the middle of the seen area, away from others that may be the same "
+            "person; many people may never be tracked"
+        )
     else:
         return False
     notices.warn(f"numbers have no intervals: {why}", "not-compared")

@@ -30,6 +30,9 @@ _BORDER_M, _BORDER_S, _BORDER_FRAMES = 0.5, 1.0, 2
 _SAMPLES: Final = 3
 #: Another track may go on after so many seconds, no farther away than by this speed and distance.
 _GOES_ON_S, _GOES_ON_M_PER_S, _GOES_ON_M = 30.0, 2.0, 1.5
+#: There are so many hidden people to one who was tracked, times the square of the share (at most so large) of those
+#: who are first seen in the middle. (Chosen on drawn scenes.)
+_HIDDEN, _MOST_LATE = 3.3, 0.3
 #: Worlds are drawn with this seed and their number.
 _SEED: Final = 2012
 
@@ -39,7 +42,8 @@ class WorldTracks(NamedTuple):
 
     What a row has are the values of the sample ``before``, and ``share`` of the way from there to ``after``: 0 at a
     sample, from 0 to 1 in a gap, below 0 where a track begins earlier or ends later than it was seen.
-    ``observed`` are samples. ``late`` is the share of tracks that begin in the middle of the seen area.
+    ``observed`` are samples. ``late`` and ``lost`` are the shares of tracks that begin, and that end, in the middle of
+    the seen area and don't go on from another one, or as one.
     """
 
     track: Ints
@@ -49,6 +53,7 @@ class WorldTracks(NamedTuple):
     share: Floats
     observed: Bools
     late: float
+    lost: float
 
     @property
     def people(self) -> int:
@@ -187,7 +192,6 @@ class _World:
 
     def tracks(self) -> WorldTracks:
         """Draw which tracks go on as others, how long people were unseen, and who was not seen at all."""
-        late = float(self.begins.mean()) if len(self.names) else 0.0
         go_on = float(self.rng.random()) ** 0.5  # most do; the other explanation stays likely
         goes_on, root = self._joined(self.rng.random(len(self.names)) < go_on)
         begins, ends = self.begins & (root == np.arange(len(root))), self.ends & ~goes_on
@@ -196,14 +200,15 @@ class _World:
             (root[self.of], self.frame, rows, rows, np.zeros(len(rows))),
             self._unseen(begins, self.first, self.before_begin, -1, root),
             self._unseen(ends, self.last, self.after_end, 1, root),
-            self._never_seen(late, go_on),
+            self._never_seen(int(begins.sum()), len(np.unique(root))),
         ]
         track, frame, before, after, share = (np.concatenate(values) for values in zip(*parts, strict=True))
         order = np.lexsort((frame, track))
         track, frame, before, after, share = (values[order] for values in (track, frame, before, after, share))
         others = self.names.max(initial=0) + 1 + np.arange(track.max(initial=0) + 1)
         names = np.append(self.names, others)  # of those who were never tracked others than all tracks have
-        return self._filled(names[track], frame, before, after, share, order < len(rows), late)
+        late, lost = (float(those.mean()) if len(those) else 0.0 for those in (begins, ends))
+        return WorldTracks(*self._filled(names[track], frame, before, after, share, order < len(rows)), late, lost)
 
     def _joined(self, wanted: Bools) -> tuple[Bools, Ints]:
         """Which tracks (T,) go on as another one, and the first track of each (T,)."""
@@ -253,28 +258,23 @@ class _World:
         inside = _Seen.inside(self.planes, places) > 0
         return track[inside], frame[inside], at[inside], to[inside], share[inside]
 
-    def _never_seen(self, late: float, go_on: float) -> _Rows:
-        """The rows of people who were never tracked: such as those who were seen late or lost, at other times."""
-        middle = self.depth > _BORDER_M + _BORDER_S * self._usual_speed()
-        share = min(late / max(float(middle.mean()) if len(middle) else 0.0, 0.2), 0.9)
-        like = np.flatnonzero(self.begins | self.ends)
-        more = int(self.rng.poisson((1 - go_on) * share**2 * len(self.names))) if len(like) else 0
-        like = like[self.rng.integers(0, max(len(like), 1), more)]
+    def _never_seen(self, late: int, people: int) -> _Rows:
+        """The rows of people who were never tracked, by how many were tracked ``late``: as tracks, at other times.
+
+        With tracks chosen by the places of ends and gaps, or by how near others are, intervals are not narrower.
+        """
+        share = min(late / max(people, 1), _MOST_LATE)
+        more = int(self.rng.poisson(_HIDDEN * share**2 * people))
+        like = self.rng.integers(0, max(len(self.names), 1), more)
         at = ragged_range(self.first[like], sizes := self.last[like] - self.first[like] + 1)
         room = len(self.s) - 1 - self.frame[self.last[like]] + self.frame[self.first[like]]
         shift = np.floor(self.rng.random(more) * (room + 1)).astype(np.int64) - self.frame[self.first[like]]
         track = np.repeat(len(self.names) + np.arange(more), sizes)
         return track, self.frame[at] + np.repeat(shift, sizes), at, at, np.zeros(len(at))
 
-    def _usual_speed(self) -> float:
-        """The median speed from sample to sample."""
-        same = np.diff(self.of) == 0
-        seconds = np.diff(self.s[self.frame])[same]
-        return float(np.median(np.hypot(*np.diff(self.xy_m, axis=0)[same].T) / seconds)) if len(seconds) else 0.0
-
     def _filled(
-        self, track: Ints, frame: Ints, before: Ints, after: Ints, share: Floats, observed: Bools, late: float
-    ) -> WorldTracks:
+        self, track: Ints, frame: Ints, before: Ints, after: Ints, share: Floats, observed: Bools
+    ) -> tuple[Ints, Ints, Ints, Ints, Floats, Bools]:
         """With rows on a straight line in the frames between those of a track."""
         gap = np.flatnonzero((track[1:] == track[:-1]) & (np.diff(frame) > 1))
         steps = frame[gap + 1] - frame[gap] - 1
@@ -287,4 +287,4 @@ class _World:
         share, observed = np.append(share, part), np.append(observed, np.zeros(len(here), bool))
         order = np.lexsort((frame, track))
         sides = self.sample[before[order]], self.sample[after[order]]
-        return WorldTracks(track[order], frame[order], *sides, share[order], observed[order], late)
+        return track[order], frame[order], *sides, share[order], observed[order]

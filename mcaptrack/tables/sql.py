@@ -239,10 +239,10 @@ class Database:
                 + (f", not {', '.join(sorted(others))}" if others else "")
             )
         answers, seen = [], []
-        for tracks, people, late in self._tracks_in_worlds():
+        for tracks, of_world in self._tracks_in_worlds():
             self._connection.register("tracks", tracks.drop_columns(["world"]))
             answers.append(tables.tidy(self._run(self._connection.extract_statements(query)[0])))
-            seen.append((people, late))
+            seen.append(of_world)
         has_none = lacks_intervals(seen)
         if _PAIRS.search(query) and not has_none:
             has_none = True
@@ -252,8 +252,8 @@ class Database:
             )
         return self._over_worlds(answers, has_none)
 
-    def _tracks_in_worlds(self) -> Iterator[tuple[Any, int, float]]:
-        """The tracks of each world, Arrow, the number of people, and the share of them who begin in the middle."""
+    def _tracks_in_worlds(self) -> Iterator[tuple[Any, tuple[int, float, float]]]:
+        """The tracks of each world, Arrow, and the number of people and the shares of tracks that are late and lost."""
         import pyarrow as pa
 
         def asked(query: str, **values: str) -> Any:
@@ -271,10 +271,11 @@ class Database:
             parts.append(zip(repeat(samples), repeat(frames), repeat(xy_m), drawn, strict=False))
         for number, channels in enumerate(zip(*parts, strict=False), start=1):
             people = [world.people for *_, world in channels]
-            late = sum(count * world.late for count, (*_, world) in zip(people, channels, strict=True))
+            cut = [(world.late, world.lost) for *_, world in channels]
+            late, lost = np.average(cut, axis=0, weights=np.maximum(people, 1)).tolist()
             whole = pa.concat_tables([_of_world(*channel) for channel in channels])
             whole = whole.append_column("world", pa.array(np.full(len(whole), number, np.uint32)))
-            yield whole, sum(people), late / max(sum(people), 1)
+            yield whole, (sum(people), late, lost)
 
     def _load_worlds(self) -> None:
         """Load what the tracks of worlds are made of."""

@@ -521,7 +521,7 @@ def zones_in_worlds(
     samples = (positions.track, positions.class_id, positions.frame, positions.at["metres"])
     for rows_of_world in tracks_in_worlds(*samples, t_ns, worlds.rows, worlds.row_ns):
         of_world, arrivals = _of_world(positions, t_ns, rows_of_world), []
-        seen.append((rows_of_world.people, rows_of_world.late))
+        seen.append((rows_of_world.people, rows_of_world.late, rows_of_world.lost))
         for placed in zones:
             paths, rows, margin = _paths(of_world, placed, options, "worlds")
             stay = _Stays.of(placed, margin, rows, of_world, paths)

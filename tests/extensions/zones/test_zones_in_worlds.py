@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack.evaluation.intervals import WIDER
+from mcaptrack.evaluation.intervals import WIDER, WIDER_MEAN
 from mcaptrack.notices import collected
 from tests.commands import done
 from tests.worlds import noisy_tracks, write_channels
@@ -52,7 +52,8 @@ def test_zones_have_the_medians_and_intervals_of_what_sql_counts_in_each_world(w
         (right.then["left"], "then_left", True),
     ):
         low, middle, high = np.percentile(wanted[name], [5, 50, 95])
-        ends = max(low - WIDER * middle, 0), high + WIDER * middle
+        wider = (WIDER if is_count else WIDER_MEAN) * middle
+        ends = max(low - wider, 0), high + wider
         ends = (np.floor(ends[0]), np.ceil(ends[1])) if is_count else ends
         assert found == pytest.approx((middle, *ends)), name
 
