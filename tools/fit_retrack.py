@@ -273,7 +273,7 @@ def decisions_of(run: Run) -> tuple[Judged, Judged, Judged]:
     _, track, count = np.unique(tracks.track, return_inverse=True, return_counts=True)
     is_person = np.bincount(track, people >= 0) * 2 >= count
     log, *_ = reached("_people", *run.args)
-    lasts = [tracks.step[tracks.track == name].ptp() for name in np.unique(tracks.track)]
+    lasts = [np.ptp(tracks.step[tracks.track == name]) for name in np.unique(tracks.track)]
     short = np.array(lasts) < round(log.least_s * DEFAULT.rate_hz)
     return joins, *(Judged(decided.log_odds[some, None], is_person[some]) for some in (~short, short))
 

@@ -210,7 +210,7 @@ def log_density(off: np.ndarray, variance: float) -> float:
 
 
 class OnlineTracker:
-    CAP, GATE, FRESH, FLOOR_M = 26.0, 40.0, 4.0, 0.1
+    CAP, GATE, CROWD_M, FRESH, FLOOR_M = 26.0, 40.0, 1.7, 4.0, 0.1
     WIDE, MERGED = 0.1, 4.0
 
     def __init__(self, options, predict: Predict, past: int) -> None:
@@ -301,7 +301,7 @@ class OnlineTracker:
         self.people = [p for p in self.people if p.missed <= (self.max_age if p.hits >= self.confirm else young)]
         for person in self.people:
             person.predict(passed / o.rate_hz, o.drift_m_per_s, o.drift_ratio)
-        value = [[self.gain(person, row) for row in rows] for person in self.people]
+        value = [[self.gain(person, row, rows) for row in rows] for person in self.people]
         pairs = best_assignment(value, most_pairs=False)
         has = {self.people[a].name: rows[b] for a, b in pairs}
         hosts = self.merge(has, passed)
@@ -325,7 +325,7 @@ class OnlineTracker:
         self.known |= {row["track_id"] for row in rows}
         return has
 
-    def gain(self, person: Person, row: Row) -> float | None:
+    def gain(self, person: Person, row: Row, rows: list[Row]) -> float | None:
         """Twice the log likelihood ratio of a pair to no pair."""
         o = self.options
         variance = person.cov[0, 0] + self.noise_m**2 + self.FLOOR_M**2
@@ -334,7 +334,8 @@ class OnlineTracker:
             return None
         gain = self.CAP - squared - 2 * log(variance)
         if person.source == row["track_id"]:
-            gain += o.same_id_bonus
+            others = [hypot(*(place(other) - place(row))) for other in rows if other is not row]
+            gain += o.same_id_bonus / 3 if any(apart < self.CROWD_M for apart in others) else o.same_id_bonus
         if row["track_id"] not in self.known and person.missed == 1:
             gain -= self.FRESH
         gain = round(gain, 6)

@@ -178,7 +178,7 @@ def calibrate(descriptors: Descriptors, tracks: Tracks, step_s: float) -> Appear
     two = np.flatnonzero(within > 0)
     now, then = (descriptors.values[tracks.look[which]] / np.float32(255) for which in (two, two - 1))
     noise = max(float(np.median(np.square(now - then).sum(axis=1))) if len(two) else 1.0, 1e-6)
-    windows = Windows(descriptors, tracks._replace(track=np.cumsum(within == 0) - 1), step_s)
+    windows = GapWindows(descriptors, tracks._replace(track=np.cumsum(within == 0) - 1), step_s)
     distance, *_ = windows.distances(before, windows.starts[before + 1], after, windows.starts[after])
     lag = np.searchsorted(_LAGS_S, gap_s, "right") - 1
     low, high = np.sort([track[before], track[after]], axis=0)
@@ -271,8 +271,8 @@ class Appearance(NamedTuple):
         return None if calibration is None else cls(descriptors, calibration, step_s)
 
 
-class Windows:
-    """What is seen next to gaps between and within tracks (K,), which are numbered by ascending id."""
+class GapWindows:
+    """Descriptors next to gaps between and within tracks (K,), which are numbered by ascending id."""
 
     def __init__(self, descriptors: Descriptors, tracks: Tracks, step_s: float) -> None:
         order = tracks.order
@@ -302,7 +302,8 @@ class Windows:
         low, high = self._known[begin], self._known[self.starts[right + 1]]
         after, is_after, first = self._window(low[:, None] + np.arange(WINDOW), low, high)
         distance = usual_distance(self._values, before, is_before, after, is_after)
-        return distance, np.abs(first - last) * self._step_s, is_before.any(axis=1) & is_after.any(axis=1)
+        are_seen = np.asarray(is_before.any(axis=1) & is_after.any(axis=1))
+        return distance, np.abs(first - last) * self._step_s, are_seen
 
     def _window(self, places: Ints, low: Ints, high: Ints) -> tuple[Ints, Bools, Ints]:
         """The descriptors at ``places`` (E, WINDOW), which of them are from ``low`` to before ``high`` and within
@@ -320,7 +321,7 @@ class Sides:
 
     def __init__(self, appearance: Appearance, tracks: Tracks) -> None:
         self._calibration = appearance.calibration
-        self._windows = Windows(appearance.descriptors, tracks, appearance.step_s)
+        self._windows = GapWindows(appearance.descriptors, tracks, appearance.step_s)
 
     def of_tracks(self, end: Ints, begin: Ints) -> Floats:
         """The log likelihood ratio (E,) that the end of one track and the beginning of another are one person.

@@ -1,8 +1,9 @@
 """Online tracking by likelihood: data association step by step, from the past alone.
 
 Every track is a Kalman filter. An observation is assigned to the track that makes it likely, and the input's track ids
-count as evidence. A track without an observation is coasting: its filter predicts on until the track terminates. Tracks
-that are occluded stay alive while they are merged into one detection with another track.
+count as evidence: much where a person walks alone, little in a crowd, where trackers confuse people. A track without
+an observation is coasting: its filter predicts on until the track terminates. Tracks that are occluded stay alive while
+they are merged into one detection with another track.
 
 The numbers of tracks are rows of arrays, with a column for each track. A step has few tracks, so what takes time is the
 number of operations on arrays. Letters: K tracks, N observations of one step, P pairs of both, L lost tracks.
@@ -20,7 +21,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
 from mcaptrack.geometry.assignment import LARGE_TABLE, assign_by_gain, assign_pairs_by_gain
 from mcaptrack.geometry.hull import GrowingHull
-from mcaptrack.geometry.neighbours import Pairing
+from mcaptrack.geometry.neighbours import Pairing, near_pairs
 from mcaptrack.transforms.retrack import linking
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, StateRows, update
 
@@ -262,6 +263,8 @@ _UNMATCHED, _GATE = 26.0, 40.0
 #: noise of positions, in metres.
 _NEW_ID, _EXTRA_NOISE_M = 4.0, 0.1
 _MERGE_EVIDENCE: Final = 4.0
+#: The same input id counts a third where another observation is as near.
+_CROWD_M: Final = 1.7
 
 
 class Alive(NamedTuple):
@@ -408,7 +411,8 @@ class OnlineTracker:
         squared /= pairs.of_first(s)
         gain = _UNMATCHED - squared
         gain -= pairs.of_first(2 * np.log(s))
-        gain += self.same_id * (pairs.of_first(tracks[SOURCE]) == pairs.of_second(source))
+        bonus = np.where(_is_crowded(xy_m), self.same_id / 3, self.same_id)
+        gain += (pairs.of_first(tracks[SOURCE]) == pairs.of_second(source)) * pairs.of_second(bonus)
         names = source.tolist()
         if not self.known_sources.issuperset(names):
             is_new = np.array([name not in self.known_sources for name in names])
@@ -428,6 +432,16 @@ class OnlineTracker:
         self.tracks = np.concatenate([self.tracks, born], axis=1)
         new = self.model.initial(xy_m, self.noise_m)
         self.state = StateRows(*(np.concatenate(both, axis=1) for both in zip(self.state, new, strict=True)))
+
+
+def _is_crowded(xy_m: Floats) -> Bools:
+    """Whether others are nearer than ``_CROWD_M`` to each position (2, N)."""
+    count = xy_m.shape[1]
+    if count * count > LARGE_TABLE:
+        pairs = np.concatenate(near_pairs(np.zeros(count, np.int64), xy_m.T, _CROWD_M))
+        return np.bincount(pairs, minlength=count) > 0
+    near = _squared(xy_m[:, :, None] - xy_m[:, None]) < _CROWD_M**2
+    return np.asarray(near.sum(axis=0) > 1)
 
 
 def _nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:

@@ -110,7 +110,7 @@ class RetrackOptions:
     speed_m_per_s: float = setting(1.75, least=0.0, theme=_MOTION)
     drift_m_per_s: float = setting(0.12, least=0.0, theme=_MOTION)
     drift_ratio: float = setting(0.08, least=0.0, theme=_MOTION)
-    same_id_bonus: float = setting(4.0, least=0.0, theme=_ASSOCIATION)
+    same_id_bonus: float = setting(12.0, least=0.0, theme=_ASSOCIATION)
     max_age_s: float = option(2.0, least=0.0, theme=_LIFE)
     interpolated: bool = setting(False, theme=_ASSOCIATION)
     min_track_s: float = setting(2.0, least=0.0, theme=_LIFE)
