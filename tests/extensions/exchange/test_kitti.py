@@ -85,7 +85,7 @@ REFUSED = {
     "cars": ("kitti", "tracks", KITTI.splitlines()[4], " holds no people, only 1 Car; `classes=` takes others"),
     "regions": ("kitti", "detections", KITTI.splitlines()[5], " holds no such boxes, only 1 regions (DontCare)"),
     "coco": ("auto", "tracks", '[{"image_id": 1}]', f" is JSON (a list with image_id) of no label format ({FORMATS})"),
-    "xml": ("auto", "tracks", '\ufeff<a "images">', ":1: not valid XML: not well-formed (invalid token)"),
+    "xml": ("auto", "tracks", '\ufeff<annotations "images">', ":1: not valid XML: not well-formed (invalid token)"),
 }  # fmt: skip
 
 
