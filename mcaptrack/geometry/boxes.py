@@ -22,7 +22,7 @@ def columns_to_boxes(rows: NDArray[np.void]) -> Floats:
 
 
 def parse_size(text: str) -> tuple[int, int] | None:
-    """Two whole numbers from 1 to 999999 with an x between them, as in 1920x1080; None for anything else."""
+    """Width and height of a text with an x between both, as 1920x1080: whole numbers from 1 to 999999; else None."""
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(part.isascii() and part.isdecimal() and 0 < len(part) < 7 for part in parts):
         return None

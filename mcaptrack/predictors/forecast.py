@@ -131,7 +131,7 @@ class Predictor(AnyPredictor, Protocol):
 
 
 def are_covariances(cov: Floats) -> bool:
-    """Whether matrices (B, T, 2, 2) are symmetric and positive definite, up to the precision of 32 bits."""
+    """Whether the matrices ``cov`` (B, T, 2, 2) are symmetric and positive definite, up to the precision of 32 bits."""
     xx, xy, yx, yy = cov[..., 0, 0], cov[..., 0, 1], cov[..., 1, 0], cov[..., 1, 1]
     scale = np.sqrt(np.maximum(xx, 0)) * np.sqrt(np.maximum(yy, 0))  # the product of both may overflow
     is_symmetric = np.abs(xy - yx) <= 1e-4 * scale

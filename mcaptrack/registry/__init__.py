@@ -48,7 +48,7 @@ from mcaptrack.installed import (
 )
 from mcaptrack.registry.guard import Guard, contained_import
 
-__all__ = ["Entry", "blamed", "find", "of_type", "others"]
+__all__ = ["Entry", "blamed", "find", "names", "of_type", "others"]
 
 Kind = Literal[
     "detector",

@@ -93,8 +93,8 @@ def latency_of(transform: Transform) -> Mapping[str, float]:
 
 
 class ModelCard(NamedTuple):
-    """A description of the network of a transform, for the provenance of its channels: the digest of its file, the
-    names of the classes in its rows by ``class_id``, and other facts.
+    """A description of the network of a transform, for the provenance of its channels: the digest of its file
+    (``weights_sha256``), the names of the classes in its rows by ``class_id``, and other facts.
 
     A transform with a network may have a method ``model_card`` that gives it after a run.
     """
@@ -105,7 +105,7 @@ class ModelCard(NamedTuple):
 
 
 class Suited(NamedTuple):
-    """The entry of another stage that suits the output of a transform, for the trait ``suits``.
+    """The entry of another stage, by its name, that suits the output of a transform, for the trait ``suits``.
 
     ``parameters`` are those that it is made with; where a ground plane is given, those of ``on_ground`` are added.
     """
@@ -294,7 +294,7 @@ _KINDS: Final[Mapping[type, tuple[type, ...]]] = {float: (int, float), int: (int
 
 
 def bare_type(annotation: Any) -> Any:
-    """The type of a parameter without ``| None``."""
+    """The type in the annotation of a parameter without ``| None``."""
     parts = [part for part in get_args(annotation) if part is not type(None)]
     return parts[0] if get_origin(annotation) in (UnionType, typing.Union) and len(parts) == 1 else annotation
 
