@@ -245,7 +245,10 @@ def option(
 
 
 def setting(default: Any, help: str = "", **about: Any) -> Any:  # noqa: A002
-    """Declare a parameter as ``option`` does that only ``--set`` sets: the command has no option of its own for it."""
+    """Declare a parameter as ``option`` does that only ``--set`` sets: the command has no option of its own for it.
+
+    ``default``, ``help`` and ``about`` are parameters of ``option``.
+    """
     return option(default, help, flag=False, **about)
 
 
@@ -338,7 +341,7 @@ def _type_name(annotation: Any) -> str:
 
 
 def check_options(transform: WithOptions) -> None:
-    """Check the values of all parameters. To be called in ``__post_init__``.
+    """Check the values of all parameters of a transform. To be called in ``__post_init__``.
 
     Raises
     ------
