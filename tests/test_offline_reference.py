@@ -24,7 +24,7 @@ from mcaptrack.transforms.retrack.motion_model import (
 )
 from tests.memory import held
 from tests.references.hypotheses import Claim, Scene, gains_of, swept
-from tests.references.offline import DRIFTS, Motion, course_of, exchanged, smoothed_in_log, usual
+from tests.references.offline import DRIFTS, Motion, course_of, exchanged, smoothed_in_log, usual_by_gap
 from tests.tiers import thorough
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -150,11 +150,14 @@ def test_links_are_the_same_without_a_table_of_all_pairs_and_in_batches_of_any_s
 
 @given(seed=SEEDS)
 @settings(max_examples=25)
-def test_the_share_of_links_that_are_right_equals_the_reference(seed):
+def test_shifts_by_the_length_of_gaps_equal_the_reference(seed):
     rng = np.random.default_rng(seed)
     count = int(rng.integers(0, 40))
-    odds = rng.normal(rng.normal(0, 2), 2, count)
-    assert linking.prior_shift(odds) == pytest.approx(usual(odds.tolist()), abs=1e-2)
+    odds, gap_s = rng.normal(rng.normal(0, 2), 2, count), rng.choice(np.arange(0.4, 20, 0.4), count)
+    found = linking.prior_shifts(odds, gap_s)
+    made = {k: (float(odds[k]), False, float(gap_s[k])) for k in range(count)}
+    wanted = usual_by_gap(made)
+    np.testing.assert_allclose(found, wanted, atol=1e-3)
 
 
 def test_links_of_thousands_of_broken_tracks_take_memory_for_the_candidates_alone():

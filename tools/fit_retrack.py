@@ -164,16 +164,17 @@ class Pairs:
     features: np.ndarray
     right: np.ndarray
 
-    def best(self, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The log odds of the best set of links, and which of them are right."""
-        table, right = np.zeros((2, self.count, self.count))
+    def best(self, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The log odds of the best set of links, which of them are right, and the seconds of their gaps."""
+        table, right, gap_s = np.zeros((3, self.count, self.count))
         good = gain > LEAST
         table[self.ends[good], self.begins[good]] = gain[good] - LEAST
         right[self.ends, self.begins] = self.right
+        gap_s[self.ends, self.begins] = self.features[:, linking.FEATURES.index("gap")]
         row, column = solve(-table)
         made = table[row, column] > 0
         where = row[made], column[made]
-        return table[where] + LEAST, right[where]
+        return table[where] + LEAST, right[where], gap_s[where]
 
 
 def pairs_of(run: Run) -> Pairs:
@@ -344,12 +345,14 @@ def fit_links(pairs: list[Pairs]) -> dict[str, Any]:
     features, right = (np.concatenate([getattr(one, name) for one in pairs]) for name in ("features", "right"))
     weights = logistic(features, right, np.ones(len(right)), group)
     best = [one.best(one.features @ weights[:-1] + weights[-1]) for one in pairs]
-    gain, is_right = (np.concatenate(parts) for parts in zip(*best, strict=True))
+    gain, is_right, gap_s = (np.concatenate(parts) for parts in zip(*best, strict=True))
     scale, shift = logistic(gain[:, None], is_right, np.ones(len(gain)))
+    likely, gap = probability(scale * gain + shift), np.searchsorted(linking._GAPS_S, gap_s)
     return {
         "weights": named(linking.FEATURES, scale * weights[:-1]),
         "bias": round(float(scale * weights[-1] + shift), 3),
         "usual": round(float(is_right.mean()), 3),
+        "usual by gap": [round(float(likely[gap == one].mean()), 3) for one in range(len(linking._BY_GAP))],
         "least": round(float(scale * LEAST + shift), 2),
     }
 
@@ -427,7 +430,8 @@ def main() -> None:
     pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)
     install(linking, "_LINKS", links)
-    linking._PRIOR, linking.MIN_LOG_ODDS = links["usual"], links["least"]
+    linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
+    linking._BY_GAP = np.array(links["usual by gap"])
     more = [*scenes, *runs(MORE, given.steps)]
     choices = fit_choices(list(told(choices_of, more, "choices")))
     hypotheses.CHOICES = Choices.of(choices)

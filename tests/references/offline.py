@@ -22,6 +22,7 @@ FITTED = json.loads((files("mcaptrack") / "transforms/retrack/weights.json").rea
 LINKS = FITTED["links"]["weights"]
 LINK_NAMES = ("miss", "misfit to noise", "gap", "misfit or stay by gap", "turn", "stay and speed", "misfit and speed")
 LINK_WEIGHTS = [LINKS[name] for name in LINK_NAMES]
+GAPS_S, BY_GAP, GAP_LINKS = (0.9, 1.7, 3.3, 6.5, 13.0, 1e9), FITTED["links"]["usual by gap"], 5.0
 LINK_BIAS, LINK_USUAL, LINK_LEAST = (FITTED["links"][name] for name in ("bias", "usual", "least"))
 MEET_M, MARGIN, EXCHANGE_COST, LEAST_GAIN = 2.0, 10, 2.5, 1.0
 DRIFTS = (0.05, 0.15, 0.4, 1.2)
@@ -166,6 +167,30 @@ def link_features(motion: Motion, before: State, after: State, gap_s: float) -> 
         log(min(misfit, stay) + NEAR_M) * log(gap_s + 0.4), log(hypot(*(came - left)) + SPEED_M_PER_S),
         log(stay + NEAR_M) * log(speed + SPEED_M_PER_S), log(misfit + NEAR_M) * log(speed + SPEED_M_PER_S),
     ]  # fmt: skip
+
+
+def gap_class(gap_s: float) -> int:
+    """The class of a gap: the first one with a bound that isn't less."""
+    return next(number for number, bound in enumerate(GAPS_S) if gap_s <= bound)
+
+
+def usual_by_gap(made: dict[object, tuple[float, bool, float]]) -> list[float]:
+    """By how much the log odds of links over gaps of each class are shifted: all links count as some of each class.
+
+    Links have log odds, whether they don't count, and the seconds of their gap.
+    """
+    elsewhere = [(odds, gap_class(gap_s)) for odds, is_other, gap_s in made.values() if not is_other]
+    all_of = usual([odds for odds, _ in elsewhere])
+    out = []
+    for one, often in enumerate(BY_GAP):
+        here = [odds for odds, number in elsewhere if number == one]
+        expected, shift = sigmoid(log(often / (1 - often)) + all_of), 0.0
+        for _ in range(50):
+            right = sum(sigmoid(odds + shift) for odds in here) + GAP_LINKS * expected
+            share = right / (len(here) + GAP_LINKS)
+            shift = log(share / (1 - share)) - log(often / (1 - often))
+        out.append(shift)
+    return out
 
 
 def usual(made: list[float]) -> float:

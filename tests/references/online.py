@@ -14,8 +14,9 @@ from tests.references.offline import (
     LINK_WEIGHTS,
     Motion,
     State,
+    gap_class,
     link_features,
-    usual,
+    usual_by_gap,
 )
 from tests.references.retracking import (
     LEAST,
@@ -114,6 +115,46 @@ class Lives:
         return bool(max(np.diff(angle).max(), angle[0] + 2 * pi - angle[-1]) > pi)
 
 
+class Places:
+    """What became of the last 2000 tracks that were lost."""
+
+    def __init__(self) -> None:
+        self.all: list[tuple[np.ndarray, bool]] = []
+
+    def ratio(self, at: np.ndarray) -> float:
+        """The odds that it goes well within 2 m, compared with everywhere; 8 more are as everywhere."""
+        ended = self.all[-2000:]
+        well = (sum(good for _, good in ended) + 1) / (len(ended) + 2)
+        near = [good for there, good in ended if hypot(*(there - at)) <= 2]
+        return (near.count(True) / well + 8) / (near.count(False) / (1 - well) + 8)
+
+
+def at_odds(probability: float, ratio: float) -> float:
+    return probability * ratio / (1 - probability + probability * ratio)
+
+
+class Losses:
+    """Places where tracks were lost, of those that are lost, and the odds that these come back."""
+
+    def __init__(self) -> None:
+        self.lost = Places()
+        self.now: dict[int, tuple[np.ndarray, float]] = {}
+
+    def learn(self, people: list[Person], has: dict[int, Row], passed: int) -> None:
+        for name in [one for one in self.now if one not in {person.name for person in people}]:
+            place, _ = self.now.pop(name)
+            if passed == 1:
+                self.lost.all.append((place, False))
+        for name in [one for one in self.now if one in has]:
+            self.lost.all.append((self.now.pop(name)[0], True))
+        for p in people:
+            if p.name not in has and p.name not in self.now:
+                self.now[p.name] = (p.here, self.lost.ratio(p.here))
+
+    def ratio(self, name: int) -> float:
+        return self.now[name][1] if name in self.now else 1.0
+
+
 @dataclass
 class Left:
     """A track as it was last observed, under the name that it is written."""
@@ -135,9 +176,9 @@ class Returns:
         self.lasting = 3 * (confirm - 1) + 1
         self.tracks: dict[int, Left] = {}
         self.used: set[int] = set()
-        self.made: list[float] = []
+        self.made: list[tuple[float, bool, float]] = []
         self.estimated = 0
-        self.shift = usual([])
+        self.shifts = usual_by_gap({})
 
     def learn(self, people: list[Person], has: dict[int, Row], step: int) -> None:
         for person in people:
@@ -187,12 +228,13 @@ class Returns:
                     mean[:, 1], cov[1, 1] = known.state.mean[:, 1], known.state.cov[1, 1]
                 features = link_features(self.motion, known.state, State(mean, cov), gap_s)
                 odds = float(np.dot(LINK_WEIGHTS, features) + LINK_BIAS)
-                found[i, j], gains[i, j] = odds, max(odds - LINK_LEAST, 0)
+                found[i, j], gains[i, j] = (odds, False, gap_s), max(odds - LINK_LEAST, 0)
         least = log(self.options.link_confidence / (1 - self.options.link_confidence))
         for i, j in zip(*linear_sum_assignment(-gains), strict=True):
             if gains[i, j] <= 0:
                 continue
-            is_right = found[i, j] + self.shift > (least - log(3) if new[j] in first else least)
+            shifted = found[i, j][0] + self.shifts[gap_class(found[i, j][2])]
+            is_right = shifted > (least - log(3) if new[j] in first else least)
             if is_right:
                 self.tracks[new[j].name].written = self.tracks[lost[i]].written
                 self.used.add(lost[i])
@@ -200,7 +242,7 @@ class Returns:
                 self.made.append(found[i, j])
         if len(self.made) > self.estimated + min(self.estimated / 10, 50):
             self.estimated = len(self.made)
-            self.shift = usual(self.made[-500:])
+            self.shifts = usual_by_gap(dict(enumerate(self.made[-500:])))
         return [one for one in more if self.tracks[one.name].written not in (None, one.name)]
 
 
@@ -232,6 +274,7 @@ class OnlineTracker:
         online, predictions = [], []
         places: dict[tuple[int, int], Point] = {}
         lives = Lives(self.confirm, self.max_age)
+        losses = Losses()
         motion = Motion(self.noise_m, max(o.speed_m_per_s, LEAST), o.drift_m_per_s, o.drift_ratio, 1 / o.rate_hz)
         returns = Returns(motion, o, self.confirm)
         for at, (step, rows) in enumerate(zip(steps, samples, strict=True)):
@@ -244,8 +287,9 @@ class OnlineTracker:
             }
             lives.learn(now, passed)
             lives.places += [one.here for one in self.people if one.name in has and one.hits >= self.confirm]
+            losses.learn(self.people, has, passed)
             returns.learn(self.people, has, step)
-            written = [one for one in self.people if self.is_written(one, now[one.name], lives)]
+            written = [one for one in self.people if self.is_written(one, now[one.name], lives, losses)]
             written += returns.name(written, step, has, self.people)
             shown = []
             for person in self.people:
@@ -274,7 +318,7 @@ class OnlineTracker:
             )
         return offline(self.claims, samples, steps, o, self.noise_m), online, predictions
 
-    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives) -> bool:
+    def is_written(self, person: Person, now: tuple[int, int, bool], lives: Lives, losses: Losses) -> bool:
         """Whether a track is written online."""
         o, (hits, missed, outside) = self.options, now
         if not o.adapt_online:
@@ -286,7 +330,8 @@ class OnlineTracker:
             return False
         if hits >= lives.lasting and not outside:
             return True
-        return lives.comes_back(missed, outside) * lives.lasts(hits + 1) >= 0.5
+        comes_back = at_odds(lives.comes_back(missed, outside), losses.ratio(person.name))
+        return comes_back * lives.lasts(hits + 1) >= 0.5
 
     def forecast(self, row: Row, name: int, step: int, places: dict[tuple[int, int], Point]):
         past = [places.get((step - back, name)) for back in range(self.past - 1, 0, -1)]

@@ -26,6 +26,11 @@ _REACH_M, _MAX_SPEED_M_PER_S = 1.0, 2.5
 _LINKS: Final = Logistic.of("links")
 FEATURES: Final = _LINKS.names
 _PRIOR, MIN_LOG_ODDS = (float(_LINKS.numbers[name]) for name in ("usual", "least"))
+#: Gaps are of classes with these bounds in seconds; the mean probability of the best links of each, where as many are
+#: right as usual; and with how many links more this is taken to be so in a log.
+_GAPS_S: Final = (0.9, 1.7, 3.3, 6.5, 13.0)
+_BY_GAP: Final = np.array(_LINKS.numbers["usual by gap"])
+_GAP_LINKS: Final = 5.0
 #: Added to distances and speeds before taking logarithms: differences below these mean nothing.
 _NEAR_M, _SPEED_M_PER_S = 0.3, 0.15
 #: Odds that are enough for a link, as a share of those of the least confidence: pieces of a person that stay apart cost
@@ -112,6 +117,30 @@ def prior_shift(log_odds: Floats) -> float:
         if abs(shift - before) < 1e-4:
             break
     return shift
+
+
+def gap_classes(gap_s: Floats) -> Ints:
+    """The class of each gap (E,) by its length, from 0 on."""
+    return np.searchsorted(_GAPS_S, gap_s)
+
+
+def prior_shifts(log_odds: Floats, gap_s: Floats) -> Floats:
+    """The shifts of the log odds of links over gaps of each class (see ``gap_classes``), from the best links (E,).
+
+    How long people are missed differs from log to log, too, so gaps of about the same length are shifted together: few
+    of them as all links are.
+    """
+    count = len(_BY_GAP)
+    gap = gap_classes(gap_s)
+    usual = np.log(_BY_GAP / (1 - _BY_GAP))
+    expected = probability(usual + prior_shift(log_odds))
+    links = np.bincount(gap, minlength=count) + _GAP_LINKS
+    shifts = np.zeros(count)
+    for _ in range(50):
+        right = np.bincount(gap, probability(log_odds + shifts[gap]), minlength=count)
+        share = (right + _GAP_LINKS * expected) / links
+        shifts = np.log(share / (1 - share)) - usual
+    return shifts
 
 
 def motion_terms(model: MotionModel, gaps: Gaps) -> dict[str, Floats]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -82,14 +82,15 @@ _NO_TRACKS: Final = _Known(_NONE, _NONE, _NONE, _NONE, _NONE, _NONE, _NO_STATE, 
 
 
 class _Links(NamedTuple):
-    """Candidate links (E,): from a lost track to a new one, by index, and their log odds."""
+    """Candidate links (E,): from a lost track to a new one, by index, the seconds between them, and their log odds."""
 
     lost: Ints
     new: Ints
+    gap_s: Floats
     log_odds: Floats
 
 
-_NO_LINKS: Final = _Links(_NONE, _NONE, np.empty(0))
+_NO_LINKS: Final = _Links(_NONE, _NONE, np.empty(0), np.empty(0))
 
 
 class OnlineLinks:
@@ -114,9 +115,9 @@ class OnlineLinks:
         self._sure = float(np.log(min_confidence / (1 - min_confidence)))
         self._least = self._sure + float(np.log(linking.ENOUGH))
         self._alive, self._lost = _NO_TRACKS, _NO_TRACKS  # lost ones were written, and are continued by no other
-        self._links: deque[float] = deque(maxlen=_LINKS)
+        self._links: deque[tuple[float, float]] = deque(maxlen=_LINKS)  # log odds and seconds
         self._link_count, self._estimated = 0, 0
-        self._shift = linking.prior_shift(np.empty(0))
+        self._shifts = linking.prior_shifts(np.empty(0), np.empty(0))
 
     def __call__(self, seen: Alive, is_written: Bools) -> tuple[Ints, Bools]:
         """The ids under which the tracks alive at some steps are written, (R,), and whether they are, (R,).
@@ -191,12 +192,12 @@ class OnlineLinks:
             gaps = linking.Gaps(taken(lost.state, candidate), after, gap_s)
             is_near = linking.are_in_reach(gaps)
             candidate, row, gaps = candidate[is_near], row[is_near], taken(gaps, is_near)
-            before, after, _ = gaps
+            before, after, gap_s = gaps
             # nothing is known of the velocity of what was observed once: it may be that of the lost one
             single = new.hits[row] == 1
             after.mean[single, 2:], after.cov[single, 2] = before.mean[single, 2:], before.cov[single, 2]
             log_odds = linking.log_odds(self._model, gaps)
-            parts.append(taken(_Links(candidate, row, log_odds), log_odds > linking.MIN_LOG_ODDS))
+            parts.append(taken(_Links(candidate, row, gap_s, log_odds), log_odds > linking.MIN_LOG_ODDS))
         return joined(parts)
 
     def _decide(self, links: _Links, is_first: Bools, is_settled: Bools) -> Bools:
@@ -209,8 +210,10 @@ class OnlineLinks:
             return is_made
         ends, begins = (np.unique(side, return_inverse=True)[1] for side in (links.lost, links.new))
         best = linking.best_links(ends, begins, links.log_odds - linking.MIN_LOG_ODDS, len(is_made))
-        is_right = links.log_odds[best] + self._shift > np.where(is_first[best], self._least, self._sure)
-        self._learn(links.log_odds[best[is_settled[best] | is_right]])
+        shifted = links.log_odds[best] + self._shifts[linking.gap_classes(links.gap_s[best])]
+        is_right = shifted > np.where(is_first[best], self._least, self._sure)
+        counts = best[is_settled[best] | is_right]
+        self._learn(links.log_odds[counts], links.gap_s[counts])
         is_made[best[is_right]] = True
         return is_made
 
@@ -238,13 +241,13 @@ class OnlineLinks:
         )
         return known, which[count:]
 
-    def _learn(self, log_odds: Floats) -> None:
-        """Learn from the best links so far how many are right."""
-        self._links.extend(log_odds.tolist())
+    def _learn(self, log_odds: Floats, gap_s: Floats) -> None:
+        """Learn from the best links so far how many are right after gaps of what length."""
+        self._links.extend(zip(log_odds.tolist(), gap_s.tolist(), strict=True))
         self._link_count += len(log_odds)
         if self._link_count > self._estimated + min(_GROWS * self._estimated, _GROWS * _LINKS):
             self._estimated = self._link_count
-            self._shift = linking.prior_shift(np.array(self._links))
+            self._shifts = linking.prior_shifts(*np.array(self._links).T)
 
 
 _NOTHING: Final = np.empty(0, np.intp), np.empty(0, np.intp)
@@ -473,7 +476,7 @@ def _squared(off: Floats) -> Floats:
 # A track that is lost is written for a while, because most come back. Those that don't have left, or were false.
 # Which is likelier is learned in the same way, for each number of steps without an observation, for tracks that
 # have not lasted yet, and for those that would be outside of the area in which tracks were seen so far: most of
-# these have left it.
+# these have left it. It also depends on where the track was lost (``PlacesOfLosses``).
 #
 # Letters: F steps, R tracks of all steps, end to end; H levels of observations, the last one of tracks that have
 # lasted; A levels of steps without an observation.
@@ -493,6 +496,74 @@ def _lasting(confirm_hits: int) -> int:
 _LASTS, _RETURNS, _WEIGHT = 0.6, 0.8, 2.0
 #: Numbers of observations, and of steps without one, are counted in at most so many levels.
 _LEVELS: Final = 200
+
+
+# Where lost tracks come back and where they don't, as far as the log has shown.
+#
+# People go out at some places, and are missed for a moment at others. Whether a lost track comes back is told by
+# what became of those that were lost nearby, compared with the whole log. (Where a track began tells less of
+# whether it will last: people who are soon occluded look like false detections.)
+#
+# Letters: F steps; R tracks alive at these steps, end to end.
+
+
+Place: TypeAlias = tuple[float, float]
+
+#: Places are as near as this to be one.
+_NEAR_M: Final = 2.0
+#: Each place counts as if so many tracks like all others had been there before.
+_USUAL: Final = 8.0
+#: So many of the last tracks count.
+_LAST: Final = 2000
+
+
+class PlaceOdds:
+    """The odds that something turns out well at places, compared with everywhere."""
+
+    def __init__(self) -> None:
+        self._xy_m = np.empty((2, _LAST))
+        self._is_good = np.zeros(_LAST, bool)
+        self._count = 0
+
+    def add(self, place: Place, is_good: bool) -> None:
+        """Count what became of something that was at a place."""
+        at = self._count % _LAST
+        self._xy_m[:, at], self._is_good[at] = place, is_good
+        self._count += 1
+
+    def ratio(self, place: Place) -> float:
+        """The odds that something at a place turns out well, as a ratio to those everywhere."""
+        count = min(self._count, _LAST)
+        is_good = self._is_good[:count]
+        share = (int(is_good.sum()) + 1) / (count + 2)
+        (x, y), (x_m, y_m) = place, self._xy_m[:, :count]
+        near = is_good[(x_m - x) ** 2 + (y_m - y) ** 2 <= _NEAR_M**2]
+        good = int(near.sum())
+        return (good / share + _USUAL) / ((len(near) - good) / (1 - share) + _USUAL)
+
+
+class PlacesOfLosses:
+    """Where tracks were lost, and what became of them: called with each step of a log."""
+
+    def __init__(self) -> None:
+        self._odds = PlaceOdds()
+        self._lost: dict[int, tuple[Place, float]] = {}  # where each lost track was lost, and the ratio there
+
+    def __call__(self, passed: int, ids: list[int], is_observed: Bools, xy_m: Floats) -> list[float]:
+        """The odds that lost tracks (K,) come back, as ratios to those of the whole log; 1 for others.
+
+        ``passed`` is by how many steps time advanced, and ``xy_m`` (2, K) where tracks are.
+        """
+        alive = dict(zip(ids, is_observed.tolist(), strict=True))
+        for name in [name for name in self._lost if alive.get(name, True)]:
+            place, _ = self._lost.pop(name)
+            if name in alive or passed == 1:  # a gap of the log ends tracks without telling anything of them
+                self._odds.add(place, name in alive)
+        for k in np.flatnonzero(~is_observed).tolist():
+            if ids[k] not in self._lost:
+                place = float(xy_m[0, k]), float(xy_m[1, k])
+                self._lost[ids[k]] = place, self._odds.ratio(place)
+        return [self._lost[name][1] if name in self._lost else 1.0 for name in ids]
 
 
 class ShownTracks:
@@ -517,6 +588,7 @@ class ShownTracks:
         self._lasting = _lasting(confirm_hits)
         self._levels, self._ages = min(self._lasting, _LEVELS), min(max_age, _LEVELS)
         self._seen = GrowingHull()
+        self._places = PlacesOfLosses()
         # By level of observations: tracks that reached the next one or terminated, and those that terminated. By inside
         # and outside and level of steps without an observation: tracks that went on from there, and that came back.
         self._counts = np.zeros((2, self._levels + 1))
@@ -533,28 +605,34 @@ class ShownTracks:
         if not self._adapts:
             is_old = tracks[HITS] * 2 >= self._confirm_hits * 3
             return np.asarray(np.where(is_observed, is_confirmed, may_coast & is_old))
-        outside = self._outside(alive, is_observed & is_confirmed)
+        inside, ratio = self._where(alive, is_observed & is_confirmed)
+        outside = ~inside
         level, next_level = (self._level(tracks[HITS] + more) for more in (0, 1))
         age = np.where(is_observed, 0, -(-np.minimum(tracks[MISSED], self._max_age) * self._ages // self._max_age))
         lasts, returns = self._learn(passed, tick, np.stack([tracks[IDS], level, age, outside]))
         lasting, where = level >= self._levels, outside.astype(np.intp)
         early = lasts[tick, level] >= 0.5
-        comes_back = returns[tick, where, age] * lasts[tick, next_level] >= 0.5
+        comes_back = _at_odds(returns[tick, where, age], ratio) * lasts[tick, next_level] >= 0.5
         stays = may_coast & ((lasting & ~outside) | comes_back)
         return np.asarray(np.where(is_observed, early | is_confirmed, stays))
 
     def _level(self, hits: Ints) -> Ints:
         return -(-np.minimum(hits, self._lasting) * self._levels // self._lasting)
 
-    def _outside(self, alive: Alive, is_sure: Bools) -> Bools:
-        """Which tracks (R,) are outside of the area in which others, and they themselves, were seen before."""
-        xy_m, inside = alive.state.mean[:, :2].T, np.zeros(len(alive.tick), bool)
-        for low, high in pairwise(np.searchsorted(alive.tick, np.arange(len(alive.steps) + 1)).tolist()):
-            inside[low:high] = self._seen.holds(xy_m[:, low:high])
-            new = low + np.flatnonzero(is_sure[low:high] & ~inside[low:high])
-            if len(new):
-                self._seen.add(xy_m[:, low:high][:, is_sure[low:high]])
-        return ~inside
+    def _where(self, alive: Alive, is_sure: Bools) -> tuple[Bools, Floats]:
+        """Which tracks (R,) are in the area in which others, or they themselves, were seen before; and how much better
+        or worse than everywhere the odds are that lost ones come back, where they were lost, (R,).
+        """
+        xy_m, ids = alive.state.mean[:, :2].T, alive.tracks[IDS].tolist()
+        bounds, is_observed = np.searchsorted(alive.tick, np.arange(len(alive.steps) + 1)).tolist(), alive.is_observed
+        inside, ratio = np.zeros(len(ids), bool), np.ones(len(ids))
+        for passed, (low, high) in zip(alive.passed.tolist(), pairwise(bounds), strict=True):
+            here = xy_m[:, low:high]
+            inside[low:high] = self._seen.holds(here)
+            if (is_sure[low:high] & ~inside[low:high]).any():
+                self._seen.add(here[:, is_sure[low:high]])
+            ratio[low:high] = self._places(passed, ids[low:high], is_observed[low:high], here)
+        return inside, ratio
 
     def _learn(self, passed: Ints, tick: Ints, now: Ints) -> tuple[Floats, Floats]:
         """Learn from what became of tracks, of which ``now`` (4, R) is known at each step.
@@ -587,6 +665,11 @@ class ShownTracks:
         survives[:, -1] = 1.0
         stays_lost: Floats = 1 - (returns[1] + self._prior_returns) / (returns[0] + _WEIGHT)
         return _from_here_on(survives), 1 - _from_here_on(stays_lost)
+
+
+def _at_odds(probability: Floats, ratio: Floats) -> Floats:
+    """Probabilities (R,) with odds multiplied by ``ratio`` (R,)."""
+    return np.asarray(probability * ratio / (1 - probability + probability * ratio))
 
 
 def _counted(place: Ints, count: int, shape: tuple[int, ...]) -> Floats:
