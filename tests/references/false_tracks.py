@@ -16,7 +16,7 @@ from tests.references.offline import FITTED, Motion, Path, State
 PEOPLE, PERSON_BIAS = FITTED["people"]["weights"], FITTED["people"]["bias"]
 DECIDED, DECIDED_BIAS = FITTED["decided"]["weights"]["log odds"], FITTED["decided"]["bias"]
 THROUGHOUT = FITTED["people"]["stands throughout"]
-BESIDE_M, BESIDE_SAMPLES, GOES_M = 1.8, 4, 3.0
+DUPLICATE_M, BESIDE_M, BESIDE_SAMPLES, GOES_M = 1.2, 1.8, 4, 3.0
 
 
 def person_features(motion: Motion, paths: dict[int, Path]) -> dict[int, dict[str, float]]:
@@ -38,6 +38,7 @@ def person_features(motion: Motion, paths: dict[int, Path]) -> dict[int, dict[st
             "log speed": log(speed + 0.1),
             "log roughness": log(off / count / (2 * motion.noise_m**2) + 0.1),
             "observed": count / length,
+            "duplicate": max((inside(states, other) for who, other in where.items() if who != name), default=0.0),
             "beside": share,
             "in step": in_step,
             "rare gaps": rarity(
@@ -88,6 +89,14 @@ def extent(states: dict[int, State]) -> float:
     """The diagonal of the box around the places of a track."""
     places = np.array([state.mean[:, 0] for state in states.values()])
     return hypot(*(places.max(axis=0) - places.min(axis=0)))
+
+
+def inside(mine: dict[int, State], theirs: dict[int, State]) -> float:
+    """The share of a track's steps beside another track that began well before it and ended well after it."""
+    if not (min(theirs) + 3 < min(mine) and max(theirs) - 3 > max(mine)):
+        return 0.0
+    near = [s for s in mine if s in theirs and hypot(*(mine[s].mean[:, 0] - theirs[s].mean[:, 0])) < DUPLICATE_M]
+    return len(near) / len(mine)
 
 
 def companion(name: int, paths: dict[int, Path], where: dict, noise_m: float, errors: float) -> tuple[float, float]:

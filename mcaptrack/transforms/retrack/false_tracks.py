@@ -27,6 +27,10 @@ from mcaptrack.transforms.retrack.weights import Logistic, columns, probability
 _PEOPLE: Final = Logistic.of("people")
 FEATURES: Final = _PEOPLE.names
 _MEAN, _SPREAD = (np.array([_PEOPLE.numbers[what][name] for name in FEATURES]) for what in ("mean", "spread"))
+#: A duplicate of a track is nearer to it than this.
+_DUPLICATE_M: Final = 1.2
+#: A track lies inside another if it begins more than so many steps after it and ends as many before it.
+_INSIDE_STEPS: Final = 3
 #: A track is beside a longer one where it is nearer to it than this, if at so many samples.
 _BESIDE_M: Final = 1.8
 _BESIDE_SAMPLES: Final = 4
@@ -65,6 +69,7 @@ def features(model: MotionModel, trajectories: Trajectories, smoothed: State) ->
         "log speed": np.log(mean_speed + 0.1),
         "log roughness": np.log(roughness + 0.1),  # the mean squared residual
         "observed": count / length,
+        "duplicate": _duplicate_share(trajectories, xy),
         "beside": beside,
         "in step": in_step,
         "rare gaps": _rare_gaps(trajectories, extent > _GOES_M),
@@ -102,6 +107,23 @@ def _gaps(trajectories: Trajectories) -> tuple[Ints, Ints]:
 def _extent(xy: Floats, first: Ints) -> Floats:
     """The diagonal of the box around each track (K,)."""
     return np.asarray(np.hypot(*(np.maximum.reduceat(xy, first) - np.minimum.reduceat(xy, first)).T))
+
+
+def _duplicate_share(trajectories: Trajectories, xy: Floats) -> Floats:
+    """The share of each track's rows that are near one other track which began before it and ended after it, (K,)."""
+    begins, ends = trajectories.step[trajectories.first[:-1]], trajectories.step[trajectories.first[1:] - 1]
+    length = np.diff(trajectories.first)
+    track = group_index(length)
+    a, b = (track[side] for side in near_pairs(trajectories.step, xy, _DUPLICATE_M))
+    is_a_short = length[a] <= length[b]
+    short, long = np.where(is_a_short, a, b), np.where(is_a_short, b, a)
+    pair, count = np.unique(short * len(length) + long, return_counts=True)
+    short, long = pair // len(length), pair % len(length)
+    share = count / length[short]
+    is_inside = (begins[long] + _INSIDE_STEPS < begins[short]) & (ends[long] - _INSIDE_STEPS > ends[short])
+    out = np.zeros(len(length))
+    np.maximum.at(out, short, share * is_inside)
+    return out
 
 
 def _beside(trajectories: Trajectories, xy: Floats, noise_m: float, errors: Floats) -> tuple[Floats, Floats]:
