@@ -59,7 +59,8 @@ def another(setting: Setting, default: Any) -> Any:
     if get_origin(setting.kind) is Literal:
         one = next(name for name in get_args(setting.kind) if name != default)
     elif setting.name == "set":
-        one = f"{next(iter(COMMANDS[setting.command].settable))}=1"
+        settable = COMMANDS[setting.command].settable
+        one = f"{max(settable, key=lambda name: bool(settable[name].tuning))}=1"  # if there is one that tunes
     elif setting.kind is str and isinstance(setting.declared.tuning, str):
         pattern = setting.declared.tuning
         one = next(word for word in ("cv", "25", "0.25", "min-iou", "car=40") if re.fullmatch(pattern, word))
