@@ -35,7 +35,7 @@ def folder(tmp_path, monkeypatch) -> Iterator[Path]:
 
 
 def test_the_command_line_refuses_every_empty_value():
-    assert len(EMPTY) > 250
+    assert len(EMPTY) > 200
     for words in EMPTY:
         outcome = call(*words)
         assert (outcome.code, outcome.out, outcome.err.count("\n")) == (2, "", 1), (words, outcome)

@@ -89,7 +89,7 @@ WORKS = {
         lambda folder: run(folder, retracker="consistency"),
     ),
     "retrack": Work(prepare_run, retrack, retrack, 11),
-    "run after re-tracking": Work(prepare_tables, run, run),
+    "run after re-tracking": Work(prepare_tables, run, run, 41),
     "export": Work(
         lambda folder: log_of(folder / "a.mcap"),
         *[lambda folder: mcaptrack.export(folder / "a.mcap", folder / "T", topic="/camera/tracks")] * 2,

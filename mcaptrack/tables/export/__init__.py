@@ -432,8 +432,8 @@ class _Job:
         self.done.rows[name] = 0
         self.done.spare.append(name)
         if path.exists():
-            _remove(path)
             self.done.removed.append(name)
+        _remove(path)
         return True
 
     def _write(self, name: str, path: Path, pieces: object, metadata: dict[str, str], order: Sequence[str]) -> None:
@@ -505,8 +505,8 @@ class _Job:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file, and its folders if they are empty then."""
+    """Remove a file, and its folders if they are empty then, also if a process that was killed has removed the file."""
     path.unlink(missing_ok=True)
-    with suppress(OSError):
-        path.parent.rmdir()
-        path.parent.parent.rmdir()
+    for folder in (path.parent, path.parent.parent):
+        with suppress(OSError):
+            folder.rmdir()
