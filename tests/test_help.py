@@ -121,6 +121,7 @@ class TestHelp:
         monkeypatch.setenv("COLUMNS", "80")
         text, everything = call(command, "--help").out, call(command, "--help-all").out
         assert len(text.splitlines()) <= 48  # two screens of 24 lines
+        assert "\n\n\n" not in everything
         names = {max(option.opts, key=len): option.rich_help_panel for option in shown(command)}
         listed, every = (set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", page, re.MULTILINE)) for page in (text, everything))
         assert every - {"--help", "--help-all"} == names.keys()

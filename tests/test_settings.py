@@ -59,7 +59,7 @@ def another(setting: Setting, default: Any) -> Any:
     if get_origin(setting.kind) is Literal:
         one = next(name for name in get_args(setting.kind) if name != default)
     elif setting.name == "set":
-        one = f"{next(iter(COMMANDS[setting.command].settable))}=1"
+        one = next(f"{name}=1" for name, about in COMMANDS[setting.command].settable.items() if about.tuning is True)
     elif setting.kind is str and isinstance(setting.declared.tuning, str):
         pattern = setting.declared.tuning
         one = next(word for word in ("cv", "25", "0.25", "min-iou", "car=40") if re.fullmatch(pattern, word))
@@ -183,6 +183,10 @@ class TestUnknownNames:
         monkeypatch.setenv("MCAPTRACK_RETRACK_LINK_S", "2")
         assert "names no option; write MCAPTRACK_RETRACK_SET=link_s=VALUE" in refused("info", "x.mcap")
 
+    def test_a_variable_of_a_command_is_not_taken_for_that_of_another(self, monkeypatch):
+        monkeypatch.setenv("MCAPTRACK_TRACK_LEDGER", "x")  # as retrack has, not track
+        assert refused("info", "x.mcap").endswith("MCAPTRACK_TRACK_LEDGER names no option\n")
+
     def test_a_variable_without_its_unit_is_refused(self, monkeypatch):
         monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")
         assert refused("run", "x.mcap").endswith("; did you mean MCAPTRACK_TRACK_MAX_AGE_S?\n")
@@ -261,6 +265,7 @@ class TestTrust:
             assert "may tune and nothing else" in refused(command, "x.mcap")
         for command, text in (
             ("detect", "overlap=0.1"),
+            ("detect", "input_size=640x640"),
             ("track", "class_limits=car=40:1"),
             ("retrack", "mode=online"),
         ):
