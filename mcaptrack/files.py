@@ -303,7 +303,9 @@ _MOST_NAMES: Final = 2000
 
 
 def missing(path: Path) -> str:
-    """The message about a file or folder that isn't there: whether its folder is, and which name there is meant."""
+    """The message about a file or folder that isn't there, or is no file: whether its folder is, and which is meant."""
+    if path.is_dir():
+        return f"{path} is a folder; give the name of a file"
     folder = path.parent
     try:
         with os.scandir(folder) as entries:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -115,6 +116,8 @@ class TestErrors:
                 ["--frame", "map"],
                 "no such option: --frame (ingest, run have it); in Python mcaptrack.track has it: frame=...",
             ),
+            (["--all"], "no such option: --all (export, evaluate have it);"),
+            (["--ledger", "x"], "no such option: --ledger (ingest, run, detect, retrack, export have it);"),
             (["--views"], "no such option: --views; in Python mcaptrack.track has it: views=True"),
             (["--max-age-s", "2s"], "invalid value for '--max-age-s': '2s' is not a number;"),
             (["--jobs", "2.5"], "invalid value for '--jobs': '2.5' is not a whole number;"),
@@ -123,6 +126,18 @@ class TestErrors:
             assert (code, out) == (2, "")
             assert err.startswith(f"mcaptrack: {said}")
             assert err.endswith(" `mcaptrack track --help-all` lists the options\n")
+
+    def test_an_option_of_many_commands_is_refused_with_some_of_them(self):
+        assert re.match(
+            r"mcaptrack: no such option: -o \((\w+, ){4}\w+ and 1\d more have it\);", call("info", "-o", "x").err
+        )
+
+    def test_a_mode_that_there_is_not_is_refused(self, place):
+        code, _, err = call("retrack", "labels.mcap", "--set", "mode=offlin", folder=place)
+        assert (code, err) == (
+            1,
+            "mcaptrack: --set mode can't be 'offlin'; did you mean offline? there are both, offline, online\n",
+        )
 
     def test_a_stage_that_cannot_run_is_not_announced(self, place):
         printed("ingest", "good.txt", "--as", "truth", "--fps", "10", "-o", place / "labels.mcap", folder=place)

@@ -22,6 +22,7 @@ from mcaptrack.cli.group import entries
 from mcaptrack.cli.help import FIRST_PANEL, LAST_PANELS
 from mcaptrack.cli.many import NAMES
 from mcaptrack.cli.stages import shown_default
+from mcaptrack.registry import own
 from mcaptrack.transforms import STAGES
 from tests.commands import GROUP, call
 from tests.tiers import one_in
@@ -121,6 +122,7 @@ class TestHelp:
         monkeypatch.setenv("COLUMNS", "80")
         text, everything = call(command, "--help").out, call(command, "--help-all").out
         assert len(text.splitlines()) <= 48  # two screens of 24 lines
+        assert "\n\n\n" not in everything
         names = {max(option.opts, key=len): option.rich_help_panel for option in shown(command)}
         listed, every = (set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", page, re.MULTILINE)) for page in (text, everything))
         assert every - {"--help", "--help-all"} == names.keys()
@@ -128,6 +130,10 @@ class TestHelp:
         assert listed == {name for name in names if names[name] not in last}
         told = " ".join(text.partition("`--help-all` shows all options, also: ")[2].split())
         assert [panel for panel in names.values() if panel in last and panel.partition(" (")[0] not in told] == []
+
+    def test_the_help_of_export_names_all_formats(self):
+        words = {*re.findall(r"[\w-]+", call("export", "--help").out)}
+        assert {"parquet", "arrow", "csv", "jsonl", *own("exporter")} <= words
 
     def test_a_short_name_means_the_same_in_all_commands(self):
         for command in COMMANDS:

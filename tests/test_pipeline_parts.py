@@ -607,6 +607,10 @@ def test_what_differs_of_two_transforms(wanted: Any, words: str):
         assert part in found
 
 
+def test_what_is_empty_is_shown_as_such():
+    assert differing(Predict(), Predict(class_limits="car=4")) == "class_limits car=4, not ''"
+
+
 def test_of_many_that_differ_three_are_named():
     one = Sort()
     other = Sort(max_age_s=9.0, min_iou=0.9, min_hits_s=9.0, cost="metres")

@@ -60,7 +60,7 @@ def another(setting: Setting, default: Any) -> Any:
         one = next(name for name in get_args(setting.kind) if name != default)
     elif setting.name == "set":
         settable = COMMANDS[setting.command].settable
-        one = f"{max(settable, key=lambda name: bool(settable[name].tuning))}=1"  # if there is one that tunes
+        one = f"{max(settable, key=lambda name: settable[name].tuning is True)}=1"  # if there is one that tunes
     elif setting.kind is str and isinstance(setting.declared.tuning, str):
         pattern = setting.declared.tuning
         one = next(word for word in ("cv", "25", "0.25", "min-iou", "car=40") if re.fullmatch(pattern, word))
@@ -184,6 +184,10 @@ class TestUnknownNames:
         monkeypatch.setenv("MCAPTRACK_RETRACK_LINK_S", "2")
         assert "names no option; write MCAPTRACK_RETRACK_SET=link_s=VALUE" in refused("info", "x.mcap")
 
+    def test_a_variable_of_a_command_is_not_taken_for_that_of_another(self, monkeypatch):
+        monkeypatch.setenv("MCAPTRACK_TRACK_LEDGER", "x")  # as retrack has, not track
+        assert refused("info", "x.mcap").endswith("MCAPTRACK_TRACK_LEDGER names no option\n")
+
     def test_a_variable_without_its_unit_is_refused(self, monkeypatch):
         monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")
         assert refused("run", "x.mcap").endswith("; did you mean MCAPTRACK_TRACK_MAX_AGE_S?\n")
@@ -260,11 +264,10 @@ class TestTrust:
         for command, text in (("detect", "file=evil.onnx"), ("retrack", "predictor=red:a.bin"), ("train", "classes=a")):
             put(folder / "mcaptrack.toml", f'[{command}]\nset = ["{text}"]\n')
             assert command not in COMMANDS or "may tune and nothing else" in refused(command, "x.mcap")
-        for command, text in (
-            ("detect", "least_visible=0.1"),
-            ("track", "class_limits=car=40:1"),
-            ("retrack", "mode=online"),
-        ):
+        tuned = [("detect", "least_visible=0.1"), ("track", "class_limits=car=40:1"), ("retrack", "mode=online")]
+        if "input_size" in COMMANDS["detect"].settable:  # of an extension
+            tuned.append(("detect", "input_size=640x640"))
+        for command, text in tuned:
             put(folder / "mcaptrack.toml", f'[{command}]\nset = ["{text}"]\n')
             assert parsed(command)["set"] == [text]
 

@@ -130,7 +130,7 @@ def export(
     *,
     form: Annotated[
         TableFormat | BoxFormat | str,
-        named("exporter", (*get_args(TableFormat), *get_args(BoxFormat)), FILES, "format"),
+        named("exporter", get_args(TableFormat), FILES, "format"),
     ] = "parquet",
     topic: Annotated[str | Sequence[str] | None, Option(FILES, shown=False)] = None,
     all_topics: Annotated[bool, Option(FILES, flag="all")] = False,
@@ -164,11 +164,10 @@ def export(
         By default LOG.tables, LOG.rosbag2, or a file such as LOG.cvat.xml beside the log; of a log in a store, in the
         working folder.
     form : {"parquet", "arrow", "csv", "jsonl", "rosbag2", "rosbag2-sqlite3", "mot", "kitti", "coco", "cvat", ...}
-        Tables (parquet, arrow, csv, jsonl), a ROS 2 bag, or a file with the boxes of one channel: MOTChallenge, KITTI
-        tracking, COCO with tracks, CVAT for video, a table, or a recording of Rerun; or the format of an installed
-        package, or module:Class.
-
-        "rosbag2" is a bag in MCAP, "rosbag2-sqlite3" one in a database.
+        Tables (parquet, arrow, csv, jsonl), a ROS 2 bag (rosbag2 in MCAP, rosbag2-sqlite3 in a database), or a file
+        with the boxes of one channel: MOTChallenge (mot), KITTI tracking (kitti), COCO with tracks (coco), CVAT for
+        video (cvat), a table (boxes-csv), or a recording of Rerun (rerun); or the format of an installed package, or
+        module:Class.
     topic : str or sequence of str, optional
         Also write a table of all messages of this channel; the channel with the boxes for a file.
     all_topics : bool, default False

@@ -159,7 +159,7 @@ class _OfPackage:
             is_own = how.transform == self.name and is_finished(topic, how)
             if not is_own and not (how.transform == VIEW and how.input in made):
                 raise McaptrackError(
-                    f"{self.entry} makes {topic}, which is not below its input; its provenance is "
+                    f"{self.entry} makes {topic}, which is not below its input, or not of this name: its provenance is "
                     f"Provenance({self.name!r}, parameters, input, digest of the input)"
                 )
         may_add(state.opened, [*made], self.name, f"results of {self.entry}", is_asked=True)

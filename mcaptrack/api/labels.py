@@ -26,7 +26,7 @@ FPS_PATTERN: Final = r"[0-9]+([.][0-9]+)?(/[0-9]+)?"
 Format = Annotated[
     str,
     named(
-        "label_format", ("auto",), READING, "format", PLUGIN, "FORMAT",
+        "label_format", ("auto",), READING, "format", PLUGIN,
         "Format of label files, one of an installed package, or module:Class. auto: as the content tells; csv: any "
         "table with a header.\n\nThose of 3D boxes are csv, kitti-3d, nuscenes and argoverse.",
     ),

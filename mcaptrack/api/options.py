@@ -133,20 +133,15 @@ def chooser(kind: Kind, intro: str = "The {kind} to use", panel: str = "", shown
     return Option(panel, tuning=PLUGIN, metavar="NAME", shown=shown, names=lambda: names(kind), help=text)
 
 
-def named(
-    kind: Kind, built_in: Sequence[str], panel: str, flag: str, tuning: str = "", metavar: str = "", text: str = ""
-) -> Option:
-    """The option that chooses a format by name: a built-in one, or of another package; ``built_in`` are its names that
-    the help shows, or what stands before those of the registry, with ``metavar`` in the help.
-    """
+def named(kind: Kind, built_in: Sequence[str], panel: str, flag: str, tuning: str = "", text: str = "") -> Option:
+    """The option that chooses a format by name: one of ``built_in``, or one of the registry."""
 
     def every() -> Sequence[str]:
-        from mcaptrack.registry import names, others
+        from mcaptrack.registry import names
 
-        return (*built_in, *(names(kind) if metavar else others(kind)))
+        return (*built_in, *names(kind))
 
-    shown = metavar or "|".join(built_in)
-    return Option(panel, flag=flag, tuning=tuning or False, metavar=shown, names=every, help=text)
+    return Option(panel, flag=flag, tuning=tuning or False, metavar="FORMAT", names=every, help=text)
 
 
 Output = Annotated[PathLike | None, output()]

@@ -15,6 +15,7 @@ import numpy as np
 from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
 from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
+from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.api.products import Products, refuse_foreign_products, write_products
 from mcaptrack.choices import Mode
@@ -418,6 +419,7 @@ def _with_options(base: Transform, options: Mapping[str, Value]) -> Transform:
     return replace(base, **options)
 
 
+@checked
 def run_stage(
     stage: str,
     transform: Transform | None,

@@ -26,7 +26,7 @@ from mcaptrack.cli.settings import (
     other_way,
 )
 from mcaptrack.cli.text import refuse_usage, say
-from mcaptrack.errors import similar
+from mcaptrack.errors import list_names, similar
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 
@@ -81,7 +81,7 @@ def _unknown_option(error: Any) -> str:
         return f"{text}{nearest(name, error.possibilities or ())}"
     theirs = {command: _options_of(command_class) for command, command_class in context.parent.command.commands.items()}
     if having := [command for command, options in theirs.items() if name in options]:
-        text += f" ({', '.join(having)} {'has' if len(having) == 1 else 'have'} it)"
+        text += f" ({list_names(having, 5)} {'has' if len(having) == 1 else 'have'} it)"
     own_options = theirs.get(context.info_name, [])
     begin = f"--{name.removeprefix('--').replace('_', '-')}-"
     if len(alike := [option for option in own_options if option.startswith(begin)]) > 1:

@@ -21,7 +21,7 @@ from mcaptrack.api.declared import Option, Parameter
 from mcaptrack.cli.config import NAME, ConfigFile, read_files, user_file
 from mcaptrack.cli.text import refuse_usage
 from mcaptrack.environment import PREFIX, VARIABLES
-from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.errors import McaptrackError, did_you_mean, similar
 from mcaptrack.installed import missing_extension
 from mcaptrack.ranges import limits
 
@@ -162,12 +162,21 @@ def _from_environment(commands: Commands) -> Iterable[tuple[str, Setting, Given]
         if setting is None and command not in commands and _is_of_package(command):
             continue
         if setting is None:
-            variables = [each.variable for other in commands for each in commands[other].settings.values()]
-            option = name.removeprefix(f"{PREFIX}{command.upper()}_").lower()
+            is_command = command in commands
+            start = f"{PREFIX}{command.upper()}_" if is_command else PREFIX
+            variables = [
+                each.variable
+                for other in ([command] if is_command else commands)
+                for each in commands[other].settings.values()
+            ]
+            tails = {each.removeprefix(PREFIX): each for each in VARIABLES}
+            tails |= {each.removeprefix(start): each for each in variables}
+            option = name.removeprefix(start).lower()
             missing = missing_extension(command) or missing_extension(option)
-            way = other_way(commands[command], option, f"{PREFIX}{command.upper()}_SET=") if command in commands else ""
-            hint = f"; {missing or way}" if missing or way else nearest(name, [*variables, *VARIABLES])
-            refuse_usage(f"the environment variable {name} names no option{hint}")
+            way = other_way(commands[command], option, f"{start}SET=") if is_command else ""
+            meant = similar(option, tails)
+            hint = missing or way or (f"did you mean {tails[meant]}?" if meant else "")
+            refuse_usage(f"the environment variable {name} names no option{f'; {hint}' if hint else ''}")
         if not text:
             continue
         try:

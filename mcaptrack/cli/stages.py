@@ -125,7 +125,7 @@ def stage_help(stage: Stage, text: str, plugins: Mapping[str, type[Transform]] =
     lines = [f"- `{name}`: {' '.join(first.split())}" for name, first in firsts.items() if first]
     others = [f"{name}: {doc}" for name, plugin in plugins.items() if (doc := _own_doc(plugin))]
     others = [re.split(r"\n\n\w+\n---", doc)[0] for doc in others]  # without the sections on use from Python
-    return "\n\n".join([text, *others, "\n".join(lines), *(f"Example: {line}" for line in examples)])
+    return "\n\n".join(filter(None, [text, *others, "\n".join(lines), *(f"Example: {line}" for line in examples)]))
 
 
 def _own_doc(cls: type[Transform]) -> str:

@@ -195,5 +195,5 @@ def differing(before: Transform, wanted: Transform) -> str:
         return f"{type(wanted).__name__}, not {type(before).__name__}"
     names = [f.name for f in fields(before) if not f.metadata.get("context")]
     pairs = [(name, getattr(before, name), getattr(wanted, name)) for name in names]
-    changes = [f"{name} {now}, not {then}" for name, then, now in pairs if then != now]
+    changes = [f"{name} {now or repr(now)}, not {then or repr(then)}" for name, then, now in pairs if then != now]
     return "; ".join(changes[:_NAMED]) + (f"; and {len(changes) - _NAMED} more" if len(changes) > _NAMED else "")

@@ -150,7 +150,9 @@ def check_finisher(function: Callable[..., Any], log: PathLike, *, name: str = "
         _finished(parts, copy, {})
         with logs.read(copy) as opened:
             if late := [topic for topic in made.channels if is_stale(opened, topic)]:
-                raise LawError(f"again: {late[0]} is not made again where tracks have changed")
+                raise LawError(
+                    f"again: {late[0]} is not made again where tracks have changed, by a run without options"
+                )
 
 
 def _finished(parts: PartsOfRun, path: Path, options: Mapping[str, Any]) -> RunResult:

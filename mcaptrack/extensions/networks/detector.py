@@ -51,6 +51,7 @@ NETWORK: Final = "The network"
 _BOXES: Final = "What is detected"
 #: The size of the input follows that of the picture.
 _AS_PICTURE: Final = "picture"
+_INPUT_SIZE: Final = rf"[0-9]+x[0-9]+|{_AS_PICTURE}"
 #: Pixels of an input that follows the picture: smaller pictures are enlarged, at most twice, and larger ones reduced.
 _LEAST_PIXELS, _MOST_PIXELS = 700_000, 1_000_000
 _MOST_TILES: Final = 64
@@ -184,7 +185,7 @@ class OnnxDetector:
 
     file: str = option("", theme=NETWORK)
     layout: LayoutChoice = setting("auto", theme=NETWORK)
-    input_size: str = setting("", theme=NETWORK)
+    input_size: str = setting("", pattern=_INPUT_SIZE, theme=NETWORK)
     device: Device = option("auto", theme=NETWORK)
     max_memory_mb: int = setting(1000, least=10, most=1_000_000, theme=NETWORK)
     tiles: str = option("1x1", theme=_BOXES)
@@ -583,7 +584,7 @@ class CataloguedDetector(OnnxDetector):
     """
 
     layout: LayoutChoice = setting("yolox", theme=NETWORK)
-    input_size: str = setting("picture", theme=NETWORK)
+    input_size: str = setting("picture", pattern=_INPUT_SIZE, theme=NETWORK)
 
     #: False boxes score up to 0.6 and begin no tracks, so that those that begin need no confirmation.
     suits: ClassVar[Mapping[str, Suited]] = MappingProxyType(

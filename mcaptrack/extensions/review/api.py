@@ -306,7 +306,9 @@ def review(
     path, file = log_file(log), optional_path(answers)
     given = {} if file is None else read_json(file, "a file of answers", _MOST_BYTES, is_unique=True)
     if not isinstance(given, dict) or not all(isinstance(yes, str) and yes in _PROBABILITIES for yes in given.values()):
-        raise McaptrackError(f'{file} has no answers; it holds them by question, as in {{"31@50.8-32@51.6": "yes"}}')
+        raise McaptrackError(
+            f'{file} has no answers; it holds them by question, as yes, no or skip: {{"31@50.800-32@51.600": "yes"}}'
+        )
     with logs.read(path) as opened:
         prefix = pipeline.find_camera(opened, camera)
         solved = asking.solve(opened, prefix)

@@ -41,6 +41,8 @@ class ReviewCommand(Once["Review"]):
             talk.clear()
         else:
             warn_unused("no page is served", "open", "port", "host")
+            if done.result is not None:
+                warn_unused("answers are taken, and no questions are printed", "print")
         super().print_result(done, talk)
 
     def data(self, done: Review) -> dict[str, Any]:

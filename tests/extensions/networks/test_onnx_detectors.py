@@ -244,6 +244,7 @@ class TestRefused:
     def test_no_file_and_no_runtime_say_what_to_do(self, network, tmp_path, monkeypatch):
         assert refused(OnnxDetector()) == "detector onnx needs a file, as in onnx:FILE"
         assert "does not exist" in refused(OnnxDetector(file=str(tmp_path / "none.onnx")))
+        assert refused(OnnxDetector(file=str(tmp_path))).endswith(f"{tmp_path} is a folder; give the name of a file")
         monkeypatch.setitem(sys.modules, "onnxruntime", None)
         assert "pip install 'mcaptrack[onnx]'" in refused(OnnxDetector(file=str(network())))
 

@@ -261,6 +261,8 @@ def test_a_judge_weighs_where_there_are_pictures_and_is_never_certain(seen, tmp_
     assert all(0.9 < yes < 1 for yes in review.answers.values())
     again = mcaptrack.review(own, questions=50)
     assert {*asked} & {*again.questions}  # a person is still asked
+    printed = call("review", own, "--print", "--judge", "alike:Alike").err
+    assert "--print changes nothing here: answers are taken" in printed
 
 
 @needs_browser
