@@ -69,7 +69,13 @@ def section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> ReportSec
         if total.in_worlds
     ]
     if in_worlds:
-        caption = "Medians over worlds of re-tracking, and intervals of 90 %."
+        has_intervals = any(
+            total.in_worlds.tracks.low is not None
+            for channel, _ in shown
+            for total in channel.totals
+            if total.in_worlds
+        )
+        caption = f"Medians over worlds of re-tracking{', and intervals of 90 %' * has_intervals}."
         tables.append(SectionTable(caption, _IN_WORLDS, in_worlds))
     some = [zone for zone in zones if not zone.is_line][:_CHARTS]
     inside = {channel.topic: _inside(opened, channel.topic, channel.zones) for channel in counted}

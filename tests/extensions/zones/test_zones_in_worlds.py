@@ -66,6 +66,7 @@ def test_zones_of_few_people_have_no_interval_and_those_of_logs_without_worlds_s
         total, _ = mcaptrack.zones(there, zones=SIDES).zones["/camera/retracks"]
     assert (total.in_worlds.tracks.low, total.in_worlds.tracks.high) == (None, None)
     assert ["no interval" in warning.message for warning in warnings] == [True]
+    assert "in 9 worlds: medians\n" in done("zones", there, "-q").out
     done("retrack", there, "-q")
     total, _ = mcaptrack.zones(there).zones["/camera/retracks"]
     assert (total.in_worlds, "in_worlds" in total.to_json()) == (None, False)
