@@ -506,7 +506,7 @@ def test_enumerations_of_protobuf_name_classes_without_what_all_values_begin_wit
     ("name", "encoding"), [("visualization_msgs/MarkerArray", "cdr"), ("lab_msgs/WalkerList", "json")]
 )
 def test_channels_that_begin_without_things_are_read(name, encoding, tmp_path):
-    """A detector that sees nobody for a minute: what its channel holds is in a later message."""
+    """A detector that sees no people for a minute: what its channel holds is in a later message."""
     unstamped = HEAD | {"stamp": {"sec": 0, "nanosec": 0}}
     drawn = {"type": 1, "header": unstamped, "pose": POSE, "scale": SIZE, "ns": "person"}
     where, thing = ("markers", drawn) if encoding == "cdr" else ("walkers", {"uid": 7, "pos_x": 1.5, "pos_y": -2.25})

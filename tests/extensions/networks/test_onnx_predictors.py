@@ -47,7 +47,7 @@ def test_a_network_with_a_covariance_and_a_mask_of_gaps(tmp_path):
 
 
 def with_step(folder, said: str) -> str:
-    """A network whose metadata say how long a step is (field 14 of the model: key and value)."""
+    """A network with metadata that say how long a step is (field 14 of the model: key and value)."""
     entry = b"\x0a\x06step_s\x12" + bytes([len(said)]) + said.encode()
     path = folder / "net.onnx"
     path.write_bytes(base64.b64decode(LINE) + b"\x72" + bytes([len(entry)]) + entry)
