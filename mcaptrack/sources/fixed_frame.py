@@ -586,9 +586,8 @@ def _tree(opened: log.Log, is_near: tuple[bool, ...]) -> TransformTree | None:
         for edge, near in zip(read.edges, is_near, strict=True)
     ]
     group = np.array(merged)[read.of_edge]
-    return TransformTree(
-        [Recorded(*edge, taken(read.poses, np.flatnonzero(group == number))) for edge, number in numbers.items()]
-    )
+    edges, poses = list(numbers), _groups(group, np.arange(len(group)))
+    return TransformTree([Recorded(*edges[edge], taken(read.poses, which)) for edge, which in poses if edge >= 0])
 
 
 #: The fields of transforms of all schemas.
