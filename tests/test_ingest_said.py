@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -320,10 +321,10 @@ def test_a_message_that_no_log_should_hold_is_refused(tmp_path, monkeypatch):
             made(source, tmp_path / "into.mcap")
 
 
-def images(folder: Path, numbers: range, suffix: str = ".jpg") -> Path:
+def images(folder: Path, numbers: Iterable[int], suffix: str = ".jpg") -> Path:
     folder.mkdir()
     for number in numbers:
-        cv2.imwrite(str(folder / f"{number:03}{suffix}"), np.full((48, 64, 3), 3 * number, np.uint8))
+        cv2.imwrite(str(folder / f"{number:03}{suffix}"), np.full((48, 64, 3), 3 * number % 256, np.uint8))
     return folder
 
 
@@ -354,6 +355,23 @@ def test_a_folder_of_images_is_kept_with_how_it_was_made(tmp_path):
         with pytest.raises(McaptrackError) as error:
             ingest(folder, tmp_path / "b.mcap", IngestOptions(**given))
         assert str(error.value) == words
+
+
+def test_times_in_the_names_of_images_are_read(tmp_path):
+    at_s = [1_700_000_000, 1_700_000_001, 1_700_000_003]
+    for digits, unit in ((0, "seconds"), (3, "milliseconds"), (6, "microseconds"), (9, "nanoseconds")):
+        folder = images(tmp_path / unit, [10**digits * at for at in at_s], ".png")
+        report = ingest(folder, tmp_path / f"{unit}.mcap", IngestOptions())
+        with log.read(tmp_path / f"{unit}.mcap") as opened:
+            assert opened.times("/camera/video").tolist() == [10**9 * at for at in at_s]
+        name = f"{at_s[0] * 10**digits}.png"
+        assert f"{folder}: the names of its images are read as times, {unit} since 1970, as {name}" in report.remarks
+        ingest(folder, tmp_path / f"{unit}.mcap", IngestOptions(fps=Fraction(10)), force=True)
+        with log.read(tmp_path / f"{unit}.mcap") as opened:  # what a user says counts
+            assert opened.times("/camera/video")[0] == 0
+    (tmp_path / "seconds" / "1700000002500.png").write_bytes((tmp_path / "seconds" / "1700000001.png").read_bytes())
+    with pytest.raises(McaptrackError, match="has no clock"):  # of two units
+        ingest(tmp_path / "seconds", tmp_path / "b.mcap", IngestOptions())
 
 
 # Untrusted bytes

@@ -41,13 +41,17 @@ _CAMERA_DIGITS, _ONE_RUN = 3, 3  # digits of such a number; parts of a name that
 #: Numbers in names count as frame numbers if at least this share of them exists.
 _DENSE: Final = 0.5
 _SHOWN: Final = 3
+#: A time in a name, from 2001 on: seconds since 1970, with 3, 6 or 9 more digits or a fraction of them.
+_STAMP: Final = re.compile(r"(?:.*\D)?([1-9][0-9]{9})((?:[0-9]{3}){0,3}|[._-][0-9]{1,9})(?:[^0-9.]\D*)?")
+_UNITS: Final = {0: "seconds", 3: "milliseconds", 6: "microseconds", 9: "nanoseconds"}
 
 
 class Images(NamedTuple):
     """The images of a folder in order: ``place`` (P,) is their position in the sequence, with gaps for missing ones.
 
     ``every`` is the step of the numbers in their names: 12 if every twelfth picture was kept with its number.
-    ``missing`` and ``notes`` say what is not there, and what was assumed or passed over.
+    ``missing`` and ``notes`` say what is not there, and what was assumed or passed over. ``stamps_ns`` are the times in
+    their names, if these have some and nothing else says when they were taken.
     """
 
     paths: list[Path]
@@ -55,6 +59,7 @@ class Images(NamedTuple):
     every: int
     missing: str
     notes: tuple[str, ...] = ()
+    stamps_ns: tuple[int, ...] = ()
 
 
 class _Name(NamedTuple):
@@ -64,8 +69,11 @@ class _Name(NamedTuple):
     numbers: tuple[int, ...]
 
 
-def find_images(folder: Path) -> Images:
-    """The images of a folder. Raises McaptrackError if there are none, or those of several cameras."""
+def find_images(folder: Path, has_rate: bool = True) -> Images:
+    """The images of a folder; without ``has_rate`` they have the times in their names.
+
+    Raises McaptrackError if there are none, or those of several cameras.
+    """
     files = sorted(folder.iterdir(), key=natural_order)
     named = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     paths = [path for path in named if not path.name.startswith(".")]
@@ -80,6 +88,10 @@ def find_images(folder: Path) -> Images:
     _refuse_several(folder, paths, names)
     text = f"{folder}: the names of its images don't count pictures; they follow one another in the order of names"
     in_order = Images(paths, list(range(len(paths))), 1, "", (*notes, *([text] if len(paths) > 1 else [])))
+    stamps_ns, unit = ((), "") if has_rate else _stamps_ns(paths)
+    if stamps_ns:
+        text = f"{folder}: the names of its images are read as times, {unit} since 1970, as {paths[0].name}"
+        return in_order._replace(notes=(*notes, text), stamps_ns=stamps_ns)
     if len({(name.series, name.numbers[:-1]) for name in names}) > 1 or not names[0].numbers:
         return in_order
     numbers = [name.numbers[-1] for name in names]
@@ -90,6 +102,15 @@ def find_images(folder: Path) -> Images:
     gone = [str(numbers[0] + every * at) for at in sorted(set(range(place[-1] + 1)) - set(place))]
     missing = f"{len(gone)} of {place[-1] + 1} numbered images ({_some(gone)})" if gone else ""
     return Images(paths, place, every, missing, tuple(notes))
+
+
+def _stamps_ns(paths: Sequence[Path]) -> tuple[tuple[int, ...], str]:
+    """The times in the names of images, and their unit; none if not all names have one, in one unit and in order."""
+    found = [match.groups() for path in paths if (match := _STAMP.fullmatch(path.stem))]
+    units = {_UNITS[len(rest)] if rest.isdecimal() or not rest else _UNITS[0] for _, rest in found}
+    stamps_ns = [int(seconds + re.sub(r"\D", "", rest).ljust(9, "0")) for seconds, rest in found]
+    is_clock = len(found) == len(paths) > 1 and len(units) == 1 and stamps_ns == sorted(set(stamps_ns))
+    return (tuple(stamps_ns), *units) if is_clock else ((), "")  # type: ignore[return-value]
 
 
 def _some(names: Sequence[str]) -> str:

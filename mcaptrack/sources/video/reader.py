@@ -372,7 +372,8 @@ class Video:
 
     def pictures(self, start_ns: int = 0) -> Iterator[PictureMessage]:
         """All pictures in order, the first of them at ``start_ns``; afterwards warnings about their times."""
-        clock = Clock(self.path, start_ns, self.options.fps or (self.fps if self.images else None))
+        is_counted = self.images and not self.images.stamps_ns
+        clock = Clock(self.path, start_ns, self.options.fps or (self.fps if is_counted else None))
         if self.options.is_still:
             yield from _encode_stills(self, clock)
         elif self.why_transcode:
@@ -496,16 +497,21 @@ def _remarks(path: Path, stream: Any, first: Any, orientation: Orientation) -> I
 
 
 def _open_folder(path: Path, options: VideoOptions) -> Video:
-    images = find_images(path)
+    info = find_seqinfo(path)
+    fps, start_ns = info.fps if info else None, None
+    images = find_images(path, has_rate=bool(options.fps or fps))
     span = measure_span(images.paths)
-    first = next((image for path in images.paths if (image := read_image(path, span)) is not None), None)
+    read = ((at, read_image(path, span)) for at, path in enumerate(images.paths))
+    at, first = next(((at, image) for at, image in read if image is not None), (0, None))
     if first is None:
         raise McaptrackError(f"{images.paths[0]} can't be read as an image, nor can any other in {path}")
     height, width = first.shape[:2]
     name = options.image_format if options.is_still else "h264"
-    why, info = "" if options.is_still else "it is a folder of images", find_seqinfo(path)
+    why = "" if options.is_still else "it is a folder of images"
+    if stamps_ns := images.stamps_ns:
+        fps, start_ns = Fraction(NS_PER_S, int(np.median(np.diff(stamps_ns)))), stamps_ns[at]
     video = Video(
-        path, options, name, width, height, info.fps if info else None, len(images.paths), None, why, images=images,
+        path, options, name, width, height, fps, len(images.paths), start_ns, why, images=images,
         notes=list(images.notes), span=span,
     )  # fmt: skip
     if span:
@@ -612,12 +618,13 @@ def _decoded_pictures(video: Video) -> Iterator[DecodedPicture]:
         slot_s = 1 / video.fps if video.has_slots and video.fps else None
         yield from in_slots(_decoded(video), _delay(video), slot_s) if slot_s else _decoded(video)
         return
-    for path, place in zip(video.images.paths, video.images.place, strict=True):
+    stamps_ns = video.images.stamps_ns or [None] * len(video.images.paths)
+    for path, place, t_ns in zip(video.images.paths, video.images.place, stamps_ns, strict=True):
         image = read_image(path, video.span)
         if image is None:
             video.lost.append(f"{path} can't be read as an image; it is left out")
         else:
-            yield DecodedPicture(place, None, image)
+            yield DecodedPicture(place, None if t_ns is None else Fraction(t_ns, NS_PER_S), image)
             del image
 
 
