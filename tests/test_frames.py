@@ -415,6 +415,9 @@ class TestReading:
         with log.read(write(tmp_path / "a.mcap", *channels, shared)) as opened:
             for topic, x in (("/a/lidar/boxes", 11.0), ("/b/camera/image", -9.0)):
                 assert fixed_frame.poses_at(opened, topic, "map", "lidar", at(0.5), at(0.5)).translation[0, 0] == x
+        shown = done("info", tmp_path / "a.mcap", "--frames").out.partition("\nframes\n")[2].splitlines()
+        assert [line.split()[-1] for line in shown[::4]] == ["/a/", "/b/"]
+        assert [shown[number].split()[-2:] for number in (3, 7)] == 2 * [["lidar", "static"]]
 
     def test_a_log_without(self, tmp_path):
         kind, _ = MESSAGES["FrameTransform"]

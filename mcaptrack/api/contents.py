@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from math import degrees
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -106,6 +106,8 @@ class FrameInfo:
     jumps : tuple of dict
         Steps far beyond the speed around them, as when a localisation is reset: ``t_ns``, ``distance_m``,
         ``angle_deg``.
+    namespace : str
+        The namespace of its robot, as in "/robot1/", if several have frames of the same names.
 
     """
 
@@ -118,6 +120,7 @@ class FrameInfo:
     end_ns: int | None = None
     gaps: tuple[Mapping[str, int], ...] = ()
     jumps: tuple[Mapping[str, float], ...] = ()
+    namespace: str = ""
 
 
 @dataclass(frozen=True)
@@ -242,7 +245,7 @@ def info(log: EachLog, *, frames: bool = False) -> LogInfo:
             messages=sum(sum(part.index.counts.values()) for part in opened.parts),
             attachments=tuple(listed.name for part in opened.parts for listed in part.index.attachments),
             channels=channels,
-            frames=_frames(opened) if frames else None,
+            frames=tuple(_frames(opened)) if frames else None,
             warnings=tuple(dict.fromkeys(warnings)),
         )
 
@@ -292,24 +295,21 @@ def _rate(opened: logs.Log, messages: int) -> float | None:
     return round((messages - 1) / (span_ns / NS_PER_S), 3) if messages > 1 and span_ns > 0 else None
 
 
-def _frames(opened: logs.Log) -> tuple[FrameInfo, ...]:
-    """Return the frames of a log, each after its parent, and warn of transforms that contradict or are missing."""
-    from mcaptrack.sources.fixed_frame import read_frames
+def _frames(opened: logs.Log) -> Iterator[FrameInfo]:
+    """Yield the frames of a log, each after its parent, and warn of transforms that contradict or are missing."""
+    from mcaptrack.sources.fixed_frame import namespaces_of, read_frames
 
-    read = read_frames(opened)
-    for why in read.unread:
-        warn(why, "lost")
-    if read.tree is None:
-        return ()
-    for remark in read.tree.remarks:
-        warn(f"{opened.path}: transforms: {remark.text}", "transforms")
-    waiting = read.tree.roots()[::-1]
-    infos: list[FrameInfo] = []
-    while waiting:
-        frame = waiting.pop()
-        infos.append(_frame(frame, read.tree.series.get(frame)))
-        waiting += read.tree.children_of(frame)[::-1]
-    return tuple(infos)
+    for namespace in namespaces_of(opened):
+        read = read_frames(opened, namespace)
+        for why in read.unread:
+            warn(why, "lost")
+        for remark in read.tree.remarks if read.tree else ():
+            warn(f"{opened.path}: transforms: {remark.text}", "transforms")
+        waiting = read.tree.roots()[::-1] if read.tree else []
+        while read.tree and waiting:
+            frame = waiting.pop()
+            yield replace(_frame(frame, read.tree.series.get(frame)), namespace=namespace)
+            waiting += read.tree.children_of(frame)[::-1]
 
 
 def _frame(frame: str, series: TransformSeries | None) -> FrameInfo:

@@ -205,7 +205,8 @@ def _frames(frames: list[dict[str, Any]], start_ns: int) -> Tree:
         return f"{(t_ns - start_ns) / 1e9:.3f}"
 
     root = Tree("frames")
-    nodes: dict[str | None, tuple[Tree, int]] = {None: (root, 0)}
+    names = dict.fromkeys(frame["namespace"] for frame in frames)
+    nodes: dict[Any, tuple[Tree, int]] = {(name, None): (root.add(name) if name else root, 0) for name in names}
     for frame in frames:
         label = Text(printable(frame["frame"]))
         if frame["static"]:
@@ -222,7 +223,7 @@ def _frames(frames: list[dict[str, Any]], start_ns: int) -> Tree:
             if faults:
                 more = f" and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
                 label.append(f"  {word}{'s' * (len(faults) > 1)}: {', '.join(faults[:_SHOWN])}{more}", "red")
-        above, depth = nodes[frame["parent"]]
+        above, depth = nodes[frame["namespace"], frame["parent"]]
         node = above.add(label)
-        nodes[frame["frame"]] = (node, depth + 1) if depth < _DEEPEST else (above, depth)
+        nodes[frame["namespace"], frame["frame"]] = (node, depth + 1) if depth < _DEEPEST else (above, depth)
     return root

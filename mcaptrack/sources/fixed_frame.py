@@ -518,6 +518,7 @@ def poses_at(
     return poses
 
 
+@log.kept
 def read_frames(opened: log.Log, topic: str = "") -> FramesRead:
     """Read the transforms of a log. Messages that can't be read are left out, and counted in ``unread``.
 
@@ -525,12 +526,32 @@ def read_frames(opened: log.Log, topic: str = "") -> FramesRead:
     a frame are those of the most similar topics of transforms; without a topic all count together.
     """
     read = _read_transforms(opened)
-    ranks = [(shared_parts(source, topic), topic.startswith(f"{source.rpartition('/')[0]}/")) for source in read.topics]
+    return FramesRead(_tree(opened, _is_near(read, topic)), read.topics, read.unread)
+
+
+def namespaces_of(opened: log.Log) -> tuple[str, ...]:
+    """Return the namespaces, as in "/robot1/", of robots with frames of the same names; ("",) for other logs.
+
+    ``read_frames`` takes them as topics.
+    """
+    read = _read_transforms(opened)
+    of_topic = [_namespace(topic) for topic in read.topics]
+    near = [_is_near(read, name) for name in dict.fromkeys(of_topic)]
+    own = {of_topic[edge.topic] for edge, *is_near in zip(read.edges, *near, strict=True) if not all(is_near)}
+    return tuple(sorted(own)) or ("",)
+
+
+def _namespace(topic: str) -> str:
+    return f"{topic.rpartition('/')[0]}/"
+
+
+def _is_near(read: _TransformsRead, topic: str) -> tuple[bool, ...]:
+    """Whether the topic of each edge is most similar to ``topic``, of those with its frame; all are to ""."""
+    ranks = [(shared_parts(source, topic), topic.startswith(_namespace(source))) for source in read.topics]
     nearest: dict[str, tuple[int, bool]] = {}
     for edge in read.edges:
         nearest[edge.child] = max(nearest.get(edge.child, (0, False)), ranks[edge.topic])
-    is_near = tuple(not topic or ranks[edge.topic] == nearest[edge.child] for edge in read.edges)
-    return FramesRead(_tree(opened, is_near), read.topics, read.unread)
+    return tuple(not topic or ranks[edge.topic] == nearest[edge.child] for edge in read.edges)
 
 
 class _Edge(NamedTuple):

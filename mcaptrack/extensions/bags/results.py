@@ -12,6 +12,7 @@ import heapq
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import product
 from math import cos, sin
 from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
@@ -31,7 +32,7 @@ from mcaptrack.schema.classes import class_name, class_names
 from mcaptrack.schema.encodings import CDR, encoded, ros_definition, ros_name
 from mcaptrack.schema.provenance import frame_id_of, input_of
 from mcaptrack.sources.cameras import cameras
-from mcaptrack.sources.fixed_frame import transforms_of
+from mcaptrack.sources.fixed_frame import namespaces_of, transforms_of
 from mcaptrack.sources.foreign.definitions import typestore_of
 
 Progress = Callable[[str, int, int], None]
@@ -428,9 +429,10 @@ class _Job:
 
     def transforms(self) -> list[_Stream]:
         """The transforms of the log: those that hold for ever, and those that move."""
-        tree = transforms_of(self._opened)
         out = []
-        for topic, is_static in (("/tf_static", True), ("/tf", False)):
+        for namespace, is_static in product(namespaces_of(self._opened), (True, False)):
+            tree = transforms_of(self._opened, namespace)
+            topic = f"{namespace or '/'}{'tf_static' if is_static else 'tf'}"
             wanted = [series for series in (tree.series.values() if tree else ()) if series.is_static == is_static]
             poses = sorted(
                 (int(t_ns), number, at)
@@ -440,14 +442,18 @@ class _Job:
             )
             if poses:
                 self.total += len(poses)
-                moved = ((t_ns, _transform(wanted[number], at)) for t_ns, number, at in poses)
-                out.append(_Stream(topic, "tf2_msgs/msg/TFMessage", moved, is_static))
+                out.append(_Stream(topic, "tf2_msgs/msg/TFMessage", _transforms(wanted, poses), is_static))
         return out
 
 
 def _paths(frames: Sequence[Frame], frame_id: str, bases: Sequence[Mapping[int, float]]) -> Iterator[tuple[int, Any]]:
     for frame, base_m in zip(frames, bases, strict=True):
         yield from ((frame.t_ns, path) for path in paths(frame, frame_id, base_m))
+
+
+def _transforms(series: Sequence[Any], poses: Sequence[tuple[int, int, int]]) -> Iterator[tuple[int, Any]]:
+    """The messages of poses: the time of each, the number of its series, and its number there."""
+    yield from ((t_ns, _transform(series[number], at)) for t_ns, number, at in poses)
 
 
 def _transform(series: Any, at: int) -> Any:

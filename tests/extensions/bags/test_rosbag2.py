@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -175,22 +176,29 @@ def test_boxes_in_pixels_become_detections_in_2d(tmp_path):
     assert found["/c/tracks/markers"][1][1].markers[1].header.frame_id == "c/ground"
 
 
-def test_transforms_are_in_the_bag(tmp_path):
-    path = written(tmp_path / "a.mcap", {"/lidar/tracks": (TRACKS, DRIVE)})
+@pytest.mark.parametrize("robots", [("",), ("/a", "/b")], ids=["one robot", "two, with frames of the same names"])
+def test_transforms_are_in_the_bag(tmp_path, robots):
+    path, wanted = written(tmp_path / "a.mcap", {"/lidar/tracks": (TRACKS, DRIVE)}), {}
+    steps = {"tf": ("map", "base_link", 3), "tf_static": ("base_link", "lidar", 1)}
     with log.read(path) as opened, log.extend(opened, None) as writer:
         moved = foxglove.message_class(foxglove.TRANSFORM)
-        number = writer.add_channel("/tf", foxglove.schema_record(foxglove.TRANSFORM), "protobuf", {})
-        for n in range(3):
-            one = moved(parent_frame_id="map", child_frame_id="base_link")
-            one.timestamp.FromNanoseconds(T0 + ns(n))
-            one.translation.x, one.rotation.w = float(n), 1.0
-            writer.add_message(number, T0 + ns(n), n, one.SerializeToString())
+        for (x, robot), (name, (parent, child, count)) in product(enumerate(robots), steps.items()):
+            topic = f"{robot}/{name}"
+            number = writer.add_channel(topic, foxglove.schema_record(foxglove.TRANSFORM), "protobuf", {})
+            wanted[topic] = [(parent, child, 10.0 * x + n) for n in range(count)]
+            for n, (*_, place) in enumerate(wanted[topic]):
+                one = moved(parent_frame_id=parent, child_frame_id=child)
+                one.timestamp.FromNanoseconds(T0 + ns(n))
+                one.translation.x, one.rotation.w = place, 1.0
+                writer.add_message(number, T0 + ns(n), n, one.SerializeToString())
     result = mcaptrack.export(path, tmp_path / "bag", form="rosbag2")
-    assert dict(result.rows) == {"/lidar/tracks": 6, "/lidar/tracks/markers": 6, "/tf": 3}
-    tf = [message.transforms[0] for _, message in read(tmp_path / "bag")["/tf"]]
-    assert [(one.header.frame_id, one.child_frame_id, one.transform.translation.x) for one in tf] == [
-        ("map", "base_link", n) for n in range(3)
-    ]
+    tf = {topic: [message.transforms[0] for _, message in read(tmp_path / "bag")[topic]] for topic in wanted}
+    written_to = {
+        topic: [(one.header.frame_id, one.child_frame_id, one.transform.translation.x) for one in transforms]
+        for topic, transforms in tf.items()
+    }
+    assert written_to == wanted
+    assert {topic for topic in result.rows if "tf" in topic} == {*wanted}
 
 
 class TestFolders:
