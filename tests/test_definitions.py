@@ -393,7 +393,7 @@ def test_messages_that_are_compressed_one_by_one_are_read_as_others_are(tmp_path
     with log.read(tmp_path / "made.mcap") as opened:
         assert [found.payload for found in opened.messages("/t")] == payloads
     with pytest.raises(McaptrackError, match="are compressed one by one"):
-        mcaptrack.track(path, topic="/t", sidecar=False)
+        mcaptrack.track(path, topic="/t", sidecar=False, progress=lambda *_: pytest.fail("it computes before"))
     write(tmp_path / "cut.mcap", "vision_msgs/msg/Detection2DArray", "ros2msg", text, [packed[0][:-4]])
     with log.read(tmp_path / "cut.mcap") as opened, pytest.raises(McaptrackError, match="at 1700000000000000000 ns"):
         asked(opened)

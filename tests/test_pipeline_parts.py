@@ -178,11 +178,12 @@ PLANS = {
     "a parameter that is gone, and another setting": other_settings(
         f"predictions: {WITHOUT('Predict')}", predict=Predict()
     )._replace(changed={"predictions": {"parameters": {"strange": 1}}}),
-    "compared with something that is gone": Plan({"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], AGAIN[2:3]),
+    "compared with something that is gone": Plan({"predictions": {"references": {"/camera/truth": "x"}}}, {}, ["predict"], [EARLIER("predictions", "truth", "predict")]),
     "compared with nothing, as now": Plan({"predictions": {"references": {"/camera/truth": ""}}}),
-    "compared with something else": Plan({"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], AGAIN[2:3]),
+    "compared with something else": Plan({"predictions": {"references": {"/camera/tracks": "T"}}}, {}, ["predict"], [EARLIER("predictions", "tracks", "predict")]),
     "a plane that is gone": Plan(
-        {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}}, {}, STAGES_OF_ALL, AGAIN
+        {"tracks": {"parameters": parameters_of("track", Sort(ground_planes=((0, PLANE),)))}}, {}, STAGES_OF_ALL,
+        [EARLIER("tracks", "ground_plane", "track"), *AGAIN[1:]],
     ),
 }  # fmt: skip
 

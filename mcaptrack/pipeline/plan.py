@@ -21,7 +21,7 @@ from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, warn_unused
 from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, rebuild
 from mcaptrack.pipeline.scenes import Scenes
-from mcaptrack.pipeline.staleness import is_of_corrections, is_stale, read_planes
+from mcaptrack.pipeline.staleness import changed_source, is_of_corrections, is_stale, read_planes
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
 from mcaptrack.schema.framing import joined_parts
 from mcaptrack.schema.provenance import FUSE, Provenance, frame_id_of
@@ -460,7 +460,9 @@ class _Planner:
         if is_of_corrections(self.opened, self.prefix, result.provenance):
             changed = "answers about" if stage.kind == "retracker" else "corrections of"
             return f"{changed} {source} have changed: {again}, as before"
-        return f"{topic} was made from an earlier {source}: {again}, as before"
+        made_again = next((name for name in result.provenance.made_from() if self.changes.get(name)), "")
+        earlier = made_again or changed_source(self.opened, topic) or source
+        return f"{topic} was made from an earlier {earlier}: {again}, as before"
 
     def _kept(self, result: _Result, transform: Transform) -> tuple[str, ...] | None:
         """Return the outputs that are written: those that the log has, and those that belong beside them."""

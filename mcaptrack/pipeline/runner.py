@@ -42,6 +42,7 @@ from mcaptrack.schema.provenance import FUSE, VIEW, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import camera_at, provenance_of
 from mcaptrack.sources.fixed_frame import BoxesRead
+from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import ModelCard, traits_of
@@ -252,6 +253,7 @@ def run(
     part = report.watch.part
     with collected() as warnings:
         if jobs:
+            encoding_for(opened)  # refuses a recording that results can't be written into
             warn_clock_jumps(opened)
         planes = read_planes(opened, prefix)
         for job in jobs:

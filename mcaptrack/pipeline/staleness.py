@@ -29,18 +29,25 @@ _MOST_RECORDED: Final = 100
 
 def is_stale(opened: log.Log, topic: str) -> bool:
     """Return whether an input or reference of ``topic``, or its ground plane, has changed since it was made."""
+    return bool(changed_source(opened, topic))
+
+
+def changed_source(opened: log.Log, topic: str) -> str:
+    """Return the input, reference or ground plane of ``topic`` that has changed since it was made; "" if none has."""
     provenance = Provenance.from_metadata(opened.channel(topic).metadata)
     if provenance is None:
-        return False
+        return ""
     prefix = name_above(chain_of(opened, topic)[-1])
     if _is_plane_new(opened, prefix, provenance):
-        return True
-    if is_motion_new(opened, prefix, provenance) or is_of_corrections(opened, prefix, provenance):
-        return True
-    if any((name in opened.channels) != bool(then) for name, then in provenance.references.items()):
-        return True
+        return camera_at(opened, prefix).ground_plane
+    if is_motion_new(opened, prefix, provenance):
+        return motion_topic(camera_at(opened, prefix).prefix)
+    if is_of_corrections(opened, prefix, provenance):
+        return provenance.input
+    changed = [name for name, then in provenance.references.items() if (name in opened.channels) != bool(then)]
     now = {name: how for name in provenance.made_from() if (how := provenance_of(opened, name)) and how.digest}
-    return any(how.digest != provenance.made_from()[name] for name, how in now.items())
+    changed += [name for name, how in now.items() if how.digest != provenance.made_from()[name]]
+    return changed[0] if changed else ""
 
 
 def is_finished(topic: str, how: Provenance) -> bool:

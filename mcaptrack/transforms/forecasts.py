@@ -299,7 +299,7 @@ class OnlineForecasts:
     def done(self) -> FrameColumns:
         """The predictions; nothing can be added any more."""
         if self._calibration is not None:
-            self._calibration.warn(self._name)
+            self._calibration.warn(f"{self._name} from online tracks")
         return self._out.done()
 
     def _forecast(self, past: Floats, is_known: Bools, steps: Ints) -> Forecast:
