@@ -85,6 +85,7 @@ class TestErrors:
         "ingest clip.mp4 -o clip.mp4 --force": "clip.mp4 is both input and output",
         "run a.mcap -o a.mcap --force": "a.mcap is both input and output",
         "run text.mp4": "text.mp4 can't be read as an MCAP file",
+        "detect a.mcap --detector mog2": "no detector is called mog2; knn took its place;",
         "info folder": "the folder folder has no log, which is a file that ends with .mcap and no part of a recording",
         "run clip.mp4": "clip.mp4 is a video, not an MCAP file; `mcaptrack ingest clip.mp4`",
         "evaluate a.mcap --truth good.txt": "add it with `mcaptrack ingest good.txt --as truth --into a.mcap`",
@@ -117,7 +118,10 @@ class TestErrors:
                 "no such option: --frame (ingest, run have it); in Python mcaptrack.track has it: frame=...",
             ),
             (["--all"], "no such option: --all (export, evaluate have it);"),
-            (["--ledger", "x"], "no such option: --ledger (ingest, run, detect, retrack, export have it);"),
+            (
+                ["--ledger", "x"],
+                "no such option: --ledger (ingest, run, detect, retrack, export have it); in Python mcaptrack.fleet.run",
+            ),
             (["--views"], "no such option: --views; in Python mcaptrack.track has it: views=True"),
             (["--max-age-s", "2s"], "invalid value for '--max-age-s': '2s' is not a number;"),
             (["--jobs", "2.5"], "invalid value for '--jobs': '2.5' is not a whole number;"),
@@ -129,7 +133,8 @@ class TestErrors:
 
     def test_an_option_of_many_commands_is_refused_with_some_of_them(self):
         assert re.match(
-            r"mcaptrack: no such option: -o \((\w+, ){4}\w+ and 1\d more have it\);", call("info", "-o", "x").err
+            r"mcaptrack: no such option: -o \((\w+, ){4}\w+ and 1\d more have it\); `> FILE` ",
+            call("info", "-o", "x").err,
         )
 
     def test_a_mode_that_there_is_not_is_refused(self, place):

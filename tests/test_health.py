@@ -123,6 +123,7 @@ def test_what_an_extra_lacks_is_no_fault(monkeypatch):
 def test_a_plug_in_that_cant_be_imported_is_a_warning(tmp_path, monkeypatch):
     package(tmp_path, "own", "1.5", {"mcaptrack.trackers": {"mine": "nothing_there:Mine"}})
     monkeypatch.syspath_prepend(str(tmp_path))
+    assert done("doctor").out.endswith("none; 1 of what it can do without, see above\n")
     said = json.loads(done("doctor", "--json").out)
     ((name, why),) = said["plugins"].items()
     assert name == "tracker mine (own 1.5)"

@@ -175,9 +175,10 @@ def test_pages_are_printed_with_their_generated_parts():
 
 
 def test_a_page_that_is_not_there_is_said_with_those_that_are():
-    code, _, err = call("docs", "tabels")
-    assert code == 1
-    assert err.startswith("mcaptrack: there is no page tabels; did you mean tables? There are readme, ")
+    for page, meant in (("tabels", "tables"), ("detectors", "networks")):
+        code, _, err = call("docs", page)
+        assert code == 1
+        assert err.startswith(f"mcaptrack: there is no page {page}; did you mean {meant}? There are readme, ")
 
 
 def test_links_of_the_pages_lead_somewhere():

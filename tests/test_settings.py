@@ -184,9 +184,15 @@ class TestUnknownNames:
         monkeypatch.setenv("MCAPTRACK_RETRACK_LINK_S", "2")
         assert "names no option; write MCAPTRACK_RETRACK_SET=link_s=VALUE" in refused("info", "x.mcap")
 
+    def test_a_parameter_of_the_command_of_a_stage_alone_is_said_to_change_no_run(self, monkeypatch):
+        monkeypatch.setenv("MCAPTRACK_RETRACK_SET", "mode=online link_s=2")
+        words = "MCAPTRACK_RETRACK_SET: `mcaptrack retrack` alone has mode; run ignores it"
+        for command in ("run", "track", "retrack"):
+            assert (words in call(command, "x.mcap").err) == (command == "run")
+
     def test_a_variable_of_a_command_is_not_taken_for_that_of_another(self, monkeypatch):
         monkeypatch.setenv("MCAPTRACK_TRACK_LEDGER", "x")  # as retrack has, not track
-        assert refused("info", "x.mcap").endswith("MCAPTRACK_TRACK_LEDGER names no option\n")
+        assert "MCAPTRACK_TRACK_LEDGER names no option; in Python " in refused("info", "x.mcap")
 
     def test_a_variable_without_its_unit_is_refused(self, monkeypatch):
         monkeypatch.setenv("MCAPTRACK_TRACK_MAX_AGE", "2")

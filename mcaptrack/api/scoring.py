@@ -349,7 +349,8 @@ def evaluate(
     truth : path or sequence of paths, optional
         Ground truth for files of tracks: one file for each, matched by name or in order.
     against : str, optional
-        Without ground truth, compare trackers of logs by this channel of offline re-tracking: differences only.
+        Without ground truth, compare trackers of logs, two or more ``topic``, by this channel of offline re-tracking:
+        differences only.
     gate_m : float or sequence of float, default (0.5, 1, 2)
         Gate: largest distance in metres at which ground truth and a track match.
 

@@ -246,7 +246,12 @@ def settings_of(command: str) -> dict[str, Any]:
     for setting in other.settings.values():
         place = set_values[setting.parameter][1].where if setting.parameter in set_values else ""
         setting.check(values.get(setting.parameter), place)
-    return values | ({"set": values_set(command, values["set"], other.settable)} if values.get("set") else {})
+    if not values.get("set"):
+        return values
+    texts = values_set(command, values["set"], other.settable)
+    for name in [each.name for each in other.set_parameters if each.name in texts and context.info_name == "run"]:
+        warn(f"{set_values['set'][1].where}: `mcaptrack {command}` alone has {name}; run ignores it", "option-not-used")
+    return values | {"set": texts}
 
 
 def check_ranges(values: Mapping[str, Any]) -> None:

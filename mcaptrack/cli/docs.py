@@ -58,7 +58,9 @@ def documentation(
         return pages
     name = Path(page).name.lower().removesuffix(".md")
     if name not in pages:
-        raise McaptrackError(f"there is no page {page}; {did_you_mean(name, pages)}There are {', '.join(pages)}")
+        about = " or ".join(each for each, path in pages.items() if name in _title(path).lower())
+        hint = f"did you mean {about}? " if about else did_you_mean(name, pages)
+        raise McaptrackError(f"there is no page {page}; {hint}There are {', '.join(pages)}")
     return {name: pages[name]}
 
 

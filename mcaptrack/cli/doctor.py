@@ -65,4 +65,5 @@ def _lines(result: DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
         )
         yield "  credentials", result.store.credentials
         yield from ((f"  {name}", why or "works") for name, why in result.store.access.items())
-    yield "faults", f"{len(result.faults)}, see below" if result.faults else "none"
+    doubts = f"; {len(result.warnings)} of what it can do without, see above" if result.warnings else ""
+    yield "faults", f"{len(result.faults)}, see below" if result.faults else f"none{doubts}"

@@ -123,6 +123,11 @@ class Elsewhere(NamedTuple):
 
 #: Commands by name. One is made when it is looked up, so only those are that the environment and files name.
 Commands = Mapping[str, HasSettings]
+#: What is done in place of an option that other commands have.
+_INSTEAD: Final = {
+    **dict.fromkeys(("--o", "--output"), "`> FILE` at the end of the line writes its text to a file"),
+    **dict.fromkeys(("--ledger", "--timeout"), "in Python mcaptrack.fleet.run has it, for any function"),
+}
 _KNOWN: Final[ContextVar[tuple[Commands, dict[str, dict[str, Given]]]]] = ContextVar("known")
 
 
@@ -235,9 +240,10 @@ def other_way(command: HasSettings, name: str, start: str = "--set ", end: str =
 
     ``name`` is that of its flag. Text that sets it begins with ``start``, and its value ends with ``end``.
     """
-    elsewhere = command.elsewhere.get(f"--{name.removeprefix('--').replace('_', '-')}")
+    flag = f"--{name.lstrip('-').replace('_', '-')}"
+    elsewhere = command.elsewhere.get(flag)
     if elsewhere is None:
-        return ""
+        return _INSTEAD.get(flag, "")
     if elsewhere.is_set:
         return f"write {start}{elsewhere.parameter}{end or f'={elsewhere.value}'}"
     return f"in Python mcaptrack.{command.name} has it: {elsewhere.parameter}={elsewhere.value}"

@@ -190,8 +190,8 @@ def differences(logs: Sequence[Candidates]) -> list[Difference]:
     names = [name for name in logs[0].scores if all(name in candidates.scores for candidates in logs)]
     if len(names) < 2:
         raise McaptrackError(
-            f"there are no two channels of tracks to compare ({', '.join(names) or 'none'}); name those that all logs "
-            "have with `topic=`, or bring in another tracker's as `log.write` does"
+            f"there are no two channels of tracks to compare ({', '.join(names) or 'none'}); name two or more that all "
+            "logs have with `topic=`, or bring in another tracker's as `log.write` does"
         )
     return [compare(before, after, logs) for before, after in combinations(names, 2)]
 
