@@ -223,6 +223,19 @@ DEFINITIONS = {
     )
     + BAR
     + "MSG: unique_identifier_msgs/UUID\nuint8[16] uuid\n",
+    "tier4_perception_msgs/DetectedObjectsWithFeature": package(
+        "tier4_perception_msgs",
+        DetectedObjectsWithFeature="std_msgs/Header header; DetectedObjectWithFeature[] feature_objects",
+        DetectedObjectWithFeature="DetectedObject object; Feature feature",
+        Feature="sensor_msgs/PointCloud2 cluster; sensor_msgs/RegionOfInterest roi",
+        DetectedObject="float32 existence_probability; ObjectClassification[] classification; "
+        "DetectedObjectKinematics kinematics; Shape shape",
+        ObjectClassification="uint8 UNKNOWN=0; uint8 CAR=1; uint8 PEDESTRIAN=7; uint8 label; float32 probability",
+        DetectedObjectKinematics="geometry_msgs/PoseWithCovariance pose_with_covariance; bool has_position_covariance; "
+        "uint8 orientation_availability; geometry_msgs/TwistWithCovariance twist_with_covariance; bool has_twist; "
+        "bool has_twist_covariance",
+        Shape="uint8 type; geometry_msgs/Polygon footprint; geometry_msgs/Vector3 dimensions",
+    ),
     # Not known by name: nobody published it.
     "lab_msgs/WalkerList": package(
         "lab_msgs",
@@ -282,6 +295,21 @@ IN_SPACE = {
             },
         },
         "uuid score v size heading",
+    ),
+    "tier4_perception_msgs/DetectedObjectsWithFeature": (
+        "feature_objects",
+        {
+            "object": {
+                "existence_probability": 0.75, "classification": [{"label": 7, "probability": 1.0}],
+                "shape": {"dimensions": SIZE},
+                "kinematics": {
+                    "pose_with_covariance": {"pose": POSE}, "orientation_availability": 2, "has_twist": True,
+                    "twist_with_covariance": {"twist": {"linear": {"x": 0.25, "y": -0.5}}},
+                },
+            },
+            "feature": {"roi": ROI},
+        },
+        "score v size heading pedestrian",
     ),
     "autoware_perception_msgs/DynamicObjectArray": (
         "objects",
@@ -452,7 +480,15 @@ def test_positions_ids_classes_and_scores_are_as_the_message_states_them(name, e
     }
     np.testing.assert_allclose([row[key] for key in wanted], list(wanted.values()), atol=1e-6)
     assert found.frame_id == ("odom" if "odom" in has else "map")
-    name_of_class = "pedestrian" if "uuid" in has else "leg" if "leg" in has else "" if "nothing" in has else "person"
+    name_of_class = (
+        "pedestrian"
+        if has & {"uuid", "pedestrian"}
+        else "leg"
+        if "leg" in has
+        else ""
+        if "nothing" in has
+        else "person"
+    )
     assert ({0: "", 1: "person"} | found.classes)[row["class_id"]].lower() == name_of_class
     with log.read(path) as opened:
         assert foreign.holds_boxes(opened, "/seen", in_space=True)

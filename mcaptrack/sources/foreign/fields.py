@@ -267,7 +267,8 @@ _PICTURED_KEYS: Final = frozenset({"left", "top", "right", "bottom", "w", "h", "
 
 def recognised(shape: FieldShape, type_name: str) -> ThingFields | None:
     """The things of a type of messages; None if it has none, that is no position and no box."""
-    out = [fields for things, each, names in _lists(shape, type_name) if (fields := _thing(things, each, names))]
+    lists = _lists(shape, type_name)
+    out = [fields for at, each, names in lists if (fields := _thing(at, each, names) or _wrapped(at, each))]
     return max(out, key=lambda fields: (fields.is_certain, len(fields.paths)), default=None)
 
 
@@ -326,6 +327,14 @@ def _thing(things: Path, each: FieldShape, words: Sequence[str]) -> ThingFields 
     part = next((word.rstrip("s") for word in words if _PARTS.fullmatch(word)), "")
     class_name = "" if "class" in paths else part or ("person" if is_person else "")
     return _with_classes(each, ThingFields(things, paths, {}, class_name, is_certain))
+
+
+def _wrapped(things: Path, each: FieldShape) -> ThingFields | None:
+    """The fields of a thing that is the field ``object`` of another, as where its features stand beside it."""
+    inner = each.at(("object",)) if things else None
+    fields = _thing(things, inner, _words_in(inner.name)) if inner is not None and inner.is_struct else None
+    paths = {key: [("object", *path) for path in of] for key, of in fields.paths.items()} if fields else {}
+    return replace(fields, paths=paths) if fields else None
 
 
 def _add_posed_guess(each: FieldShape, guess: Mapping[str, Path], paths: dict[str, list[Path]]) -> None:

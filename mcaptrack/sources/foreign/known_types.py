@@ -8,6 +8,7 @@ that takes boxes as the fields have them, with their things, to boxes as they ar
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from math import nan
 from typing import Final, NamedTuple
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from mcaptrack.geometry.arrays import Floats, taken
 from mcaptrack.sources.foreign.fields import Adjust, Boxes3d, around, rotated
-from mcaptrack.sources.foreign.things import EACH, Things
+from mcaptrack.sources.foreign.things import EACH, Path, Things
 
 
 class Known(NamedTuple):
@@ -87,19 +88,19 @@ def _derived(things: Things, boxes: Boxes3d) -> Boxes3d:
 _ROUND, _POLYGON, _HEADING_UNKNOWN = 1, 2, 0
 
 
-def _autoware(things: Things, boxes: Boxes3d) -> Boxes3d:
-    """Footprints and cylinders are sizes, and velocities are along the axes of the object."""
-    kind, size, turn = things.numbers(("shape", "type")), boxes.size.copy(), boxes.orientation
+def _autoware(things: Things, boxes: Boxes3d, at: Path = ()) -> Boxes3d:
+    """Footprints and cylinders are sizes, and velocities are along the axes of the object, ``at`` the end of a path."""
+    kind, size, turn = things.numbers((*at, "shape", "type")), boxes.size.copy(), boxes.orientation
     size[kind == _ROUND, 1] = size[kind == _ROUND, 0]  # x is the diameter
-    owner, points = things.members(("shape", "footprint", "points", EACH))
+    owner, points = things.members((*at, "shape", "footprint", "points", EACH))
     middle, extent = around(points.vectors(()), owner, len(things))
     is_outlined = kind == _POLYGON
     size[is_outlined, :2] = extent[is_outlined, :2]
     centre = boxes.centre.copy()
     centre[is_outlined] += rotated(turn, np.nan_to_num(middle) * [1, 1, 0])[is_outlined]
-    has_twist = [value in (None, True) for value in things.values(("kinematics", "has_twist"))]
+    has_twist = [value in (None, True) for value in things.values((*at, "kinematics", "has_twist"))]
     velocity = np.where(np.reshape(has_twist, (-1, 1)), rotated(turn, boxes.velocity), nan)
-    is_turned = things.numbers(("kinematics", "orientation_availability")) != _HEADING_UNKNOWN
+    is_turned = things.numbers((*at, "kinematics", "orientation_availability")) != _HEADING_UNKNOWN
     score = _stated(boxes.score)
     return boxes._replace(centre=centre, size=size, velocity=velocity, has_heading=is_turned, score=score)
 
@@ -114,6 +115,10 @@ _AUTOWARE: Final = Known(
     ",car,truck,bus,trailer,motorcycle,bicycle,pedestrian,animal,hazard,over_drivable,under_drivable",
     _autoware,
     "shape kinematics.has_twist kinematics.orientation_availability",
+)
+_IN_OBJECT: Final = _AUTOWARE._replace(
+    adjust=partial(_autoware, at=("object",)),
+    also="object.shape object.kinematics.has_twist object.kinematics.orientation_availability",
 )
 
 
@@ -175,6 +180,7 @@ KNOWN: Final[Mapping[str, Known]] = {
     "autoware_perception_msgs/DynamicObjectArray": Known(
         "", ",car,truck,bus,bicycle,motorbike,pedestrian,animal", _along_heading
     ),
+    "tier4_perception_msgs/DetectedObjectsWithFeature": _IN_OBJECT,
     "zed_interfaces/ObjectsStamped": _ZED,
     "zed_msgs/ObjectsStamped": _ZED,
     **{
