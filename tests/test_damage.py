@@ -306,6 +306,17 @@ def test_hostile_logs_cost_neither_time_nor_memory(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+def test_a_log_that_was_joined_to_another_is_named(tmp_path):
+    for name in "ab":
+        write_log(tmp_path / f"{name}.mcap", FORTY)
+    first, second = ((tmp_path / f"{name}.mcap").read_bytes() for name in "ab")
+    (tmp_path / "both.mcap").write_bytes(first + second)
+    report = log.recover(tmp_path / "both.mcap", tmp_path / "saved.mcap")
+    assert report.lost == [
+        f"byte {len(first)} to {len(first + second)}: another log follows; cut the file in two there"
+    ]
+
+
 def test_content_that_cannot_be_recovered_is_named(tmp_path):
     for name, data in {"text.mcap": b"I am no log\n" * 9, "magic.mcap": MAGIC}.items():
         (tmp_path / name).write_bytes(data)

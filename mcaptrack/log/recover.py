@@ -154,6 +154,7 @@ class _Recovery:
         if not self._is_done and not self._known_offsets:
             self._report.lost.append(f"byte {len(buffer)}: the file is cut off; anything that followed is lost")
         self._compare()
+        self._report_behind(at)
         for number in self._summary_index.channels.keys() - self._described:  # channels without messages
             with suppress(Damaged):
                 self._describe_if_new(number)
@@ -354,6 +355,14 @@ class _Recovery:
         if number not in self._described:
             self._add_channel(number)
             self._writer.write_description(number)
+
+    def _report_behind(self, at: int) -> None:
+        """Report a log that follows this one, whose data section ends at ``at``, as where files were joined."""
+        with suppress(Damaged):
+            footers = (record for record in walk(self._buffer, at, len(self._buffer)) if record.opcode == Opcode.FOOTER)
+            end = next((record.end + len(MAGIC) for record in footers), at)
+            if self._buffer[end : end + len(MAGIC)] == MAGIC:
+                self._report_lost(end, len(self._buffer), "another log follows; cut the file in two there")
 
     def _words(self, at: int, why: str) -> str:
         """Why something is lost, and what it held, if the summary lists a chunk there."""
