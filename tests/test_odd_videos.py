@@ -260,6 +260,15 @@ def test_what_is_kept_as_stored_is_said(tmp_path):
         f"{path} is HDR (PQ); its brightness stays as stored, which may not suit detectors",
     ]
     assert (video.width_px, video.height_px, video.why_transcode) == (64, 48, "")
+    thermal = tmp_path / "thermal.mkv"
+    with av.open(str(thermal), "w") as container:
+        stream = container.add_stream("ffv1", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "gray16le"
+        picture = av.VideoFrame.from_ndarray(np.full((48, 64), 4095, np.uint16), format="gray16le")
+        for packet in [*stream.encode(picture), *stream.encode(None)]:
+            container.mux(packet)
+    (note,) = open_video(thermal).notes
+    assert "grey values of 16 bits, of which the highest 8 are kept; its first picture reaches 6% of white" in note
 
 
 def said_of(times_ms: list[int], fps: Fraction | None = None) -> list[str]:

@@ -492,6 +492,13 @@ def _remarks(path: Path, stream: Any, first: Any, orientation: Orientation) -> I
     aspect = fraction(stream.sample_aspect_ratio)
     if aspect and aspect != 1:
         yield f"{path} has pixels that are {float(aspect):.4g} times as wide as high; pictures stay as they are stored"
+    bits = max(component.bits for component in first.format.components)
+    if bits > 8 and first.format.name.startswith("gray"):
+        share = first.to_ndarray(format="gray16le").max() / np.iinfo(np.uint16).max
+        yield (
+            f"{path} has grey values of {bits} bits, of which the highest 8 are kept; its first picture reaches "
+            f"{share:.0%} of white (those of a folder of PNG images are scaled)"
+        )
     if first.color_trc in _HDR:
         yield f"{path} is HDR ({_HDR[first.color_trc]}); its brightness stays as stored, which may not suit detectors"
 

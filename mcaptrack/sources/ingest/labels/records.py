@@ -30,7 +30,8 @@ class Records(Csv):
 
     def recognises(self, file: LabelFile) -> bool:
         """Whether a file begins so, or is JSON of rows with a place in each."""
-        if file.head.startswith((_PARQUET, _ARROW, _STREAM)) or file.has_json_lines:
+        is_stream = file.head.startswith(_STREAM) and not file.head.startswith(2 * _STREAM)  # as parts of videos do
+        if file.head.startswith((_PARQUET, _ARROW)) or is_stream or file.has_json_lines:
             return True
         try:
             return file.is_json and hold_places(records(file).header)
