@@ -306,6 +306,8 @@ def missing(path: Path) -> str:
     """The message about a file or folder that isn't there, or is no file: whether its folder is, and which is meant."""
     if path.is_dir():
         return f"{path} is a folder; give the name of a file"
+    if path.is_symlink():
+        return f"{path} is a link to {path.readlink()}, which does not exist"
     folder = path.parent
     try:
         with os.scandir(folder) as entries:

@@ -66,6 +66,7 @@ def place(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("mistakes")
     (folder / "text.mp4").write_text("I am no video\n")
     (folder / "folder").mkdir()
+    (folder / "link.mcap").symlink_to("gone.mcap")
     (folder / "bad.txt").write_text("1,1,1,1,2,2\n2,1,x,1,2,2\n")
     (folder / "good.txt").write_text("1,1,1,1,2,2\n")
     write_clip(folder / "clip.mp4", options={"bf": "0"})
@@ -86,6 +87,7 @@ class TestErrors:
         "run a.mcap -o a.mcap --force": "a.mcap is both input and output",
         "run text.mp4": "text.mp4 can't be read as an MCAP file",
         "detect a.mcap --detector mog2": "no detector is called mog2; knn took its place;",
+        "info link.mcap": "link.mcap is a link to gone.mcap, which does not exist",
         "info folder": "the folder folder has no log, which is a file that ends with .mcap and no part of a recording",
         "run clip.mp4": "clip.mp4 is a video, not an MCAP file; `mcaptrack ingest clip.mp4`",
         "evaluate a.mcap --truth good.txt": "add it with `mcaptrack ingest good.txt --as truth --into a.mcap`",

@@ -217,6 +217,22 @@ class TestRefused:
                 "`progress=` is called as progress(stage",
             ),
             "no gates": (lambda: mcaptrack.evaluate("log.mcap", gate_m=()), "`gate_m=` needs at least one number"),
+            "a file for tables": (
+                lambda: mcaptrack.export("log.mcap", "boxes.csv"),
+                "boxes.csv has the name of a file, and tables are files in a folder",
+            ),
+            "an array to ingest": (
+                lambda: mcaptrack.ingest(np.zeros((2, 2))),
+                "`source=` is the name of a file or folder",
+            ),
+            "gates that are read once": (
+                lambda: mcaptrack.evaluate("log.mcap", gate_m=iter((1, 2))),
+                "`gate_m=` is a number from 0.001 to 1000000",
+            ),
+            "a name that is none": (
+                lambda: mcaptrack.evaluate("log.mcap", topic=["tracks", None]),
+                "`topic=` is text, not None",
+            ),
             "a wrong gate": (lambda: mcaptrack.evaluate("log.mcap", gate_m=(1, -1)), "from 0.001 to 1000000, not -1"),
             "a score of several": (
                 lambda: mcaptrack.evaluate("log.mcap").score("IDF1", "retracks"),

@@ -505,6 +505,7 @@ def test_an_answer_is_written_to_a_file_without_loss(known, tmp_path):
     assert run(known, "select 1 as a", "-o", target).code == 0
     assert target.read_text() == '"a"\n1\n'
     assert "exists" in refusal(known, "select 2 as a", "-o", target)
+    assert "a.xlsx: answers end with .csv" in refusal(known, "select 2 as a", "-o", target.with_name("a.xlsx"))
     assert run(known, "select error('no') from tracks", "-o", target, "--force").code == 1
     assert target.read_text() == '"a"\n1\n'
     assert run(known, "select 2 as a", "-o", target, "--force").code == 0

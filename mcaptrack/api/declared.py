@@ -17,7 +17,7 @@ import os
 import re
 import textwrap
 import types
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cache, wraps
 from numbers import Integral, Real
@@ -299,7 +299,7 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
             kinds = _kinds(function).get(name, ())
             choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
             choices = [] if str in kinds else choices
-            if "" in map(_name_of, _paths_in(value, kinds)):
+            if any(isinstance(path, str) and not path for path in map(_name_of, _paths_in(value, kinds))):
                 raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
             if choices:
                 _check_choice(name, value, choices)
@@ -479,13 +479,16 @@ def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
     """Raise McaptrackError for a value of another type. Types that aren't in ``_TYPES`` are not checked here."""
     types = {get_origin(kind) or kind for kind in kinds}
     types -= {Literal} if str in types else set()  # names, and those of installed packages
+    if any(kind == Sequence[str] for kind in kinds) and isinstance(value, list | tuple):
+        for member in value:
+            _check_type(name, member, (str,))
     if not types & {*_TYPES} or not types <= {*_TYPES, type(None)} or isinstance(value, tuple(types)):
         return
     if bool in types and type(value).__name__ in ("bool", "bool_"):  # NumPy's
         return
     is_path = os.PathLike in types  # which text is a name of, too
     meant = [text for kind, text in _TYPES.items() if kind in types and not (is_path and kind is str)]
-    raise McaptrackError(f"`{name}=` is {' or '.join(meant)}, not {value!r:.40}")
+    raise McaptrackError(f"`{name}=` is {' or '.join(meant)}, not {' '.join(repr(value).split()):.40}")
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:
@@ -497,7 +500,7 @@ def _check_choice(name: str, value: object, choices: list[Any]) -> None:
 def _check_range(name: str, value: Any, ends: tuple[float, float], *, is_whole: bool) -> None:
     kind: Any = Integral if is_whole else Real
     least, most = ends
-    values = list(value) if isinstance(value, Iterable) and not isinstance(value, str | bytes) else [value]
+    values = list(value) if isinstance(value, Iterable) and not isinstance(value, str | bytes | Iterator) else [value]
     for number in values:
         if not isinstance(number, kind) or isinstance(number, bool) or not least <= number <= most:
             text = "a whole number" if is_whole else "a number"

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple, cast, get_args
 
 from mcaptrack.api.common import log_location, names_of, optional_path, split_names, warn_unused, warnings_about
 from mcaptrack.api.declared import Option, declared
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from mcaptrack.log import Log
     from mcaptrack.registry import Entry
     from mcaptrack.tables.export.contents import MessagesPart
+
+#: What the names of files with tables end with.
+_OF_FILES: Final = (*(f".{form}" for form in get_args(TableFormat)), ".json", ".tsv", ".txt", ".xlsx")
 
 
 @dataclass(frozen=True)
@@ -223,6 +226,10 @@ def export(
         folder, kind = optional_path(output) or default_folder(path), cast("TableFormat", form)
         if folder.exists() and not folder.is_dir():
             raise McaptrackError(f"{folder} is a file; tables go to a folder")
+        if folder.suffix.lower() in _OF_FILES and not folder.exists():
+            raise McaptrackError(
+                f"{folder} has the name of a file, and tables are files in a folder; give a name for it"
+            )
         part.check()
         with warnings_about(path) as warnings:
             with logs.read(path) as opened:

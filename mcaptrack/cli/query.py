@@ -70,11 +70,11 @@ class Query(Once[Any]):
         if given["tables"]:
             warn_unused("--tables lists what could be asked", "form", "rows", "worlds")
         logs = expand(paths, folders=True)
-        self._form = _form(given["form"], output, given["json"])
         if output is not None:
             refuse_overwrite(output, given["force"])
             if any(is_same_file(output, path) for path in logs):
                 raise McaptrackError(f"{output} is both input and output; give another name with -o")
+        self._form = _form(given["form"], output, given["json"])
         return {"log": logs, "files": _named(given["files"] or [])} | (
             {} if given["tables"] else {"sql": sql, "worlds": given["worlds"]}
         )
@@ -145,6 +145,8 @@ def _form(form: Form | None, output: Path | None, json: bool) -> Form:
         raise McaptrackError(f"--json and --format {form} are two formats; give one")
     end = output.suffix.removeprefix(".").lower() if output is not None else ""
     by_ending: dict[str, Form] = {name: name for name in ("csv", "json", "jsonl", "parquet", "arrow")}
+    if output is not None and form is None and not json and end not in (*by_ending, "", "txt", "md"):
+        raise McaptrackError(f"{output}: answers end with .{', .'.join(by_ending)}; --format table writes text there")
     chosen: Form = "json" if json else form or by_ending.get(end, "table")
     if chosen in ("parquet", "arrow") and output is None:
         raise McaptrackError(f"--format {chosen} is not text; name a file with -o")

@@ -244,7 +244,9 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
     ground_truth = ground_truth_of_log(opened, prefix)
     names_of_usual = (*SCORED, FULL) if has_positions(ground_truth, "bev-iou") else SCORED
     usual = [f"{prefix}/{name}" for name in names_of_usual]
-    chosen = [opened.find(topic, prefix) for topic in topics] or [topic for topic in usual if topic in opened.channels]
+    chosen = [*dict.fromkeys(opened.find(topic, prefix) for topic in topics)] or [
+        topic for topic in usual if topic in opened.channels
+    ]
     if not chosen:
         raise McaptrackError(f"{opened.path} has no tracks to score; {call('run', opened.path)} makes them")
     forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in FORECAST_INPUTS.items()}
