@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import pytest
 
+import mcaptrack
 from mcaptrack import environment
 from mcaptrack.cli.config import MAX_BYTES, user_file
 from mcaptrack.cli.settings import Setting
@@ -134,6 +135,23 @@ def test_the_strongest_source_wins(folder, monkeypatch):
     monkeypatch.setenv("MCAPTRACK_CONFIG", named)
     monkeypatch.delenv("MCAPTRACK_TRACK_MAX_AGE_S")
     assert value() == 3
+
+
+def test_an_option_wins_over_the_set_of_a_weaker_source(finished, folder, monkeypatch):
+    named = put(folder / "named.toml", '[track]\nset = ["min_iou=0.3"]\n')
+
+    def min_iou(*words: str) -> float:
+        made = folder / "made.mcap"
+        call("track", finished, "-o", made, "--force", *words, "--config", named)
+        (how,) = [each.parameters for each in mcaptrack.info(made).channels if each.topic == "/camera/tracks"]
+        return how["min_iou"]
+
+    assert min_iou() == 0.3
+    assert min_iou("--min-iou", "0.5") == 0.5
+    monkeypatch.setenv("MCAPTRACK_TRACK_MIN_IOU", "0.4")
+    assert min_iou() == 0.4
+    monkeypatch.setenv("MCAPTRACK_TRACK_SET", "min_iou=0.6")
+    assert min_iou() == 0.6
 
 
 def refused(*words: str) -> str:
@@ -295,6 +313,7 @@ class TestFiles:
         b"track = 1": "track is a command; write its options below [track]",
         b'[track]\n"a\\nb\\u001b[2J" = 1': r"track has no option a\nb\x1b[2J",
         b'[track]\ncost = "a\\nb\\u001b[2J"': r'track has no option cost; write set = ["cost=a\nb\x1b[2J"]',
+        b"[track]\nmin_iou = 0\nmin-iou = 1": "[track] has min_iou and min-iou; give one of them",
         b"[track]\nviews = true": "track has no option views; in Python mcaptrack.track has it: views=True",
         b"[track]\nmax-age-s = [1, 2, 3, 4, 5, 6, 7]": "[track] max-age-s needs a number, not [1, 2, 3, 4, 5, 6, ...]",
         b"[track]\nmin-iou = true": "[track] min-iou needs a number, not True",

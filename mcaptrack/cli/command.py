@@ -251,7 +251,8 @@ def settings_of(command: str) -> dict[str, Any]:
     texts = values_set(command, values["set"], other.settable)
     for name in [each.name for each in other.set_parameters if each.name in texts and context.info_name == "run"]:
         warn(f"{set_values['set'][1].where}: `mcaptrack {command}` alone has {name}; run ignores it", "option-not-used")
-    return values | {"set": texts}
+    rank = set_values["set"][1].rank
+    return values | {"set": {n: texts[n] for n in texts if n not in set_values or set_values[n][1].rank >= rank}}
 
 
 def check_ranges(values: Mapping[str, Any]) -> None:
@@ -277,6 +278,13 @@ def is_option_given(parameter: str) -> bool:
     context = RUNNING.get()
     source = context.get_parameter_source(parameter) if context is not None else None
     return source is not None and source.name == "COMMANDLINE"
+
+
+def is_stronger(parameter: str, other: str) -> bool:
+    """Whether a stronger source gave a parameter of the running command than another parameter."""
+    context: Any = RUNNING.get()
+    set_values = found_of(context.info_name)
+    return _rank(context, parameter, set_values)[0] < _rank(context, other, set_values)[0]
 
 
 def warn_unused(reason: str, *parameters: str) -> None:

@@ -202,6 +202,8 @@ def _from_file(commands: Commands, file: ConfigFile) -> Iterable[tuple[str, Sett
         own = commands[command].settings
         for key, value in values.items():
             name = key.replace("_", "-")
+            if name != key and name in values:
+                refuse_usage(f"{file.path}: [{command}] has {key} and {name}; give one of them")
             if name not in own:
                 way = other_way(commands[command], name, 'set = ["', f'={value}"]')
                 hint = f"; {way}" if way else nearest(name, own)

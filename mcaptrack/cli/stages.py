@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
 from mcaptrack.cli.chosen import Maker, configured, has_flag, options_of, settable_of, tuning_of
-from mcaptrack.cli.command import is_option_given, listed
+from mcaptrack.cli.command import is_option_given, is_stronger, listed
 from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
 from mcaptrack.cli.running import RunsStages
 from mcaptrack.cli.text import stdout_to_stderr
@@ -64,9 +64,10 @@ class StageCommand(RunsStages):
         stage, owners = STAGES[self.name], _owners(self.kinds)
         wanted = {option: self.values[option] for option in owners if self.values.get(option) is not None}
         for option, value in self.values["set"].items():
-            if option in wanted and is_option_given(option):
+            if option in wanted and is_option_given(option) and is_option_given("set"):
                 raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
-            wanted[option] = value
+            if option not in wanted or not is_stronger(option, "set"):
+                wanted[option] = value
         make = Maker.of(stage, self.values, wanted, owners)
         with stdout_to_stderr():
             is_open = stage.kind == "tracker" and not self.values["tracker"]  # the boxes of a log decide

@@ -19,6 +19,7 @@ from mcaptrack.files import place_of, refuse_special, refuse_url
 from mcaptrack.location import Location, Url, sibling
 from mcaptrack.log import results_path
 from mcaptrack.log.recording_files import format_of, listing_of, logs_in, not_mcap, refuse_non_mcap
+from mcaptrack.log.records import MAGIC
 from mcaptrack.notices import collected, warn
 
 #: The argument that stands for a list of names on standard input.
@@ -275,6 +276,8 @@ def _standard_input() -> bytes:
 
 def _listed(text: bytes, has_folders: bool = False) -> Iterator[NamedLog]:
     """Yield the logs of a list; their names are relative to the folder that all of them are in."""
+    if text.startswith(MAGIC):
+        raise McaptrackError("- is a list of logs on standard input, which holds a log itself; give its name")
     lines = text.split(b"\0") if b"\0" in text else text.splitlines()
     named = [as_location(os.fsdecode(line)) for line in lines if line.strip()]
     yield from (NamedLog(url, Path(url.bucket, url.key)) for url in named if isinstance(url, Url))
