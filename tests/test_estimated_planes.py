@@ -250,6 +250,12 @@ def test_a_camera_that_moves_is_refused(tmp_path):
     assert made.parameters == {"refused": "the camera moves"}
 
 
+def test_boxes_beyond_the_corner_of_the_picture_have_a_scale(tmp_path):
+    rows = DETECTIONS.rows(x_px=[-1000.0], y_px=[-2000.0], w_px=[30.0], h_px=[60.0], score=[0.9], class_id=[1])
+    path = written(tmp_path / "a.mcap", Provenance("ingest", {}), [Frame(0, 0, rows)])
+    assert mcaptrack.run(path, tables=False).summary.ground_plane == "assumed"
+
+
 @thorough
 def test_tracks_of_other_trackers_give_a_plane_too(tmp_path):
     frames = []

@@ -179,7 +179,8 @@ def make_plane(
     camera = camera_at(state.opened, state.prefix)
     estimate, person_m = choice.settled(provenance_of(state.opened, camera.ground_plane))
     parameters: dict[str, Any] = {} if person_m == PERSON_HEIGHT_M else {"person_height_m": person_m}
-    width, height = (int((seen.xywh[:, at] + seen.xywh[:, at + 2]).max().round()) for at in (0, 1))
+    ends = seen.xywh[:, :2] + seen.xywh[:, 2:]
+    width, height = (int(end) for end in np.clip(ends.max(axis=0).round(), 1, np.iinfo(np.uint32).max))
     plane: GroundPlane | None = None
     if not estimate:
         parameters["fit_plane"] = False
