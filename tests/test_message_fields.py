@@ -573,6 +573,22 @@ def test_json_needs_no_schema(tmp_path):
     assert "messages of JSON are read by the names of their fields" in dict(said)["fields"]
 
 
+def test_json_may_begin_with_what_is_none_and_have_numbers_for_stamps_and_unsigned_ids(tmp_path):
+    thing = {"label": "person", "pos_x": 1.5, "pos_y": -2.25, "id": 2**64 - 1}
+    payload = json.dumps({"timestamp": START_NS / 1e9, "objects": [thing]}).encode()
+    with recorder(tmp_path / "a.mcap") as writer:
+        channel = writer.register_channel("/seen", "json", 0)
+        for number, data in enumerate([b"{", payload, payload]):
+            writer.add_message(channel, START_NS + number * 10**8, data, START_NS)
+    found, said = read(tmp_path / "a.mcap")
+    assert [(frame.t_ns, len(frame.rows)) for frame in found.frames] == [
+        (START_NS + n * 10**8, n > 0) for n in range(3)
+    ]
+    assert {row["source_id"] for frame in found.frames for row in frame.rows} == {0}
+    assert "have no stamp" in dict(said)["clock"]
+    assert "it counts as empty" in dict(said)["lost"]
+
+
 POSES = [{"position": {"x": float(n), "y": 2.0, "z": 0.0}, "orientation": {"w": 1.0}} for n in range(3)]
 
 

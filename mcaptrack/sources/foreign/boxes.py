@@ -247,7 +247,7 @@ def _samples(
     most: int = _TRIED,
     is_enough: Callable[[Any], bool] = lambda _: True,
 ) -> list[Any]:
-    """The first messages of a channel, converted, up to one that can't be read.
+    """The first messages of a channel, converted, without those that can't be read.
 
     If none of them is enough, as where a scene is empty at first, longer ones of those after them follow, up to one
     that is.
@@ -261,10 +261,11 @@ def _samples(
             if not is_first and (has_enough or size > _SEARCHED_BYTES):
                 break
             if is_first or length > longest:
-                out.append(decode(message.payload))
-                longest, has_enough = max(longest, length), has_enough or is_enough(out[-1])
+                with suppress(McaptrackError):  # reading the channel says why
+                    out.append(decode(message.payload))
+                    longest, has_enough = max(longest, length), has_enough or is_enough(out[-1])
     except McaptrackError:
-        pass  # reading the channel says why
+        pass  # of a type that can't be decoded at all
     return out
 
 

@@ -823,7 +823,7 @@ def identity(value: Any) -> int | str | None:
         return value or None
     if isinstance(value, np.ndarray | bytes | list):
         return to_bytes(value).hex()
-    return integer(value)
+    return str(value) if isinstance(value, int) and value >= 2**63 else integer(value)  # some are unsigned
 
 
 def message_heads(messages: Things, owner: Ints, things: Things) -> tuple[Ints, Any]:

@@ -76,12 +76,15 @@ class Things:
         return np.array([number(value) for value in self.values(path)], np.float64)
 
     def stamps(self, path: Path) -> Ints:
-        """The times of a field in ns (N,); 0 where it is missing. Raises ValueError if it holds no times."""
+        """The times of a field in ns (N,); 0 where it is missing, or a number without a unit.
+
+        Raises ValueError if it holds no times.
+        """
         out = []
         for thing, value in zip(self._objects, self.values(path), strict=True):
             if value is None and _value(thing, path[:-1]) is not None:
                 raise AttributeError(name=path[-1])  # a head without a time
-            out.append(0 if value is None else time_of(value))
+            out.append(0 if value is None or isinstance(value, int | float) else time_of(value))
         return np.array(out, np.int64)
 
     def members(self, path: Path) -> tuple[Ints, Things]:
@@ -156,6 +159,8 @@ class Columns(Things):
 
         column = self._column(path)
         if column is None and not self.has(path):
+            return np.zeros(self._count, np.int64)
+        if column is not None and (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
             return np.zeros(self._count, np.int64)
         if column is None or not pa.types.is_timestamp(column.type):
             raise ValueError(f"{'.'.join(path)} is no time")
