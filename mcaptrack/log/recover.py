@@ -361,7 +361,7 @@ class _Recovery:
         with suppress(Damaged):
             footers = (record for record in walk(self._buffer, at, len(self._buffer)) if record.opcode == Opcode.FOOTER)
             end = next((record.end + len(MAGIC) for record in footers), at)
-            if self._buffer[end : end + len(MAGIC)] == MAGIC:
+            if bytes(self._buffer[end : end + len(MAGIC)]) == MAGIC:
                 self._report_lost(end, len(self._buffer), "another log follows; cut the file in two there")
 
     def _words(self, at: int, why: str) -> str:

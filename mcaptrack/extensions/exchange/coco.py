@@ -232,7 +232,7 @@ class _Images(NamedTuple):
         """Set the facts that a table has from them: its first frame, sizes of pictures and names of classes."""
         facts, frames = table.facts, self.by_id.values()
         facts.first_frame = min(frames, default=0)
-        facts.is_first_assumed = facts.first_frame > 0
+        facts.is_first_assumed, facts.is_in_order = facts.first_frame > 0, self.order == _BY_LIST
         sizes = {
             frame: (as_float(image["width"]), as_float(image["height"]))
             for frame, image in zip(frames, self.entries, strict=True)

@@ -108,6 +108,7 @@ class PictureFormat(Format):
         frames = np.array(numbers, np.int64)
         table.frame, facts.labelled = frames[table.frame.astype(np.int64)], np.unique(frames)
         facts.first_frame, facts.is_first_assumed = int(frames.min()), int(frames.min()) > 0
+        facts.is_in_order = by == "order"
         facts.region = "DontCare" if table.aside is not None else ""
         sizes = ((frame, picture.size) for frame, picture in zip(frames.tolist(), pictures, strict=True))
         facts.measure({frame: size for frame, size in sizes if size is not None}, len(pictures))

@@ -74,6 +74,7 @@ class Yolo(Format):
         if np.isfinite(rows[:, 5]).any() and not np.isfinite(rows[:, 6]).any():
             remarks.append(f"{folder}: column 6 holds {'confidences' if np.isfinite(score).any() else 'track ids'}")
         facts = LabelFacts(folder, is_normalised=True, first_class=0, labelled=np.array(sorted(numbers), np.int64))
+        facts.is_in_order = by == "order"
         facts.states_labelled = 0 in counts  # others write no files without boxes
         table = BoxTable(
             facts=facts, at=at, frame=frame, id=track_id, score=score, class_id=rows[:, 0], remarks=remarks,

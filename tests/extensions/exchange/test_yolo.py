@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from mcaptrack import notices
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange import pictures, yolo
 from mcaptrack.sources.ingest.labels.reading import read_labels
+from mcaptrack.sources.ingest.labels.timeline import Timeline
 from tests.label_cases import Row, Writer, by_frame, number, shares
 
 
@@ -112,6 +115,10 @@ def test_names_of_classes_are_beside_the_labels_or_above(files, named_by, names,
 def test_a_folder_of_labels_has_no_more_than_its_limits(tmp_path, monkeypatch):
     folder_of(tmp_path, {"b.txt": ROW, "a.txt": f"{ROW}\n", "readme.txt": "x"})
     assert read_labels(tmp_path, role="detections").remarks[0].endswith("2 files, frames are numbered by their order")
+    pictures_of = Timeline(np.arange(3), np.arange(3) * 10, "the pictures")
+    with notices.listening(lambda _: None), notices.collected() as warned:
+        pictures_of.place(read_labels(tmp_path, role="detections"), "detections", [])
+    assert "has 2 pictures without numbers, and the pictures are 3: they are taken as the first" in warned[0].message
     monkeypatch.setattr(yolo, "MAX_ROWS", 2)
     monkeypatch.setattr(pictures, "_MAX_PICTURES", 3)
     assert len(read_labels(tmp_path, role="detections").frame) == 2

@@ -58,6 +58,8 @@ class LabelFacts:
         The number of the first picture; None until it is known.
     is_first_assumed : bool
         Whether the source doesn't tell it.
+    is_in_order : bool
+        Whether frames are numbered by the order of their names, which hold no numbers of frames.
     times_s : float array (F,), optional, s
         Rising times of labelled frames, if the source has times; its frames are then places in them.
     is_timed : bool
@@ -106,6 +108,7 @@ class LabelFacts:
     found_by: str = ""
     first_frame: int | None = None
     is_first_assumed: bool = False
+    is_in_order: bool = False
     times_s: Floats | None = None
     is_timed: bool = False
     fps: Fraction | None = None

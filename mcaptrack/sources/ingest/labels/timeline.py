@@ -141,6 +141,11 @@ class Timeline:
         path = labels.path
         if labels.times_s is not None:
             return self._place_by_time(labels, labels.times_s, role, ranges)
+        if labels.facts.is_in_order and len(labels.labelled) < len(self.index):
+            text = f"{path} has {len(labels.labelled)} pictures without numbers, and {self.of} are {len(self.index)}"
+            warn(
+                f"{text}: they are taken as the first of these; one without labels would shift those after it", "clock"
+            )
         every = self._every(labels)
         frame, count = labels.extent.frames
         end = int(self.index[-1]) + 1
