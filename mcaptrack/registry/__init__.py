@@ -83,7 +83,7 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
-    "demo ingest run view info detect motion track sample predict retrack query export cut "
+    "demo ingest run view info detect motion track sample predict retrack export cut "
     "evaluate events check recover drop doctor"
 )
 #: Kinds that only entry points name.

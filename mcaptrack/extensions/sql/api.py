@@ -28,7 +28,7 @@ else:
 QUERY: Final = "Query and answer"
 
 
-@declared(heading="Results", printed_by="mcaptrack.cli.query:Query")
+@declared(heading="Results", printed_by="mcaptrack.extensions.sql.command:Query")
 def query(
     log: Annotated[
         PathLike | Sequence[PathLike],
@@ -88,7 +88,7 @@ def query(
     {'found': [True]}
 
     """
-    from mcaptrack.tables.sql import Database
+    from mcaptrack.extensions.sql.database import Database
 
     named = {name: as_path(path) for name, path in (files or {}).items()}
     with Database(locations_of(log), named) as database:
@@ -207,7 +207,7 @@ def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, 
     paths = locations_of(log)
     if not paths:
         return TableList(tables, (), ())
-    from mcaptrack.tables.sql import Database
+    from mcaptrack.extensions.sql.database import Database
 
     with Database(paths, {name: as_path(path) for name, path in (files or {}).items()}) as database:
         return TableList(tables, database.recordings, database.channels)
