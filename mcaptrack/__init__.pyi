@@ -92,6 +92,7 @@ __version__: str
 SCHEMA_VERSION: int
 
 # What extensions have beside these, for the message that names what is missing:
+# crew dask: mcaptrack.extensions.dask
 # detector onnx: mcaptrack.extensions.networks
 # detector yolox-nano: mcaptrack.extensions.networks
 # detector yolox-s: mcaptrack.extensions.networks
