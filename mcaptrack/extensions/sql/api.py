@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.common import as_path, detail, locations_of
@@ -13,16 +14,7 @@ from mcaptrack.api.options import PathLike
 if TYPE_CHECKING:
     import pyarrow as pa
 else:
-
-    class _Arrow:
-        """pyarrow: imported when the types of annotations are asked for, and not for help."""
-
-        def __getattr__(self, name: str) -> object:
-            import pyarrow
-
-            return getattr(pyarrow, name)
-
-    pa = _Arrow()
+    pa = SimpleNamespace(Table=object)  # help doesn't import pyarrow
 
 #: Heading of options in the help.
 QUERY: Final = "Query and answer"
