@@ -20,11 +20,6 @@ from mcaptrack.api.health import doctor as doctor
 from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.messages import DecodedMessage as DecodedMessage
-from mcaptrack.api.querying import ColumnInfo as ColumnInfo
-from mcaptrack.api.querying import TableInfo as TableInfo
-from mcaptrack.api.querying import TableList as TableList
-from mcaptrack.api.querying import list_tables as list_tables
-from mcaptrack.api.querying import query as query
 from mcaptrack.api.reading import FetchedMessage as FetchedMessage
 from mcaptrack.api.recording import Recording as Recording
 from mcaptrack.api.recording import open as open  # noqa: A004
@@ -65,6 +60,11 @@ from mcaptrack.extensions.report.api import report as report
 from mcaptrack.extensions.review.api import Review as Review
 from mcaptrack.extensions.review.api import ReviewResult as ReviewResult
 from mcaptrack.extensions.review.api import review as review
+from mcaptrack.extensions.sql.api import ColumnInfo as ColumnInfo
+from mcaptrack.extensions.sql.api import TableInfo as TableInfo
+from mcaptrack.extensions.sql.api import TableList as TableList
+from mcaptrack.extensions.sql.api import list_tables as list_tables
+from mcaptrack.extensions.sql.api import query as query
 from mcaptrack.extensions.training.api import train as train
 from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
@@ -92,6 +92,7 @@ __version__: str
 SCHEMA_VERSION: int
 
 # What extensions have beside these, for the message that names what is missing:
+# crew dask: mcaptrack.extensions.dask
 # detector onnx: mcaptrack.extensions.networks
 # detector yolox-nano: mcaptrack.extensions.networks
 # detector yolox-s: mcaptrack.extensions.networks

@@ -23,7 +23,7 @@ from mcaptrack.location import SCHEMES, Location, Url, hide_secrets, shortened
 from mcaptrack.processes import MARK_DIGITS, has_ended, mark_of
 
 __all__ = [
-    "follow_links", "is_same_file", "missing", "place_of", "publish_bytes", "read_beginning", "read_json",
+    "follow_links", "is_same_file", "missing", "place_of", "publish", "publish_bytes", "read_beginning", "read_json",
     "refuse_overwrite", "refuse_special", "temporary_folder", "unreadable", "visible",
 ]  # fmt: skip
 

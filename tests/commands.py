@@ -21,7 +21,7 @@ from tests.worlds import write_clip
 
 GROUP = get_command(app)
 #: Commands that change no file except the one that -o names.
-ONLY_READ = ("check", "docs", "doctor", "evaluate", "info", "query", "view")
+ONLY_READ = ("check", "docs", "doctor", "evaluate", "info", "view")
 
 
 class Outcome(NamedTuple):

@@ -164,7 +164,6 @@ READING: dict[str, Callable[[Path, Path], list[object]]] = {
     "export": lambda log, out: [log, "-o", out / "tables"],
     "info": lambda log, out: [log],
     "ingest": lambda log, out: [log, "-o", out / "ingested.mcap"],
-    "query": lambda log, out: [log, "select count(*) from tracks"],
     "recover": lambda log, out: [log, "-o", out / "recovered.mcap"],
     "view": lambda log, out: [log, "--layout", "no such layout"],
     **{

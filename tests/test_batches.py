@@ -21,7 +21,6 @@ SEVERAL = {
 }
 #: Commands that make one thing of all their inputs: without one of them it would be another thing, so they refuse.
 COMBINING = {name for name in SEVERAL if "jobs" not in GROUP.commands[name].settings}
-WORDS = {"query": ["select 1"]}
 
 
 @pytest.fixture
@@ -73,7 +72,7 @@ def test_a_command_that_combines_inputs_needs_all_of_them(folder):
     before = sorted(folder.rglob("*"))
     for command in sorted(COMBINING & READING.keys()):
         name = {"cut": "out.mcap", "tune": "out.toml"}.get(command, "out.html")
-        outcome = call(command, "a.mcap", "broken.mcap", *WORDS.get(command, []), "-o", name)
+        outcome = call(command, "a.mcap", "broken.mcap", *of_extensions("NEEDS").get(command, ()), "-o", name)
         assert (outcome.code, outcome.out) == (1, "")
         assert "broken.mcap" in outcome.err
         assert sorted(folder.rglob("*")) == before

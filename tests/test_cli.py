@@ -237,7 +237,11 @@ def test_the_demonstration(tmp_path, monkeypatch):
         f"layouts  {'  '.join(f'{folder}/demo{end}.layout.json' for end in ('', '.comparing', '.predictions'))}",
         f"tables   {folder / 'demo.tables'}",
     ]
-    assert (more[0].split()[0], more[1], len(more)) == ("Open", "See more:", 6 + ("report" in GROUP.commands))
+    assert (more[0].split()[0], more[1], len(more)) == (
+        "Open",
+        "See more:",
+        5 + len({"report", "query"} & {*GROUP.commands}),
+    )
     scored = json.loads(
         printed("evaluate", folder / "demo.mcap", "--similarity", "metres", "--gate-m", "1", "--json")[0]
     )

@@ -22,6 +22,7 @@ from mcaptrack.location import parse
 from mcaptrack.objects import trial
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call, done
+from tests.extension_cases import of_extensions
 from tests.logs import some_log
 from tests.tiers import one_in, thorough
 
@@ -77,8 +78,8 @@ def test_commands_give_the_same_of_a_store_as_of_a_file(store, template):
     for words in (["info", "--json"], ["check", "--json"], ["evaluate", "--json"]):
         ours, theirs = (done(words[0], log, *words[1:]).out for log in (path, url))
         assert theirs == ours.replace(str(path), url)
-    sql = "select * from tracks order by all"
-    assert done("query", url, sql, "--json").out == done("query", path, sql, "--json").out
+    for command, words in of_extensions("ANSWERS").items():
+        assert done(command, url, *words, "--json").out == done(command, path, *words, "--json").out
     done("export", path)
     done("export", url)
     names = {str(file.relative_to("here/a.tables")) for file in Path("here").rglob("*.parquet")}

@@ -39,7 +39,7 @@ COMMANDS = GROUP.commands
 #: its own.
 LONG = {
     "README.md", "camera-motion.md", "corrections.md", "demo.md", "extend.md", "fleet.md", "python.md", "results.md",
-    "robots.md", "sql.md", "stages.md", "troubleshooting.md", "tutorial.md",
+    "robots.md", "stages.md", "troubleshooting.md", "tutorial.md",
 }  # fmt: skip
 #: What a page finds where it names it: a copy of a prepared file or folder.
 PREPARED = {

@@ -243,7 +243,6 @@ USES = {
         "evaluate tall.txt --truth truth.txt --ground-plane plane.txt",
     ],
     "events": ["events a.mcap --similarity iou", "events a.mcap --similarity metres"],
-    "query": ["query a.mcap 'from events'", "query a.mcap 'from events' --format csv", "query a.mcap --tables"],
     "ingest": [
         "ingest truth.txt --fps 10 --as truth",
         "ingest truth.txt --fps 10 --as truth --ground-plane plane.txt",

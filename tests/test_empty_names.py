@@ -97,6 +97,6 @@ def test_the_library_refuses_every_empty_name():
             with pytest.raises(McaptrackError, match="is an empty name"):
                 function(**{**others, parameter: empty})
         tried.add(f"{name}.{parameter}")
-    assert {"open.path", "drop.log", "drop.output", "run.output", "query.files"} <= tried
+    assert {"open.path", "drop.log", "drop.output", "run.output"} <= tried
     with pytest.raises(McaptrackError, match=r"is an empty name|an empty name is no file"):
         fleet.run(mcaptrack.check, (name for name in ["b.mcap", ""]))

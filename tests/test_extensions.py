@@ -825,7 +825,7 @@ class Format:
     def recognises(self, path: Path) -> bool:
         if self.breaks == "junk":
             return bool(path.read_text("utf-8"))
-        return self.breaks != "other" and path.suffix == ".numbers"
+        return self.breaks == "any" or (self.breaks != "other" and path.suffix == ".numbers")
 
     def read(self, path: Path) -> LabelBoxes:
         self.seen += 1
@@ -928,6 +928,7 @@ FORMAT_LAWS = {
     "state": "pure: the same file gives other boxes", "file": "pure: ", "folder": "process: .* the working folder",
     "empty": "damaged: an empty file raises IndexError", "cut": "damaged: .* raises KeyError",
     "other": "recognises: it doesn't", "junk": "recognises: .*UnicodeDecodeError",
+    "any": "recognises: it takes a file of noise",
 }  # fmt: skip
 READER_LAWS = {
     "space": "declares: ", "boxes": "conforms: .* a box can't be", "ground": "conforms: .* a box can't be",
@@ -1002,6 +1003,20 @@ def test_a_class_in_the_place_of_an_object_is_refused():
             check(part, [])
         with pytest.raises(LawError, match="has no method"):
             check(SimpleNamespace(), [])
+
+
+def test_a_file_that_is_not_there_is_one_line():
+    for check in (
+        partial(testing.check_label_format, Format()),
+        partial(testing.check_recording_format, Recordings()),
+        partial(testing.check_exporter, Export()),
+        partial(testing.check_finisher, silent),
+        partial(testing.check_report_section, silent),
+        partial(testing.check_scene_maker, silent),
+    ):
+        with pytest.raises(McaptrackError, match=r"none\.mcap does not exist") as refusal:
+            check("none.mcap")
+        assert "\n" not in str(refusal.value)
 
 
 @declared()
@@ -1096,6 +1111,9 @@ def test_the_check_of_a_finisher_and_of_a_section_names_the_law(site, finished, 
     else:
         check = partial(testing.check_report_section, module.lengths, finished)
     check()
+    if part == "crowded":
+        with pytest.raises(LawError, match=r"declares: .* can't have its name: the result of run has next"):
+            check(name="next")
     monkeypatch.setattr(module, replaced, by, raising=False)
     with pytest.raises(LawError, match=said):
         check()

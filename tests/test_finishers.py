@@ -18,8 +18,10 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.api.finishing import PartsOfRun
+from mcaptrack.api.running import OF_JSON
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
+from mcaptrack.registry import others
 from mcaptrack.schema import TRACKS
 from tests.commands import done
 from tests.logs import provenance_of
@@ -187,20 +189,27 @@ def test_a_finisher_cannot_have_the_name_of_a_command_of_the_core(site):  # noqa
     assert "there is a command track; rename it" in plugins["finisher track (another 2.0)"]
 
 
-def test_a_finisher_with_a_name_of_the_result_is_left_out_and_one_that_comes_late_is_named(site, monkeypatch):  # noqa: F811
+@pytest.mark.parametrize("name", ["frames", "next"])
+def test_a_finisher_with_a_name_of_the_result_is_left_out_and_one_that_comes_late_is_named(site, name):  # noqa: F811
     parts = PartsOfRun()
-    add(site, "finisher", "frames", CODE)
+    add(site, "finisher", name, CODE)
     for finishers, why in (
-        (parts, "finisher frames was installed after run was imported; it is left out"),
+        (parts, f"finisher {name} was installed after run was imported; it is left out"),
         (
             PartsOfRun(),
-            "finisher frames (another 2.0) can't have its name: the result of run has frames; it is left out",
+            f"finisher {name} (another 2.0) can't have its name: the result of run has {name}; it is left out",
         ),
     ):
         finishers.options(())
         with collected() as warnings:
-            assert "frames" not in {step.name for step in finishers.finishers({}, False)}
+            assert name not in {step.name for step in finishers.finishers({}, False)}
         assert [notice.message for notice in warnings] == [why]
+
+
+def test_no_key_of_the_json_of_a_run_can_be_the_name_of_a_finisher(finished):
+    (said,) = json.loads(done("run", finished, "--no-tables", "--json").out)["results"]
+    assert {"next", "log", "summary"} <= said.keys()
+    assert said.keys() <= {*mcaptrack.RunResult.__dataclass_fields__, *OF_JSON, *others("finisher")}
 
 
 def test_nothing_is_asked_of_packages_for_names_that_python_looks_up(finished, monkeypatch):

@@ -25,6 +25,7 @@ from mcaptrack.cli.stages import shown_default
 from mcaptrack.registry import own
 from mcaptrack.transforms import STAGES
 from tests.commands import GROUP, call
+from tests.extension_cases import of_extensions
 from tests.tiers import one_in
 
 ROOT = Path(__file__).parent.parent
@@ -232,8 +233,7 @@ def documented() -> list[Bounded]:
 
 BOUNDED = documented()
 #: What commands are given, in which none finds anything to do, so that each ends at once with 1.
-WORDS = dict.fromkeys(COMMANDS, ("none.mcap",)) | {
-    "query": ("none.mcap", "select 1"),
+WORDS = {name: ("none.mcap", *of_extensions("NEEDS").get(name, ())) for name in COMMANDS} | {
     "demo": ("-o", str(ROOT / "README.md")),
 }
 

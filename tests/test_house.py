@@ -282,3 +282,23 @@ def test_a_part_with_a_file_of_a_missing_extension_is_named(tmp_path):
     for words in ("detect a.mcap --detector onnx:a.onnx", "predict a.mcap --predictor onnx:a.onnx"):
         assert said("-m", "mcaptrack", *words.split()) == (1, f"mcaptrack: {why}")
     assert said("-c", MAKE_AGAIN) == (0, f"detector onnx made it; {why}{why}")
+
+
+TOOLS = [path for path in (ROOT / "tools").rglob("*.py") if re.search(r"^from mcaptrack\.ext", path.read_text(), re.M)]
+
+
+@pytest.mark.parametrize("has_points", [False, True])
+def test_a_tool_about_a_missing_extension_ends_with_one_line(tmp_path, has_points):
+    for path in TOOLS:
+        before = path.read_text().partition("from mcaptrack.extensions")[0]
+        assert re.search(r"^import (tools\.)?missing_extension  # noqa", before, re.M), path
+    house_without(["review"], tmp_path)
+    if has_points:
+        points = tmp_path / "mcaptrack-1.dist-info" / "entry_points.txt"
+        points.write_text(
+            points.read_text() + "\n[mcaptrack.commands]\nreview=mcaptrack.extensions.review.api:review\n"
+        )
+    done = subprocess.run([sys.executable, ROOT / "tools" / "second_look.py", "-h"], env={"PYTHONPATH": str(tmp_path)},
+                          capture_output=True, text=True, check=False)  # fmt: skip
+    why = "review is an extension that isn't installed; install mcaptrack again, with mcaptrack/extensions/review\n"
+    assert (done.returncode, done.stderr) == (1, why)

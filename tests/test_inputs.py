@@ -13,6 +13,7 @@ import pytest
 from mcaptrack.cli.common import refuse_url
 from mcaptrack.errors import McaptrackError
 from tests.commands import GROUP, call
+from tests.extension_cases import of_extensions
 
 COMMANDS = GROUP.commands
 
@@ -21,7 +22,7 @@ def takes_paths(command: str) -> list[Any]:
     """Return the parameters of a command that have type Path, except config, which is read earlier."""
     parameters = inspect.signature(COMMANDS[command].callback).parameters
     paths = {name for name, one in parameters.items() if "Path" in str(one.annotation)} - {"config"}
-    return [p for p in COMMANDS[command].params if p.name in paths or (command, p.name) == ("query", "words")]
+    return [p for p in COMMANDS[command].params if p.name in paths or (p.name == "words" and "LOG" in p.metavar)]
 
 
 PATHS = [(name, parameter) for name in COMMANDS for parameter in takes_paths(name)]
@@ -33,7 +34,7 @@ def words_with(name: str, parameter: Any, value: str) -> list[str]:
     for other in COMMANDS[name].params:
         if other.param_type_name == "argument":
             words.append(value if other.name == parameter.name else "a.txt")
-            words += ["select 1"] if (name, other.name) == ("query", "words") else []
+            words += of_extensions("ANSWERS").get(name, ())
     return [*words, parameter.opts[0], value] if parameter.param_type_name == "option" else words
 
 
@@ -56,7 +57,7 @@ def test_a_url_is_refused_as_a_url(tmp_path, monkeypatch):
 
 
 #: Arguments that are logs, which may be in a store, beside those that are called so.
-LOGS = {("query", "words"), ("evaluate", "inputs")}
+LOGS = {*((name, "words") for name in COMMANDS), ("evaluate", "inputs")}
 
 
 def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch):

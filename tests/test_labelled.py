@@ -275,7 +275,8 @@ def test_options_of_label_files_are_the_same_in_every_command():
 def test_tables_say_which_frames_were_labelled(tmp_path, clip):
     path = tmp_path / "log.mcap"
     mcaptrack.ingest(clip, path, truth=mot(tmp_path / "gt.txt", PART), tracks=mot(tmp_path / "tr.txt", range(PICTURES)))
-    row = mcaptrack.query(path, "select source, warning_texts from recordings").to_pylist()[0]
+    with mcaptrack.open(path) as opened:
+        (row,) = opened.table("recordings").to_pylist()
     assert (
         json.loads(row["source"])["/camera/truth"] | {"frames": "21:31", "frames_by": "labels"}
         == json.loads(row["source"])["/camera/truth"]

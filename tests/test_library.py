@@ -44,7 +44,7 @@ METHODS = {
 }
 SECTIONS = ["Parameters", "Returns", "Raises", "Examples"]
 #: Optional packages that examples need.
-NEEDS = {"train": "torch", "query": "duckdb", "list_tables": "duckdb", "Recording.supervision": "supervision"}
+NEEDS = {"train": "torch", "Recording.supervision": "supervision"} | of_extensions("PACKAGES")
 
 
 def sections_of(function) -> tuple[list[str], list[str]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.clocks import parse_ns
@@ -77,8 +78,9 @@ def test_tables_leave_out_what_they_can_t_hold_and_say_so(tmp_path):
     write_stock(theirs, [*SOME, *LATE])
     outcome = done("export", theirs, "-o", tmp_path / "tables")
     assert "recordings: messages are later than the year 2262, which tables can't hold" in outcome.err
-    answer = done("query", theirs, "select start_t_ns, end_t_ns, messages from recordings", "--json")
-    assert json.loads(answer.out)["results"] == [{"start_t_ns": 5, "end_t_ns": None, "messages": 9}]
+    with mcaptrack.open(theirs) as opened:
+        (row,) = opened.table("recordings").to_pylist()
+    assert (row["start_t_ns"], row["end_t_ns"], row["messages"]) == (5, None, 9)
     refused = call("export", theirs, "--topic", "a", "-o", tmp_path / "tables")
     assert refused.code == 1
     assert f"a has 1 messages later than the year 2262, the first at {LOG_MAX_NS} ns" in refused.err

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from tests.commands import GROUP
+from tests.extension_cases import of_extensions
 from tests.tiers import one_in, thorough
 
 #: Forks a process for each line of JSON on stdin, and prints its exit code. What streams become is as a shell does it.
@@ -70,8 +71,7 @@ LINES = [
     "run a.mcap a.mcap clip.mp4 --force --json --log-format json",
     "info a.mcap",
     "check a.mcap",
-    "query a.mcap 'select * from tracks' --format csv",
-    "query a.mcap 'select * from tracks'",
+    *of_extensions("PRINTING"),
     "evaluate a.mcap --json",
     "export a.mcap -o T --json",
     "docs",

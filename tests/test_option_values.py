@@ -7,13 +7,11 @@ import io
 import json
 import logging
 import sys
-from contextlib import redirect_stdout
 from contextvars import copy_context
 from datetime import date
 from pathlib import Path
 from typing import Any, Literal
 
-import pyarrow as pa
 import pytest
 
 import mcaptrack
@@ -178,16 +176,18 @@ def test_options_that_concern_a_single_log_make_it_one_of_many(monkeypatch):
 # What commands give to the functions of the same names
 
 
-FIRST = {"drop": ["x.mcap", "/a"], "demo": [], "query": ["x.mcap", "select 1"]}
+FIRST = {"drop": ["x.mcap", "/a"], "demo": []} | {
+    name: ["x.mcap", *words] for name, words in of_extensions("NEEDS").items()
+}
 
 
 @pytest.mark.parametrize("twice", [["-o", "a.html", "-ob.html"], ["--output=a.html", "-o", "b.html"]])
 def test_an_option_of_one_value_is_not_given_two(folder, twice):
-    outcome = call("query", "x.mcap", *twice)
+    outcome = call("evaluate", "x.mcap", *twice)
     assert (outcome.code, "--output is given as a.html and as b.html; give one" in outcome.err) == (2, True), (
         outcome.err
     )
-    assert "can't be" in call("query", "x.mcap", "-o", "a.html", "-o", "a.html", "--", "-ob.html").err
+    assert "can't be" in call("evaluate", "x.mcap", "-o", "a.html", "-o", "a.html", "--", "-ob.html").err
 
 
 def test_patterns_are_replaced_by_files_in_order_without_results_of_logs_that_are_there(tmp_path, monkeypatch):
@@ -254,7 +254,7 @@ WORDS = {
     "`mcaptrack.run('-a.mcap')`": "`mcaptrack run ./-a.mcap`",
     "`mcaptrack.run('a.mcap', force=True)`": "`mcaptrack run a.mcap --force`",
     "`mcaptrack.track('a.mcap', max_age_s=2.0)`": "`mcaptrack track a.mcap --max-age-s 2.0`",
-    "`mcaptrack.list_tables('a.mcap')`": "`mcaptrack query a.mcap --tables`",
+    **of_extensions("SAID"),
     "`mcaptrack.no_such('a.mcap', size=2)`": "`mcaptrack no_such a.mcap --size 2`",
     "`mcaptrack.run(path)`": "`mcaptrack.run(path)`",
     "`mcaptrack.run(**x)`": "`mcaptrack.run(**x)`",
@@ -285,7 +285,7 @@ def test_words_of_the_library_become_words_of_the_command_line():
 # Where it is printed
 
 
-@pytest.mark.parametrize(("command", "more"), [("evaluate", []), ("query", ["select count(*) from tracks"])])
+@pytest.mark.parametrize(("command", "more"), [("evaluate", []), *of_extensions("ANSWERS").items()])
 def test_output_writes_what_would_be_printed(command, more, finished, tmp_path):
     target = tmp_path / "out.txt"
     for form in ([], ["--json"]):
@@ -308,29 +308,12 @@ def test_a_score_at_the_limit_passes(finished):
     assert call(*words, "--fail-under", f"MOTA={one['MOTA'] + 1e-4!r}").code == 4
 
 
-def test_a_terminal_shows_sixty_rows_of_an_answer_and_a_pipe_all(folder, monkeypatch, terminal):
-    answer = pa.table({"n": pa.array(range(61), pa.int64()), "word": ["a\x1b[31m"] * 61})
-    monkeypatch.setattr(mcaptrack, "query", lambda log, sql, **_: answer)
-
-    def on_screen(*words: str) -> str:
-        screen = Terminal()
-        with redirect_stdout(screen), pytest.raises(SystemExit):
-            GROUP.main(["query", "x.mcap", "select 1", *words], prog_name="mcaptrack")
-        return screen.shown()
-
-    for words, rows in (((), 60), (("--rows", "0"), 61), (("--rows", "5"), 5)):
-        assert len(on_screen(*words).splitlines()) - 2 == rows
-    assert r'0,"a\x1b[31m"' in on_screen("--format", "csv")  # data keep what a terminal would act on elsewhere
-    assert '0,"a\x1b[31m"\n' in call("query", "x.mcap", "select 1", "--format", "csv").out
-    assert len(call("query", "x.mcap", "select 1").out.splitlines()) == 63
-
-
 def test_a_page_is_drawn_on_a_terminal_and_printed_as_it_is_elsewhere(monkeypatch, terminal):
     monkeypatch.setattr("sys.stdout", terminal)
     with pytest.raises(SystemExit):
-        GROUP.main(["docs", "sql"], prog_name="mcaptrack")
+        GROUP.main(["docs", "tables"], prog_name="mcaptrack")
     assert "```" not in terminal.shown()
-    assert " SQL " in terminal.shown().splitlines()[0]
+    assert " Tables " in terminal.shown().splitlines()[0]
 
 
 def test_progress_is_shown_on_a_terminal_only(monkeypatch, terminal):

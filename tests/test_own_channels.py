@@ -231,8 +231,6 @@ class TestSchemas:
         facts = {f.name: (f.metadata[b"unit"], f.metadata[b"description"]) for f in table.schema}
         assert (facts["lon"], facts["speed_m_per_s"][0]) == ((b"deg", b"east of Greenwich"), b"m/s")
         assert (table["lon"].to_pylist(), table["satellites"].to_pylist()) == ([None, 5.0], [0, 0])
-        answer = mcaptrack.query(path, 'select lat from "/gps" where lon is null')
-        assert answer.to_pydict() == {"lat": [2.0]}
 
     UNFIT = [
         ({"columns": [("name", "U5")]}, "the column name holds text, lists or objects.*np.unique"),
@@ -448,9 +446,6 @@ class TestWriting:
         assert mcaptrack.check(path).findings == ()
         exported = mcaptrack.export(path)
         assert (exported.rows["topics/gps.speed"], exported.rows["topics/camera.speed"]) == (2, 2)
-        assert mcaptrack.query(exported.folder, 'select sum(speed_m_per_s) as v from "/gps/speed"').to_pydict() == {
-            "v": [1.0]
-        }
         with mcaptrack.open(path) as opened:
             assert {topic: opened.array(topic).tobytes() for topic in own} == own
         assert mcaptrack.drop(path, ["/gps/speed", "/camera/speed"]).dropped == ("/camera/speed", "/gps/speed")

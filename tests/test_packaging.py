@@ -136,7 +136,7 @@ def said() -> list[tuple[str, str]]:
 
 def test_pages_that_help_and_errors_name_are_in_the_wheel(shipped):
     named = [(where, page) for where, text in said() for page in re.findall(r"`mcaptrack docs (\w+)`", text)]
-    assert {page for _, page in named} >= {"tables", "sql"}
+    assert {page for _, page in named} >= {"tables", "options"}
     for where, page in named:
         assert {f"mcaptrack/docs/{name}.md" for name in (page, page.upper(), f"extensions/{page}")} & shipped, where
 
@@ -159,13 +159,13 @@ def test_the_pages_are_listed_and_printed_as_they_were_written():
     listed = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert (code, next(iter(listed))) == (0, "readme")
     assert set(listed) == {path.stem for path in PAGES} | {"readme", "changelog"}
-    assert listed["sql"] == "SQL"
+    assert listed["results"] == "Results"
     said = json.loads(call("docs", "--json")[1])
     assert {page["name"]: page["title"] for page in said["pages"]} == listed
-    text = (ROOT / "docs" / "sql.md").read_text()
-    for name in ("sql", "SQL.md", "docs/sql.md"):
+    text = (ROOT / "docs" / "results.md").read_text()
+    for name in ("results", "RESULTS.md", "docs/results.md"):
         assert call("docs", name)[1] == text
-    assert json.loads(call("docs", "sql", "--json")[1])["text"] == text
+    assert json.loads(call("docs", "results", "--json")[1])["text"] == text
 
 
 def test_pages_are_printed_with_their_generated_parts():

@@ -17,7 +17,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import pyarrow as pa
 import pytest
 
 import mcaptrack
@@ -115,7 +114,6 @@ def of_a_log(to: Transcript) -> None:
     to.run("evaluate a.mcap b.mcap --csv --similarity iou")
     to.run("evaluate a.mcap --json --similarity iou --topic /camera/tracks")
     to.run("evaluate a.mcap --fail-under IDF1=1.5 --fail-under mota=-1 --similarity iou --topic /camera/tracks")
-    to.run("query a.mcap 'select topic, count(*) as n from tracks group by all order by all'")
     to.took()
 
 
@@ -230,21 +228,6 @@ def of_upkeep(to: Transcript) -> None:
         to.run(f"recover x.mcap -o saved.mcap {more}".strip(), recover=saved)
 
 
-def of_answers(to: Transcript) -> None:
-    answer = pa.table({"n": [1, 1000], "word": ["a\x1b[31m", "x" * 70], "x": [0.5, None]})
-    for more in ("", "--rows 1", "--rows 1 -q", "--rows 1 --format csv", "--format jsonl", "--json"):
-        to.run(f"query x.mcap 'select 1' {more}".strip(), query=answer)
-    to.run("query x.mcap 'select 1'", query=answer.slice(0, 0))
-    to.run("query x.mcap 'select 1'", query=pa.table({"a": ["x" * 1001, "x" * 1000]}))
-    to.run("query --tables --rows 2 --format csv", list_tables=mcaptrack.TableList((), (), ()))
-    for line in ("--format parquet", "--format arrow", "--json --format csv", "--with a=", "-f none.sql", "-f bad.sql",
-                 "-f q.sql --tables", "-o x.mcap --force"):  # fmt: skip
-        query = "" if line.startswith("-f") else "'select 1' "
-        to.run(f"query x.mcap {query}{line}", query=answer)
-    for line in ("x.mcap", "", "'select 1'", "x.mcap FROM x", "x.mcap ';'"):
-        to.run(f"query {line}", query=answer)
-
-
 @contextmanager
 def fleets_end_with(*outcomes: LogOutcome[Any], stopped: str = "") -> Iterator[None]:
     """Let logs end like this, one after the other, instead of starting processes."""
@@ -315,7 +298,7 @@ def of_mistakes(to: Transcript) -> None:
 
 PARTS: Sequence[tuple[str, Callable[[Transcript], None]]] = (
     ("A log of labels", of_a_log), ("Runs and stages", of_runs), ("Contents", of_contents),
-    ("Check and recover", of_upkeep), ("Query", of_answers),
+    ("Check and recover", of_upkeep),
     ("Many logs", of_many_logs), ("Mistakes", of_mistakes),
 )  # fmt: skip
 

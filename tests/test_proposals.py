@@ -198,8 +198,6 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(
         "evaluate", "tracks.csv", "--truth", "truth.txt"
     ),
-    "tables/sql.py:_answer:list_tables": lambda s: s.says("query", "LOG", "show tables"),
-    "tables/sql.py:_worlds_answer:retrack": lambda s: s.says("query", "LOG", "--worlds", "select count(*) from tracks"),
     "sources/ingest/job.py:read:ingest": lambda s: (
         s.without("/camera/truth*").cubes().says("ingest", "clip.mp4", "--truth", "cubes.csv")
     ),
@@ -273,7 +271,7 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, reques
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(serving.Server, "serve_forever", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     verb = where.rpartition(":")[2]
-    verb = {"list_tables": "query", "get_model": "models"}.get(verb, verb)
+    verb = getattr(getattr(mcaptrack, verb, None), "done_by", ([verb],))[0][0]
     for extension, prepare in of_extensions("PREPARED").items():
         if where.startswith(f"extensions/{extension}/"):
             prepare(monkeypatch, tmp_path)

@@ -196,11 +196,8 @@ def test_what_transforms_and_boxes_lack_is_one_line(boxes, keep, count, words, t
     assert result.frames == {"/lidar/tracks": count}
     assert sum(words in line for line in said(result)) == 1, said(result)
     assert not any("\n" in line for line in said(result))
-    kept = (
-        mcaptrack.query(path, "select message from warnings where topic = '/lidar/tracks'")
-        .column("message")
-        .to_pylist()
-    )
+    with mcaptrack.open(path) as opened:
+        kept = [row["message"] for row in opened.table("warnings").to_pylist() if row["topic"] == "/lidar/tracks"]
     assert sum(words in line for line in kept) == 1
     assert not any(path.name in line for line in kept)
 
@@ -223,7 +220,8 @@ def test_boxes_without_any_known_pose_are_an_error_and_without_transforms_stay_i
 def test_times_are_stamps_and_tables_hold_the_boxes(tmp_path):
     path = write(tmp_path / "a.mcap", Robot(shots=3), WAYS["markers"])
     wanted = Robot(shots=3).wanted()
-    rows = mcaptrack.query(path, "select t_ns, class, x_m, source_id, x_px from detections order by t_ns, source_id")
+    with mcaptrack.open(path) as opened:
+        rows = opened.table("detections").sort_by([("t_ns", "ascending"), ("source_id", "ascending")])
     assert rows.column("t_ns").to_pylist() == [row["t_ns"] for row in wanted]
     assert rows.column("class").to_pylist() == [
         "person" if row["class"] == "pedestrian" else row["class"] for row in wanted

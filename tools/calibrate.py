@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+import missing_extension  # noqa: F401
 from reproduce import scenes
 
 from mcaptrack import log as logs

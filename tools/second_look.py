@@ -13,6 +13,8 @@ import argparse
 import warnings
 from pathlib import Path
 
+import missing_extension  # noqa: F401
+
 from mcaptrack import log
 from mcaptrack.evaluation.events import MatchRule
 from mcaptrack.evaluation.people import person_scores

@@ -2,7 +2,8 @@
 
 MkDocs calls ``on_config``, then ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
 ``<!-- generated: NAME -->`` where a part belongs: one of ``GENERATED``, or of those that `mcaptrack docs` prints, too
-(``mcaptrack.cli.generated.PARTS``). Below each query of docs/sql.md stands what the tables of `mcaptrack demo` answer:
+(``mcaptrack.cli.generated.PARTS``). Below each query of docs/extensions/sql.md stands what the tables of
+`mcaptrack demo` answer:
 those in the folder that the environment variable DEMO names, or those of one that is made for it (a minute).
 """
 
@@ -65,7 +66,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
     text = re.sub(r"^ *<!-- (?:not run|file|exit): .+? -->\n", "", with_links_that_lead(markdown), flags=re.M)
     text = with_parts(text, PARTS | GENERATED)
-    return with_answers(text) if page.file.src_uri == "sql.md" else text
+    return with_answers(text) if page.file.src_uri == "extensions/sql.md" else text
 
 
 @cache

@@ -22,6 +22,7 @@ import time
 from multiprocessing import Pool
 from pathlib import Path
 
+import missing_extension  # noqa: F401
 import numpy as np
 import torch
 from torch import nn

@@ -39,7 +39,7 @@ from typing import (
 from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.installed import missing_extension
 
-__all__ = ["Argument", "Option", "checked", "declared", "done_by"]
+__all__ = ["PYTHON_ONLY", "Argument", "Option", "checked", "declared", "done_by"]
 
 P = ParamSpec("P")
 T = TypeVar("T")

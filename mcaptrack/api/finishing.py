@@ -61,7 +61,7 @@ class PartsOfRun:
 
     def finishers(self, values: Mapping[str, object], force: bool) -> list[Finish]:
         """Return the steps of finishers with these values of options. Warn of what is left out."""
-        from mcaptrack.api.running import RunResult
+        from mcaptrack.api.running import OF_JSON, RunResult
 
         late = [
             f"{titled(*name)} was installed after run was imported" for name in _installed() if name not in self._names
@@ -70,7 +70,7 @@ class PartsOfRun:
             _leave_out(fault)
         steps: list[Finish] = []
         for entry in self._of("finisher"):
-            if not entry.is_built_in and entry.name in {*dir(RunResult), *RunResult.__dataclass_fields__}:
+            if not entry.is_built_in and entry.name in {*dir(RunResult), *RunResult.__dataclass_fields__, *OF_JSON}:
                 _leave_out(f"{entry} can't have its name: the result of run has {entry.name}")
                 continue
             step = self._made(entry, values, force)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -157,6 +157,8 @@ class RunResult(_OfFinishers):
         return not (self.stages or self.layouts or self.written_tables)
 
 
+#: Keys of the JSON of a run, beside names of ``RunResult`` and of finishers.
+OF_JSON: Final = ("next", "written_there_because")
 #: Plans the jobs for a log; takes the open log, the prefix of its camera, a function that takes notes, and the topics
 #: that were made again already, and those that are to be made again.
 Plan = Callable[[logs.Log, str, Callable[[str], None], Collection[str], Collection[str]], list[Job]]

@@ -38,7 +38,7 @@ from mcaptrack.cli.text import stdout_to_stderr
 from mcaptrack.ranges import limits
 from mcaptrack.registry import blamed, find
 
-__all__ = ["Once"]
+__all__ = ["Once", "Printed"]
 
 T = TypeVar("T")
 #: Heading of the options of all commands.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from shlex import quote
 from shutil import which
@@ -49,10 +48,8 @@ class Demo(Once["DemoResult"]):
 def _next_commands(target: Path) -> list[str]:
     """Return commands to try next, as they can be typed in the working folder."""
     command, log = _program(), quote(str(target))
-    lines = [f"{command} {name} {log}" for name in ("view", "info", "evaluate", "report") if name in entries()]
-    if find_spec("duckdb") is None:
-        lines.append(f"{_from_here(Path(sys.executable))} -m pip install duckdb")
-    return [*lines, f'{command} query {log} "from tracks limit 5"']
+    more = {"view": "", "info": "", "evaluate": "", "report": "", "query": ' "from tracks limit 5"'}
+    return [f"{command} {name} {log}{words}" for name, words in more.items() if name in entries()]
 
 
 def _program() -> str:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-__all__ = ["console", "counted", "print_table", "say", "show", "show_left_out"]
+__all__ = ["console", "counted", "print_table", "printable", "say", "show", "show_left_out"]
 
 WRONG_USAGE: Final = 2
 _STDOUT, _STDERR = 1, 2

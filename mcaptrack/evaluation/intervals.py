@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 from mcaptrack import notices
 
+__all__ = ["WorldInterval", "lacks_intervals"]
+
 #: Intervals of counts, and of other numbers, are wider than 90 % of the worlds by this share of the median on both
 #: sides, for what worlds get wrong alike. (Chosen on drawn scenes, as are the values below.)
 WIDER, WIDER_MEAN = 0.06, 0.1
@@ -19,7 +21,7 @@ _FEW, _LATE, _LOST, _APART = 15, 0.1, 0.4, 3.0
 
 
 class WorldInterval(NamedTuple):
-    """The median of a number in all worlds, and an interval of 90 %; None for none."""
+    """The ``median`` of a number in all worlds, and an interval of 90 % from ``low`` to ``high``; None for none."""
 
     median: float | None
     low: float | None

@@ -22,6 +22,8 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.ragged import find_rows, ragged_range, run_ends, run_starts
 from mcaptrack.schema import Rows
 
+__all__ = ["WorldTracks", "smoothed_places", "tracks_in_worlds"]
+
 #: Durations in rows are rounded by less than this.
 _ROUNDED_NS: Final = 1000
 #: An end is in the middle if it is farther from the border of the seen area than this, and than its way of so long.
@@ -68,7 +70,10 @@ class WorldTracks(NamedTuple):
 
 
 def smoothed_places(source: Ints, t_ns: Ints, xy_m: Floats, smoothed: Rows, smoothed_ns: Ints) -> Floats:
-    """Places (N, 2) of samples, those that re-tracking gave them in its rows ``smoothed``; others stay at ``xy_m``."""
+    """Places (N, 2) of samples, those that re-tracking gave them in its rows ``smoothed``; others stay at ``xy_m``.
+
+    Samples are of the tracks ``source`` (N,) at ``t_ns`` (N,), and rows at ``smoothed_ns``.
+    """
     at, xy_m = find_rows((smoothed["source_id"], smoothed_ns), (source, t_ns)), xy_m.copy()
     xy_m[at >= 0] = np.stack([smoothed[name][at[at >= 0]] for name in ("x_m", "y_m")], axis=1)
     return xy_m

@@ -18,7 +18,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Event, Lock, local
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from mcaptrack import __version__
 from mcaptrack.api.declared import checked
@@ -31,9 +31,7 @@ from mcaptrack.fleet.ledger import Claims, Ledger, digest_of_log, digest_of_sett
 from mcaptrack.fleet.results import AGAIN, GOOD, FleetResult, FleetStatus, LogOutcome, Running, Watch
 from mcaptrack.fleet.worker import Reply, Request
 from mcaptrack.location import Location, Url
-
-if TYPE_CHECKING:
-    from mcaptrack.fleet.cluster import Cluster
+from mcaptrack.registry import find
 
 T = TypeVar("T")
 
@@ -48,6 +46,26 @@ _TICK_S: Final = 0.25
 _WAIT_S: Final = 1.0
 #: Seconds that workers get to end in order.
 _GRACE_S: Final = 3.0
+
+
+class Crew(Protocol):
+    """Processes logs: in processes of this machine, or, made by an extension, elsewhere.
+
+    ``lost`` says why no log can be processed any more, and ``stop`` ends all work within that time.
+    """
+
+    @property
+    def places(self) -> int:
+        """The number of logs that it can be busy with."""
+        ...
+
+    def start(self, request: Request, then: Callable[[Future[Reply]], None]) -> None: ...
+
+    def running(self) -> tuple[Running, ...]: ...
+
+    def lost(self) -> str: ...
+
+    def stop(self, grace_s: float) -> None: ...
 
 
 @dataclass
@@ -71,7 +89,7 @@ class Fleet(Generic[T]):
         function: Callable[..., T],
         options: Mapping[str, Any],
         logs: Sequence[QueuedLog],
-        crew: Processes | Cluster,
+        crew: Crew,
         ledger: Ledger | None,
         tries: int,
         keep_going: bool,
@@ -358,12 +376,7 @@ def run(
         if on_status is not None:
             on_status(status)
 
-    if scheduler is None:
-        crew: Processes | Cluster = Processes(limits)
-    else:
-        from mcaptrack.fleet.cluster import Cluster
-
-        crew = Cluster(scheduler, limits, jobs)
+    crew: Crew = Processes(limits) if scheduler is None else find("crew", "dask").cls(scheduler, limits, jobs)
     hear, say = on_outcome or (lambda _: None), on_note or (lambda _: None)
     return Fleet(function, keywords, work, crew, entries, tries, keep_going, hear, watch, say).run()
 

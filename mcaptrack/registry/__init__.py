@@ -71,6 +71,7 @@ Kind = Literal[
     "name",  # in Python, such as classes of results; those of the core are in mcaptrack/__init__.py
     "scene",  # what makes a scene of several cameras (mcaptrack.pipeline.scenes)
     "doctor_line",  # what `mcaptrack doctor` says of a part
+    "crew",  # what processes many logs elsewhere (mcaptrack.fleet.Crew)
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 T = TypeVar("T")
@@ -83,13 +84,13 @@ _LABELS: Final = "mcaptrack.sources.ingest.labels"
 _SOLIDS: Final = "mcaptrack.sources.foreign.solids"
 #: Commands that a function of the library of this name declares, in the order of the help.
 _COMMANDS: Final = (
-    "demo ingest run view info detect motion track sample predict retrack query export cut "
+    "demo ingest run view info detect motion track sample predict retrack export cut "
     "evaluate events check recover drop doctor"
 )
 #: Kinds that only entry points name.
 _BY_ENTRY_POINT: Final = (
     *("stage", "message_reader", "recording", "finisher", "report_section", "command", "page", "player", "viewer"),
-    *("name", "scene", "doctor_line"),
+    *("name", "scene", "doctor_line", "crew"),
 )
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(

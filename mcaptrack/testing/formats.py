@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import log as logs
-from mcaptrack.api.common import as_path
 from mcaptrack.api.exporting import exporter_for, write_by
 from mcaptrack.api.options import PathLike
 from mcaptrack.api.reading import LogReader
@@ -43,7 +42,7 @@ from mcaptrack.sources.ingest.labels.reading import read_by
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.table import COLUMNS, Asked
 from mcaptrack.sources.ingest.recording import RecordingOfPackage, compare_counts
-from mcaptrack.testing.transforms import LawError, law, same_process
+from mcaptrack.testing.transforms import LawError, law, present, same_process
 
 #: What a label format may raise for a file that isn't of it.
 _REFUSALS: Final = (McaptrackError, ValueError)
@@ -65,6 +64,7 @@ _ODD: Final = (
 )
 #: How many damaged files are made, the last of them with one of these.
 _DAMAGED: Final = 16
+_NOISE: Final = bytes(np.random.default_rng(0).integers(0, 256, 4096, np.uint8))
 #: What labels may be read as.
 _ROLES: Final[tuple[Role | None, ...]] = ("detections", "truth", None)
 
@@ -73,10 +73,10 @@ def check_label_format(label_format: LabelFormat | Format, path: PathLike) -> No
     """Check a label format against the laws that hold for every one.
 
     The laws: it declares what the contract asks for; its boxes are labels; the same file gives the same boxes, also
-    after another one, and is not changed; it recognises its file if it recognises any, and looks at any other file
-    without an error; an empty file, and one that is cut off or damaged, gives boxes that are labels, or raises
-    McaptrackError or ValueError; it leaves the process that it runs in as it was. ``check_exporter`` compares what is
-    written with what such a format reads.
+    after another one, and is not changed; it recognises its file if it recognises any, but no noise, and looks at any
+    other file without an error; an empty file, and one that is cut off or damaged, gives boxes that are labels, or
+    raises McaptrackError or ValueError; it leaves the process that it runs in as it was. ``check_exporter`` compares
+    what is written with what such a format reads.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def check_label_format(label_format: LabelFormat | Format, path: PathLike) -> No
     >>> check_label_format(Corners(), "a.corners")
     """
     made, name = _made_format(label_format)
-    file = as_path(path).absolute()
+    file = present(path)
     with same_process(name), TemporaryDirectory() as folder:
         before = _content(file)
         with law("conforms"):
@@ -120,8 +120,13 @@ def check_label_format(label_format: LabelFormat | Format, path: PathLike) -> No
                 raise LawError("pure: the same file gives other boxes when it is read again")
         with law("recognises"):
             answers = [made.recognises(LabelFile(each)) for each in (file, *others, file)]
+            other = Path(folder, "other.strange")
+            other.write_bytes(_NOISE)
+            takes_any = made.recognises(LabelFile(other))
         if isinstance(made, FormatOfPackage) and made.recognises_any and not (answers[0] and answers[-1]):
             raise LawError(f"recognises: it doesn't recognise {file}")
+        if takes_any:
+            raise LawError(f"recognises: it takes a file of noise, {other.name}, for one of its own")
         if _content(file) != before:
             raise LawError("pure: it changes its file")
 
@@ -161,7 +166,6 @@ def _damaged(path: Path, folder: Path) -> Iterator[tuple[str, Path]]:
     """Files like this one, or folders of which one file is, but damaged, and what each is."""
     dice = np.random.default_rng(0)
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    noise = bytes(dice.integers(0, 256, 4096, np.uint8))
     for number in range(_DAMAGED):
         file = files[number % len(files)]
         data = file.read_bytes()
@@ -170,7 +174,7 @@ def _damaged(path: Path, folder: Path) -> Iterator[tuple[str, Path]]:
         spot, odd = (spots[at % len(spots)].span() if spots else (at, at + 1)), _ODD[number % len(_ODD)]
         what, changed = {
             0: ("an empty file", b""),
-            1: ("a file of noise", noise),
+            1: ("a file of noise", _NOISE),
             2: ("a file without its end", data[: len(data) * 2 // 3]),
         }.get(number, (f"a file with {odd[:9]!r} at {spot[0]}", data[: spot[0]] + odd + data[spot[1] :]))
         other = folder / str(number) / path.name
@@ -265,7 +269,7 @@ def check_recording_format(recording_format: RecordingFormat, path: PathLike) ->
     """
     entry = _entry("recording", recording_format, "open")
     _entry("recording", recording_format, "recognises")
-    file = as_path(path).absolute()
+    file = present(path)
     with same_process(entry.name), TemporaryDirectory() as folder, collected():
         before = _content(file)
         _check_description(entry, recording_format, file)
@@ -350,7 +354,7 @@ def check_exporter(
     entry = _entry("exporter", exporter, "write")
     with law("declares"):
         by = exporter_for(entry, exporter)
-    source = as_path(log).absolute()
+    source = present(log)
 
     def written(path: Path, file: Path) -> tuple[dict[str, int], Any]:
         file.parent.mkdir()

@@ -15,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack import log as logs
-from mcaptrack.api.common import as_path
 from mcaptrack.api.declared import Argument, PythonOnly, about, arguments_of, hints_of, options_of, words_of
 from mcaptrack.api.finishing import FORCE, PartsOfRun
 from mcaptrack.api.options import PathLike, no_progress
@@ -29,7 +28,7 @@ from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.registry import Entry, Kind
 from mcaptrack.schema.provenance import FUSE
 from mcaptrack.sources.cameras import cameras, detections_topic, provenance_of, scenes_of
-from mcaptrack.testing.transforms import LawError, law, same_process
+from mcaptrack.testing.transforms import LawError, law, present, same_process
 from mcaptrack.viewing.formatting import plain
 from mcaptrack.viewing.sections import section_of
 
@@ -134,8 +133,9 @@ def check_finisher(function: Callable[..., Any], log: PathLike, *, name: str = "
     LawError
         If it breaks a law; the message names the law.
     """
+    path = present(log)
     with _part_of_run("finisher", function, name) as parts, TemporaryDirectory() as folder:
-        copy = Path(shutil.copy(as_path(log), Path(folder, "log.mcap")))
+        copy = Path(shutil.copy(path, Path(folder, "log.mcap")))
         before = _channels(copy)
         made = _finished(parts, copy, options)
         if not made.channels:
@@ -156,9 +156,12 @@ def check_finisher(function: Callable[..., Any], log: PathLike, *, name: str = "
 
 
 def _finished(parts: PartsOfRun, path: Path, options: Mapping[str, Any]) -> RunResult:
+    with law("declares"), collected() as said:
+        finishing = parts.finishers(options, False)
+    if said:
+        raise LawError(f"declares: {said[0].message}")
     with law("conforms"):
-        return work(Where(path, None, None, None, False, False), lambda *_: [], no_progress,
-                    finishing=parts.finishers(options, False))  # fmt: skip
+        return work(Where(path, None, None, None, False, False), lambda *_: [], no_progress, finishing=finishing)
 
 
 def _channels(path: Path) -> dict[str, Any]:
@@ -189,7 +192,7 @@ def check_scene_maker(function: Callable[..., Any], log: PathLike, **options: An
     LawError
         If it breaks a law; the message names the law.
     """
-    path = as_path(log).absolute()
+    path = present(log)
     with _part_of_run("scene", function, "") as parts, TemporaryDirectory() as folder:
         before = path.read_bytes()
         made = []
@@ -235,7 +238,7 @@ def check_report_section(function: Callable[..., Any], log: PathLike) -> None:
         If it breaks a law; the message names the law.
     """
     entry = _entry_of("report_section", function, "")
-    path = as_path(log).absolute()
+    path = present(log)
     before = path.read_bytes()
 
     def sections(of: Path) -> list[Any]:

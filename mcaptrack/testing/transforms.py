@@ -9,11 +9,15 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, fields, is_dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from mcaptrack.api.common import as_path
+from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import missing
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.notices import collected
@@ -36,6 +40,14 @@ def law(name: str) -> Iterator[None]:
         yield
     except McaptrackError as error:
         raise LawError(f"{name}: {error}") from None
+
+
+def present(path: PathLike) -> Path:
+    """The absolute path of a file or folder. Raises McaptrackError if there is none."""
+    file = as_path(path)
+    if not file.exists():
+        raise McaptrackError(missing(file))
+    return file.absolute()
 
 
 def check_transform(transform: Transform, frames: Sequence[Frame] | None = None, *, seed: int = 0) -> None:

@@ -164,18 +164,6 @@ CASES: dict[str, dict[str, Case]] = {
         definitions=("export bare.mcap --topic /t", "--definitions src"),
         force=("export a.mcap -o taken", "--force"),
     ),
-    "query": common(
-        "query a.mcap 'select topic, t_ns from tracks order by all'",
-        file=("query a.mcap", "--file query.sql"),
-        format="--format csv",
-        **{"with": ("query a.mcap 'from more'", "--with more=more.csv")},
-        rows="--rows 2",
-        tables=("query a.mcap", "--tables"),
-        output="-o b.csv",
-        force=("query a.mcap 'select 1' -o clip.mp4", "--force"),
-        verbose=("query a.mcap 'select 1'", "-v"),
-        worlds="--worlds",
-    ),
     "info": common("info a.mcap", frames="--frames"),
     "view": common(
         "view a.mcap",

@@ -67,10 +67,7 @@ def read(log: str) -> None:
     about: mcaptrack.LogInfo = mcaptrack.info(log, frames=True)
     channels: list[mcaptrack.ChannelInfo] = list(about.channels)
     frames: list[mcaptrack.FrameInfo] = list(about.frames or ())
-    listed: mcaptrack.TableList = mcaptrack.list_tables(log)
-    tables: list[mcaptrack.TableInfo] = list(listed.tables)
-    columns: list[mcaptrack.ColumnInfo] = [column for table in tables for column in table.columns]
-    print(channels, frames, columns, mcaptrack.query(log, "from tracks").num_rows)
+    print(channels, frames)
 
 
 def use(log: str) -> None:

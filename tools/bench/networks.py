@@ -1,6 +1,6 @@
 """CPU time of a network in a process of its own, as one of a stranger runs, against the same in this process.
 
-.venv/bin/python tools/bench/networks.py yolox_nano.onnx [--size 960x736]
+.venv/bin/python -m tools.bench.networks yolox_nano.onnx [--size 960x736]
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+import tools.missing_extension  # noqa: F401
 from mcaptrack.extensions.networks.network import NetworkFile, NetworkLimits, OnnxNetwork, read_file
 from mcaptrack.geometry.boxes import parse_size
 

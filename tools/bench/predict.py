@@ -1,6 +1,6 @@
 """Forecasts per second in batches, and how many times as fast as the same networks in torch (if it is installed).
 
-.venv/bin/python tools/bench/predict.py
+.venv/bin/python -m tools.bench.predict
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+import tools.missing_extension  # noqa: F401
 from mcaptrack.extensions.training.windows import Windows
 from mcaptrack.predictors import NAMES, make
 

@@ -8,19 +8,16 @@ memory where it allows that. Prints milliseconds and the ratio, the best of seve
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from pathlib import Path
 
+import tools.missing_extension  # noqa: F401
 from mcaptrack.evaluation import EvaluateOptions
 from mcaptrack.extensions.tuning.search import Task, trial_scores
 from mcaptrack.sources.ingest import IngestOptions
 from mcaptrack.tables.compared import detections_and_ground_truth
 from mcaptrack.transforms import STAGES, Sort
-
-# This file's folder is where Python looks first, and a file in it is named like the peer.
-sys.path.pop(0)
 
 
 def main() -> None:

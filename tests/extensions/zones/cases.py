@@ -103,7 +103,7 @@ PRINTED = {"zones": _printed}
 DEEP = {
     "zones": (
         "its counts are written, drawn and reported as those of the core are",
-        "api.running cli.many evaluation.intervals evaluation.world_tracks foxglove.annotations foxglove.views.ground "
+        "api.running cli.many foxglove.annotations foxglove.views.ground "
         "foxglove.views.image foxglove.views.people geometry.camera_path pipeline.checks pipeline.motion "
         "pipeline.pictures pipeline.staleness pipeline.write schema.frame_columns viewing.background viewing.charts",
     )

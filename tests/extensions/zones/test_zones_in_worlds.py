@@ -12,6 +12,7 @@ import mcaptrack
 from mcaptrack.evaluation.intervals import WIDER, WIDER_MEAN
 from mcaptrack.notices import collected
 from tests.commands import done
+from tests.extension_cases import needs
 from tests.worlds import noisy_tracks, write_channels
 
 RIGHT = {"type": "Polygon", "coordinates": [[[2, -99], [99, -99], [99, 99], [2, 99], [2, -99]]]}
@@ -38,6 +39,7 @@ select world, count(*) filter (visits > 0) as tracks, coalesce(sum(s) / sum(visi
 """
 
 
+@needs("query")
 def test_zones_have_the_medians_and_intervals_of_what_sql_counts_in_each_world(with_worlds, tmp_path):
     there = Path(shutil.copyfile(with_worlds, tmp_path / "log.mcap"))
     made = mcaptrack.zones(there, zones=SIDES, margin_m=0, max_gap_s=1.3).zones["/camera/retracks"]

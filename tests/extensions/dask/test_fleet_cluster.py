@@ -11,8 +11,9 @@ import pytest
 
 from mcaptrack import fleet
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import cluster
-from tests import fleet_cluster, fleet_tasks
+from mcaptrack.extensions.dask import cluster
+from tests import fleet_tasks
+from tests.extensions.dask import fleet_cluster
 from tests.tiers import thorough
 
 pytestmark = pytest.mark.usefixtures("never_waits")

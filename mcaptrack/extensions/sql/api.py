@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.common import as_path, detail, locations_of
@@ -13,22 +14,13 @@ from mcaptrack.api.options import PathLike
 if TYPE_CHECKING:
     import pyarrow as pa
 else:
-
-    class _Arrow:
-        """pyarrow: imported when the types of annotations are asked for, and not for help."""
-
-        def __getattr__(self, name: str) -> object:
-            import pyarrow
-
-            return getattr(pyarrow, name)
-
-    pa = _Arrow()
+    pa = SimpleNamespace(Table=object)  # help doesn't import pyarrow
 
 #: Heading of options in the help.
 QUERY: Final = "Query and answer"
 
 
-@declared(heading="Results", printed_by="mcaptrack.cli.query:Query")
+@declared(heading="Results", printed_by="mcaptrack.extensions.sql.command:Query")
 def query(
     log: Annotated[
         PathLike | Sequence[PathLike],
@@ -88,7 +80,7 @@ def query(
     {'found': [True]}
 
     """
-    from mcaptrack.tables.sql import Database
+    from mcaptrack.extensions.sql.database import Database
 
     named = {name: as_path(path) for name, path in (files or {}).items()}
     with Database(locations_of(log), named) as database:
@@ -207,7 +199,7 @@ def list_tables(log: PathLike | Sequence[PathLike] = (), *, files: Mapping[str, 
     paths = locations_of(log)
     if not paths:
         return TableList(tables, (), ())
-    from mcaptrack.tables.sql import Database
+    from mcaptrack.extensions.sql.database import Database
 
     with Database(paths, {name: as_path(path) for name, path in (files or {}).items()}) as database:
         return TableList(tables, database.recordings, database.channels)

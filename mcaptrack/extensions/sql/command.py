@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -11,15 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import mcaptrack
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import PathLike
-from mcaptrack.api.querying import QUERY
 from mcaptrack.cli import common
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, print_table, printable, show
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import is_same_file, refuse_overwrite, refuse_url, unreadable
-from mcaptrack.location import is_remote, parse
+from mcaptrack.extensions.sql.answers import write_answer
+from mcaptrack.extensions.sql.api import QUERY
+from mcaptrack.files import is_same_file, refuse_overwrite, unreadable
 
 if TYPE_CHECKING:
     from mcaptrack import TableList
@@ -93,16 +94,14 @@ class Query(Once[Any]):
                 talk.say(note)
         else:
             warn_unused(f"{self._form} has all rows", "rows")
-            _write(done, self._form, output, json)
+            with self.printed() if json else nullcontext():
+                _write(done, self._form, output, json)
 
 
 def _asked(arguments: Sequence[str], file: Path | None, tables: bool) -> tuple[list[Path], str]:
     """Return the logs and the query that the words of the command line give."""
     from_file = file is not None or tables
     names = list(arguments) if from_file else list(arguments[:-1])
-    for word in arguments:
-        if not is_remote(parse(word)):
-            refuse_url(word)
     stray = next((name for name in names if name.lower() in _KEYWORDS and not Path(name).exists()), None)
     if stray is not None:
         raise McaptrackError(f'{stray} is not a log; the query is one argument, in quotes: "{stray} ..."')
@@ -171,10 +170,9 @@ def _write(answer: Any, form: Form, output: Path | None, json: bool) -> None:
 
         rows = codec.loads(b"".join(tables.pieces(answer, "json")))
         columns = [{"name": field.name, "type": str(field.type)} for field in answer.schema]
-        with common.printed_to(output, force=True):
-            common.print_json({"columns": columns, "results": rows})
+        common.print_json({"columns": columns, "results": rows})
     elif output is not None:
-        tables.write_answer(output, answer, form)
+        write_answer(output, answer, form)
     else:
         for piece in tables.pieces(answer, form):  # type: ignore[arg-type]
             text = piece.decode("utf-8")

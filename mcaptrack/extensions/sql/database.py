@@ -4,7 +4,7 @@
         answer = database.ask("select topic, count(distinct track_id) from tracks group by topic")
 
 A table is loaded when a query names it: from the Parquet file beside the log if that is up to date, otherwise from the
-log. Each channel is a table, too, under its name in double quotes. Only this module knows DuckDB.
+log. Each channel is a table, too, under its name in double quotes. Only this module imports DuckDB.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call, did_you_mean
 from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
 from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
+from mcaptrack.extensions.sql.answers import tidy
 from mcaptrack.files import place_of
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.location import Location, distinct_names
-from mcaptrack.log.recording_files import results_path
 from mcaptrack.notices import warn
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import TOPICS, LogTables, current_file, default_folder, topic_folder
@@ -205,7 +205,7 @@ class Database:
             raise McaptrackError(self._error_text(str(error), query)) from None
         if answer is None:
             raise McaptrackError("the query asks nothing; it needs a SELECT")
-        return tables.tidy(answer)
+        return tidy(answer)
 
     def _answer(self, query: str) -> Any:
         """The answer of the last statement that gives one, Arrow or None."""
@@ -241,7 +241,7 @@ class Database:
         answers, seen = [], []
         for tracks, of_world in self._tracks_in_worlds():
             self._connection.register("tracks", tracks.drop_columns(["world"]))
-            answers.append(tables.tidy(self._run(self._connection.extract_statements(query)[0])))
+            answers.append(tidy(self._run(self._connection.extract_statements(query)[0])))
             seen.append(of_world)
         has_none = lacks_intervals(seen)
         if _PAIRS.search(query) and not has_none:
@@ -478,7 +478,7 @@ def _unique_paths(paths: Sequence[Location]) -> list[Location]:
     by_place: dict[Location, Location] = {}
     for path in paths:
         by_place.setdefault(place_of(path), path)
-    results = {results_path(place) for place in by_place}
+    results = {log.results_path(place) for place in by_place}
     return [path for place, path in by_place.items() if place not in results]
 
 

@@ -12,21 +12,23 @@ from contextlib import chdir, redirect_stdout
 from pathlib import Path
 
 import duckdb
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import mcaptrack
 from mcaptrack import log, tables
+from mcaptrack.extensions.sql.database import Database
 from mcaptrack.schema import EVENTS, FORECAST_ERRORS, PREDICTIONS, TRACKS, Frame
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables.export import ALWAYS, default_folder, export
-from mcaptrack.tables.sql import Database
 from tests.commands import GROUP, Outcome, Terminal, call
 from tests.logs import write_channels
 from tests.tiers import thorough
 from tests.worlds import ns, tracks_at
 
-PAGE = (Path(__file__).parent.parent / "docs" / "sql.md").read_text()
+PAGE = (Path(__file__).parents[3] / "docs" / "extensions" / "sql.md").read_text()
 PRELUDE = re.findall(r"```sql\n(create view.*?)```", PAGE, re.S)[0]
 #: Queries of the page that one log answers.
 QUERIES = [
@@ -119,7 +121,7 @@ def exported(known) -> Path:
     return known.parent
 
 
-#: By a part of each query of docs/sql.md, its answer on the known log, by hand.
+#: By a part of each query of docs/extensions/sql.md, its answer on the known log, by hand.
 ANSWERS = {
     "t_ns = 10_000_000_000": [],
     "as seen_s": [],
@@ -197,7 +199,7 @@ def test_runs_are_compared_once_and_not_by_class(tmp_path):
 
 
 def test_keys_of_the_page_about_tables_join(exported):
-    page = (Path(__file__).parent.parent / "docs" / "tables.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "tables.md").read_text()
     (people,) = re.findall(r"^select f\.t,.*?;", page, re.M | re.S)
     (speeds,) = re.findall(r"^select recording, topic, track_id, path_m.*?;", page, re.M | re.S)
     with chdir(exported), duckdb.connect() as connection:
@@ -381,7 +383,7 @@ def test_ctrl_c_ends_a_query_and_the_database_stays_usable(known):
     program = (
         "import os, signal, sys, threading\n"
         "from pathlib import Path\n"
-        "from mcaptrack.tables.sql import Database\n"
+        "from mcaptrack.extensions.sql.database import Database\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "with Database([Path(sys.argv[1])]) as database:\n"
         "    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()\n"
@@ -577,3 +579,43 @@ def test_a_table_is_no_wider_than_the_terminal(known, monkeypatch):
             GROUP(["query", str(known), LONG, *rows])
         assert "…" in screen.shown()
         assert max(map(len, screen.shown().splitlines())) <= 80
+
+
+def test_a_terminal_shows_sixty_rows_of_an_answer_and_a_pipe_all(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TERM", "xterm")
+    Path("x.mcap").write_bytes(b"no log")
+    answer = pa.table({"n": pa.array(range(61), pa.int64()), "word": ["a\x1b[31m"] * 61})
+    monkeypatch.setattr(mcaptrack, "query", lambda log, sql, **_: answer)
+
+    def on_screen(*words: str) -> str:
+        screen = Terminal()
+        with redirect_stdout(screen), pytest.raises(SystemExit):
+            GROUP.main(["query", "x.mcap", "select 1", *words], prog_name="mcaptrack")
+        return screen.shown()
+
+    for words, rows in (((), 60), (("--rows", "0"), 61), (("--rows", "5"), 5)):
+        assert len(on_screen(*words).splitlines()) - 2 == rows
+    assert r'0,"a\x1b[31m"' in on_screen("--format", "csv")  # data keep what a terminal would act on elsewhere
+    assert '0,"a\x1b[31m"\n' in call("query", "x.mcap", "select 1", "--format", "csv").out
+    assert len(call("query", "x.mcap", "select 1").out.splitlines()) == 63
+
+
+def test_a_log_by_two_names_does_not_count_twice(known, tmp_path):
+    (tmp_path / "link.mcap").symlink_to(known)
+    rows = "select count(*) as n from tracks"
+    assert (
+        mcaptrack.query([known, tmp_path / "link.mcap"], rows).to_pydict() == mcaptrack.query(known, rows).to_pydict()
+    )
+
+
+def test_own_channels_are_tables_of_logs_and_of_folders(tmp_path):
+    speeds = mcaptrack.schema_of("Speed", [("m_per_s", "f8")])
+    frames = [Frame(ns(1), 0, speeds.rows(m_per_s=[0.25, np.nan])), Frame(ns(2), 1, speeds.rows(m_per_s=[0.5]))]
+    with mcaptrack.open(tmp_path / "a.mcap", create=True) as opened:
+        opened.write("/gps/speed", frames, schema=speeds)
+    exported = mcaptrack.export(tmp_path / "a.mcap", topic="/gps/speed")
+    for place in (tmp_path / "a.mcap", exported.folder):
+        assert mcaptrack.query(place, 'select sum(m_per_s) as v from "/gps/speed"').to_pydict() == {"v": [0.75]}
+        rows = mcaptrack.query(place, 'select t_ns from "/gps/speed" where m_per_s is null')
+        assert rows.to_pydict() == {"t_ns": [ns(1)]}

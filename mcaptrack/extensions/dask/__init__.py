@@ -1,0 +1,1 @@
+"""Many logs on the workers of a Dask cluster."""

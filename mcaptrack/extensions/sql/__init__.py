@@ -1,0 +1,1 @@
+"""Queries of logs in SQL, by DuckDB."""
