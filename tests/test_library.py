@@ -231,7 +231,7 @@ class TestRefused:
             ),
             "a name that is none": (
                 lambda: mcaptrack.evaluate("log.mcap", topic=["tracks", None]),
-                "`topic=` is text, not None",
+                "`topic=` holds texts, and no other values, not [",
             ),
             "a wrong gate": (lambda: mcaptrack.evaluate("log.mcap", gate_m=(1, -1)), "from 0.001 to 1000000, not -1"),
             "a score of several": (

@@ -177,7 +177,7 @@ def channel(topic: str, messages: int, rate_hz: float | None = None, **more: Any
 
 def frame(name: str, parent: str | None, **more: Any) -> dict[str, Any]:
     plain = {"static": False, "rate_hz": 12.345, "start_ns": START + SECOND, "end_ns": START + 2 * SECOND}
-    return plain | {"frame": name, "parent": parent, "gaps": [], "jumps": []} | more
+    return plain | {"frame": name, "parent": parent, "gaps": [], "jumps": [], "namespace": ""} | more
 
 
 def of_contents(to: Transcript) -> None:

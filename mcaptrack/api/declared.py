@@ -299,11 +299,12 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
             kinds = _kinds(function).get(name, ())
             choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
             choices = [] if str in kinds else choices
-            if any(isinstance(path, str) and not path for path in map(_name_of, _paths_in(value, kinds))):
+            if _has_empty_name(value, kinds):
                 raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
             if choices:
                 _check_choice(name, value, choices)
             _check_type(name, value, kinds)
+            _check_members(name, value, kinds)
             if ends := _ranges(function).get(name):
                 _check_range(name, value, ends, is_whole=float not in kinds)
             if name == "progress" and not callable(value):
@@ -466,6 +467,11 @@ def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
     return value if isinstance(value, Sequence) and not isinstance(value, str) else (value,)
 
 
+def _has_empty_name(value: Any, kinds: Iterable[Any]) -> bool:
+    """Whether a path among a value is empty; arrays, which can't be compared, are none."""
+    return any(isinstance(path, str) and not path for path in map(_name_of, _paths_in(value, kinds)))
+
+
 def _holds_paths(kind: Any) -> bool:
     whole = get_origin(kind) or kind
     return (isinstance(whole, type) and issubclass(whole, os.PathLike)) or any(map(_holds_paths, get_args(kind)))
@@ -479,9 +485,6 @@ def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
     """Raise McaptrackError for a value of another type. Types that aren't in ``_TYPES`` are not checked here."""
     types = {get_origin(kind) or kind for kind in kinds}
     types -= {Literal} if str in types else set()  # names, and those of installed packages
-    if any(kind == Sequence[str] for kind in kinds) and isinstance(value, list | tuple):
-        for member in value:
-            _check_type(name, member, (str,))
     if not types & {*_TYPES} or not types <= {*_TYPES, type(None)} or isinstance(value, tuple(types)):
         return
     if bool in types and type(value).__name__ in ("bool", "bool_"):  # NumPy's
@@ -489,6 +492,11 @@ def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
     is_path = os.PathLike in types  # which text is a name of, too
     meant = [text for kind, text in _TYPES.items() if kind in types and not (is_path and kind is str)]
     raise McaptrackError(f"`{name}=` is {' or '.join(meant)}, not {' '.join(repr(value).split()):.40}")
+
+
+def _check_members(name: str, value: object, kinds: Sequence[Any]) -> None:
+    if Sequence[str] in kinds and isinstance(value, list | tuple) and any(not isinstance(each, str) for each in value):
+        raise McaptrackError(f"`{name}=` holds texts, and no other values, not {' '.join(repr(value).split()):.40}")
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:

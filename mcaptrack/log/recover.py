@@ -357,7 +357,7 @@ class _Recovery:
             self._writer.write_description(number)
 
     def _report_behind(self, at: int) -> None:
-        """Report a log that follows this one, whose data section ends at ``at``, as where files were joined."""
+        """Report a log that follows this one, as where files were joined; ``at`` is the end of the data section."""
         with suppress(Damaged):
             footers = (record for record in walk(self._buffer, at, len(self._buffer)) if record.opcode == Opcode.FOOTER)
             end = next((record.end + len(MAGIC) for record in footers), at)

@@ -460,9 +460,12 @@ class _Planner:
         if is_of_corrections(self.opened, self.prefix, result.provenance):
             changed = "answers about" if stage.kind == "retracker" else "corrections of"
             return f"{changed} {source} have changed: {again}, as before"
+        return f"{topic} was made from an earlier {self._changed(result)}: {again}, as before"
+
+    def _changed(self, result: _Result) -> str:
+        """Return the topic that a channel was made from and that this run changes, or that has changed since then."""
         made_again = next((name for name in result.provenance.made_from() if self.changes.get(name)), "")
-        earlier = made_again or changed_source(self.opened, topic) or source
-        return f"{topic} was made from an earlier {earlier}: {again}, as before"
+        return made_again or changed_source(self.opened, result.topic) or result.source
 
     def _kept(self, result: _Result, transform: Transform) -> tuple[str, ...] | None:
         """Return the outputs that are written: those that the log has, and those that belong beside them."""
