@@ -350,7 +350,7 @@ def drawn(seed: int, most: int) -> tuple[Paths, Motion, tuple[MotionModel, Traje
     rng = np.random.default_rng(seed)
     model, motion = models(rng)
     paths = with_companions(rng, int(rng.integers(1, most + 1)))
-    out, _ = laid_out(paths, model.noise_m)
+    out = laid_out(paths)
     return paths, motion, (model, out, smooth(model, out))
 
 
@@ -392,7 +392,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
     side = wide_m / np.sqrt(2)
     steps = [step for step in range(begins, ends + 1) if not 10 < step <= 10 + missed]
     paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
-    out, _ = laid_out(paths, 1e-3)
+    out = laid_out(paths)
     smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0, 0.4), out)  # it follows the positions
     assert stand_throughout(out, smoothed, np.zeros((1, len(FEATURES))), (0, 39), 0.4).tolist() == [stands]
 
@@ -402,7 +402,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
     [(5, 399, 0.0, True), (6, 399, 0.0, False), (0, 25, 0.0, True), (0, 24, 0.0, False), (0, 399, 1.0, False)],
 )
 def test_two_seconds_of_a_long_log_ten_of_a_short_one_and_doubles(begins, last, in_step, stands):
-    out, _ = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))}, 0.1)
+    out = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))})
     smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1, 0.4), out)
     found = np.where(np.array(FEATURES) == "in step", in_step, 0.0)[None]
     assert stand_throughout(out, smoothed, found, (0, last), 0.4).tolist() == [stands]
