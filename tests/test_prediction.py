@@ -27,10 +27,8 @@ from mcaptrack.schema.predictions import forecast_to_rows, tails_of
 from mcaptrack.transforms import Predict, Sample
 from tests.worlds import ids, ns, places, walk
 
-NETWORKS = ["red", "lstm"]
 LINEAR = ["cv", "holt-cv", "kalman"]
 every_linear = pytest.mark.parametrize("name", LINEAR)
-every_predictor = pytest.mark.parametrize("name", [*LINEAR, *NETWORKS])
 
 
 def sampled(frames, **options):
@@ -75,12 +73,6 @@ class TestPredictors:
         wanted = ahead[:, None] * [0.5, -0.2]
         # The Kalman filter starts from "at rest, perhaps" and never quite forgets it.
         np.testing.assert_allclose(forecast.mean[0], wanted, rtol=0.02 if name == "kalman" else 1e-9)
-
-    @every_predictor
-    def test_an_empty_batch_gives_no_forecasts(self, name):
-        forecast = make(name, 12, 0.4).predict(np.empty((0, 8, 2)), np.empty((0, 8), bool))
-        assert forecast.mean.shape == (0, 12, 2)
-        assert forecast.cov.shape == (0, 12, 2, 2)
 
     @every_linear
     @pytest.mark.parametrize("known", [1, 3, 8])

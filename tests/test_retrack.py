@@ -203,11 +203,6 @@ def test_rows_without_metres_count_as_if_they_were_not_there(profile):
             assert_same_rows(frame.rows, same.rows)
 
 
-def test_one_class_is_not_split():
-    frames = collect(TRACKS, [Frame(0, 0, rows_of([1, 2], [3, 3]))])
-    assert split_classes(frames) == [frames]
-
-
 def test_decisions_about_tracks_that_were_left_out_have_no_id_in_any_class():
     def run(ids: list[int]):
         rows = DECISIONS.empty(len(ids))

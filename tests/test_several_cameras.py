@@ -19,7 +19,7 @@ from mcaptrack.pipeline import scenes
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.provenance import Provenance
-from tests.commands import call, done
+from tests.commands import call
 from tests.logs import recorder
 from tests.places import CAMERAS, HEIGHT, WIDTH, ran_copy, said, topics, write_log
 from tests.tiers import one_in, thorough
@@ -92,12 +92,6 @@ class TestAllCameras:
         assert again.is_up_to_date
         assert list(again.cameras) == list(ran[1].cameras)
         assert ran[0].read_bytes() == before
-
-    def test_the_command_prints_a_line_for_each_camera(self, ran: tuple[Path, RunResult]) -> None:
-        told = done("run", ran[0], "--no-tables").err
-        lines = {line.split()[0]: line for line in told.splitlines() if line.startswith("  ")}
-        assert "tracks" in lines["south"]
-        assert "left out: it has neither pictures nor boxes" in lines["labelled"]
 
 
 class TestChoice:

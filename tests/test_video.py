@@ -347,13 +347,6 @@ def zeros(start: int, size: int):
     return change
 
 
-def test_a_whole_video_says_nothing(odd):
-    for name in ("a.mp4", "a.ts", "a.avi"):
-        with collected() as warnings:
-            _, video = read(odd / name)
-        assert (video.why_transcode, video.lost, video.notes, list(warnings)) == ("", [], [], []), name
-
-
 def test_a_hole_within_a_picture_makes_all_be_decoded_and_counted(odd):
     at, size = samples(odd / "a.mp4")[20]
     path = changed(odd / "a.mp4", "hole.mp4", zeros(at + size // 2, 700))

@@ -59,10 +59,6 @@ class TestScene:
                 x, y, w = camera.homography() @ foot
                 assert [row["x_m"], row["y_m"]] == pytest.approx([x / w, y / w], abs=1e-6)
 
-    def test_the_scene_is_tracked_like_a_camera(self, scene: Path, tmp_path: Path) -> None:
-        result = mcaptrack.track(scene, camera="world", output=tmp_path / "tracked.mcap")
-        assert result.tracks == {"/world/tracks": PEOPLE}
-
 
 class TestFaults:
     def test_a_homography_that_is_off_is_named_with_its_distance(self, tmp_path: Path) -> None:

@@ -32,13 +32,6 @@ def places(*strides: int) -> list[tuple[int, int, int]]:
     ]
 
 
-@pytest.mark.parametrize("strides", [(8, 16, 32), (8, 16, 32, 64), (32,)])
-def test_cells_are_numbered_row_by_row_and_stride_by_stride(strides):
-    numbers, steps = layouts.grid(SIZE, strides)
-    assert [(*map(int, cell), int(step)) for cell, step in zip(numbers, steps, strict=True)] == places(*strides)
-    assert layouts.cells(SIZE, strides) == len(places(*strides))
-
-
 @pytest.mark.parametrize(("strides", "offset"), [((8, 16, 32), 0.5), ((8, 16, 32, 64), 0.0)])
 def test_a_box_of_nanodet_reaches_from_its_cell(strides, offset):
     """In each grid, with distances of which each side's bins are sure of one number, or torn between two."""

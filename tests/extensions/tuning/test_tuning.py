@@ -325,11 +325,6 @@ def test_a_table_keeps_its_form(text, form):
     assert re.fullmatch(form, write(text))
 
 
-def test_a_missing_file_is_created(tmp_path):
-    write_settings(tmp_path / "new.toml", "track", {"min-iou": 0.3})
-    assert (tmp_path / "new.toml").read_text() == "[track]\nmin-iou = 0.3\n"
-
-
 @pytest.mark.parametrize("text", ["track = 3\n", "[[track]]\nmax-age-s = 1\n", "[track\n", "\0", "\xff"])
 def test_a_file_of_something_else_is_refused_and_stays(tmp_path, text):
     path = tmp_path / "a.toml"
