@@ -284,6 +284,10 @@ def test_an_invalid_covariance_has_no_ellipse():
     assert half[2].tolist() == [0, 0]  # no uncertainty
 
 
+def test_without_a_plane_there_are_no_forecasts_to_draw():
+    assert not any(drawn(message) for message in messages(*CHANNELS["predictions"], planes=()))
+
+
 def test_stamps_are_those_of_the_pictures_where_they_differ_from_the_log():
     stamps = PICTURES + 1_600_000_000_123_456_789
     found = list(view(*CHANNELS["retracks"], PICTURES, PLANE, stamps))
