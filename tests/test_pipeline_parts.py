@@ -20,7 +20,6 @@ from mcaptrack.geometry.camera_path import CameraPose, Verdict
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.plan import check_spaces
-from mcaptrack.pipeline.rebuild import differing
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DECISIONS, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
 from mcaptrack.schema.ground_plane import plane_to_rows
@@ -151,6 +150,7 @@ PLANS = {
         "tracks: max_age_s 2.0, not 1.4; min_hits_s 0.5, not 0.3; min_iou 0.25, not 0.2",
         track=Sort(max_age_s=2.0, min_hits_s=0.5, min_iou=0.25),
     ),
+    "a setting that is empty": other_settings("predictions: class_limits car=4, not ''", predict=Predict(class_limits="car=4")),
     "five other settings, said once": other_settings(
         "retracks: min_history 3, not 2; drift_ratio 0.5, not 0.08; max_age_s 1.0, not 2.0; and 2 more",
         retrack=MANY_OTHERS,
@@ -583,40 +583,6 @@ def test_cuts_and_pictures_without_a_motion_are_said(count, cut, lost, said, mon
     assert [notice.code for notice in notices] == ["view-lost"] * len(said)
     for notice, words in zip(notices, said, strict=True):
         assert words in notice.message
-
-
-@pytest.mark.parametrize(
-    ("wanted", "words"),
-    [
-        (Sort(), ""),
-        (Sort(max_age_s=2.0), "max_age_s 2.0, not 1.4"),
-        (
-            Sort(max_age_s=2.0, min_iou=0.5, min_hits_s=1.0),
-            "max_age_s 2.0, not 1.4; min_iou 0.5, not 0.2; min_hits_s 1.0, not ",
-        ),
-        (OcSort(), "OcSort, not Sort"),
-    ],
-)
-def test_what_differs_of_two_transforms(wanted: Any, words: str):
-    found = differing(Sort(max_age_s=1.4, min_iou=0.2), wanted)
-    assert (
-        sorted(part.split()[0] for part in found.split("; ")) == sorted(part.split()[0] for part in words.split("; "))
-        if words
-        else not found
-    )
-    for part in words.split("; "):
-        assert part in found
-
-
-def test_what_is_empty_is_shown_as_such():
-    assert differing(Predict(), Predict(class_limits="car=4")) == "class_limits car=4, not ''"
-
-
-def test_of_many_that_differ_three_are_named():
-    one = Sort()
-    other = Sort(max_age_s=9.0, min_iou=0.9, min_hits_s=9.0, cost="metres")
-    assert differing(one, other).count(", not ") == 3
-    assert differing(one, other).endswith("; and 1 more")
 
 
 def test_own_options_are_those_with_a_default_that_the_interface_does_not_have():

@@ -19,6 +19,7 @@ from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_odds_in_log, stand_throughout
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
+from mcaptrack.transforms.retrack.online_tracker import PlaceOdds
 from mcaptrack.transforms.retrack.passes import PEOPLE, KeptIds, LikelihoodPass, Movers, movers_of, usual_score
 from tests.commands import call
 from tests.logs import provenance_of
@@ -202,11 +203,6 @@ def test_rows_without_metres_count_as_if_they_were_not_there(profile):
             assert_same_rows(frame.rows, same.rows)
 
 
-def test_one_class_is_not_split():
-    frames = collect(TRACKS, [Frame(0, 0, rows_of([1, 2], [3, 3]))])
-    assert split_classes(frames) == [frames]
-
-
 def test_decisions_about_tracks_that_were_left_out_have_no_id_in_any_class():
     def run(ids: list[int]):
         rows = DECISIONS.empty(len(ids))
@@ -349,7 +345,7 @@ def drawn(seed: int, most: int) -> tuple[Paths, Motion, tuple[MotionModel, Traje
     rng = np.random.default_rng(seed)
     model, motion = models(rng)
     paths = with_companions(rng, int(rng.integers(1, most + 1)))
-    out, _ = laid_out(paths, model.noise_m)
+    out = laid_out(paths)
     return paths, motion, (model, out, smooth(model, out))
 
 
@@ -391,7 +387,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
     side = wide_m / np.sqrt(2)
     steps = [step for step in range(begins, ends + 1) if not 10 < step <= 10 + missed]
     paths = {1: {s: (side, side) if s % 4 > 1 else (0.0, 0.0) for s in steps}}
-    out, _ = laid_out(paths, 1e-3)
+    out = laid_out(paths)
     smoothed = smooth(MotionModel(1e-3, 1.0, 100.0, 0.0, 0.4), out)  # it follows the positions
     assert stand_throughout(out, smoothed, np.zeros((1, len(FEATURES))), (0, 39), 0.4).tolist() == [stands]
 
@@ -401,7 +397,7 @@ def test_who_stands_for_the_whole_log_by_hand(begins, ends, wide_m, missed, stan
     [(5, 399, 0.0, True), (6, 399, 0.0, False), (0, 25, 0.0, True), (0, 24, 0.0, False), (0, 399, 1.0, False)],
 )
 def test_two_seconds_of_a_long_log_ten_of_a_short_one_and_doubles(begins, last, in_step, stands):
-    out, _ = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))}, 0.1)
+    out = laid_out({1: dict.fromkeys(range(begins, last + 1), (0.0, 0.0))})
     smoothed = smooth(MotionModel(0.1, 1.0, 0.1, 0.1, 0.4), out)
     found = np.where(np.array(FEATURES) == "in step", in_step, 0.0)[None]
     assert stand_throughout(out, smoothed, found, (0, last), 0.4).tolist() == [stands]
@@ -464,3 +460,56 @@ def test_who_stands_for_the_whole_of_a_short_log_is_left_in_though_seen_now_and_
     found = tracked(paths)
     assert {11, 12, 13} < set(found)
     assert not {*range(20, 28)} & set(found)
+
+
+# Where lost tracks come back: the odds at places, by hand, and what is written by them online
+
+
+Positions = dict[int, tuple[float, float]]
+
+
+def test_the_ratio_of_odds_by_hand():
+    """Six of ten went well, so the share is 7 of 12 (one more of each); at the first place all four did."""
+    odds = PlaceOdds()
+    assert odds.ratio((0.0, 0.0)) == 1.0
+    for place, good, bad in (((0.0, 0.0), 4, 0), ((50.0, 0.0), 2, 4)):
+        for is_good in [True] * good + [False] * bad:
+            odds.add(place, is_good)
+    share = 7 / 12
+    assert odds.ratio((0.0, 0.0)) == pytest.approx((4 / share + 8) / 8)
+    assert odds.ratio((1.9, 0.0)) == odds.ratio((0.0, 0.0))
+    assert odds.ratio((2.1, 0.0)) == 1.0
+    assert odds.ratio((50.0, 0.0)) == pytest.approx((2 / share + 8) / (4 / (1 - share) + 8))
+
+
+def test_only_the_last_2000_count():
+    odds = PlaceOdds()
+    for _ in range(500):
+        odds.add((0.0, 0.0), False)
+    for _ in range(1000):
+        odds.add((9.0, 9.0), True)
+        odds.add((9.0, 9.0), False)
+    assert odds.ratio((0.0, 0.0)) == 1.0
+
+
+@pytest.mark.parametrize("place", [0, 1], ids=["they return", "they are gone"])
+def test_lost_tracks_are_written_where_others_came_back(place):
+    """Each 20 steps one is missed for a step after five, and goes on for six more, and another one is gone after five."""
+
+    def path(n: int) -> Positions:
+        k, age = divmod(n, 20)
+        out: Positions = {200 + c: (60.0 * (c % 2) - 20, 60.0 * (c // 2) - 20) for c in range(4)}
+        if age != 5 and age < 12:
+            out[2 * k] = (0.1 * age, 0.0)
+        if age < 5:
+            out[2 * k + 1] = (20.0 + 0.1 * age, 20.0)
+        return out
+
+    found = [places(result[1]) for result in PROFILES["default"](walk(path, 206))]
+    near = [any(abs(x - 20 * place) < 1 and abs(y - 20 * place) < 1 for x, y in here.values()) for here in found]
+    assert near[200:] == [True] * 5 + [place == 0]
+
+
+def test_places_far_away_are_places_too():
+    frames = walk(lambda n: {1: (1e12, 0.0), 3: (0.1 * (n % 3), 1.0)}, 12)
+    assert [len(result[1].rows) for result in PROFILES["default"](frames)] == [2] * 12

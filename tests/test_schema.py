@@ -53,19 +53,6 @@ def test_rows_survive_the_wire_to_the_bit(data):
 
 
 @given(st.data())
-def test_the_protobuf_runtime_reads_what_we_write(data):
-    schema = data.draw(ALL)
-    rows = schema.rows(**data.draw(columns(schema)))
-    message = schema.codec.message_class()
-    message.ParseFromString(schema.codec.encode(rows))
-    for column in schema.columns:
-        missing = -1 if rows.dtype[column.name].kind == "i" else np.nan
-        there = [not column.optional or row.HasField(column.name) for row in message.rows]
-        theirs = [getattr(row, column.name) if has else missing for row, has in zip(message.rows, there, strict=True)]
-        np.testing.assert_array_equal(np.array(theirs, rows.dtype[column.name]), rows[column.name])
-
-
-@given(st.data())
 def test_we_read_what_the_protobuf_runtime_writes(data):
     schema = data.draw(ALL)
     rows = schema.rows(**data.draw(columns(schema)))
@@ -98,23 +85,6 @@ def test_a_channel_is_its_messages_laid_end_to_end(data):
     assert decoded is not None
     assert same(decoded[0], rows)
     assert decoded[1].tolist() == counts.tolist()
-
-
-@pytest.mark.parametrize("order", ["sls", "lsl", "ssl", "lls"])
-def test_messages_with_and_without_later_columns_are_read_together(order):
-    """Of two rows each, the short ones without the columns that came later; and one without rows."""
-    box = {"y_px": [2.0, 2.0], "w_px": [3.0, 3.0], "h_px": [4.0, 4.0], "score": [0.5, 0.5], "class_id": [1, 1]}
-    parts = [DETECTIONS.empty()]
-    for number, kind in enumerate(order):
-        more = {"z_m": [7.0, 8.0], "x_m": [1.0, 1.0], "y_m": [1.0, 1.0]} if kind == "l" else {}
-        parts.append(DETECTIONS.rows(x_px=[number, 0.5], **box, **more))
-    payloads = [DETECTIONS.codec.encode(part) for part in parts]
-    assert len({len(payload) for payload in payloads[1:]}) == 2
-    end = np.cumsum([len(payload) for payload in payloads])
-    start = end - np.array([len(payload) for payload in payloads])
-    found, counts = DETECTIONS.codec.decode_at(np.frombuffer(b"".join(payloads), np.uint8), start, end)
-    assert counts.tolist() == [0, 2, 2, 2]
-    assert same(found, np.concatenate(parts))
 
 
 def test_a_writer_that_leaves_defaults_out_is_read_between_others():
@@ -215,12 +185,6 @@ def test_messages_without_later_columns_are_those_of_the_first_version_to_the_by
     assert TRACKS.codec.encode(tracks) == row(
         ("q", 1, 9), *boxless, ("d", 6, 1.5), ("d", 7, 2.0), ("f", 8, float("nan")), ("?", 9, True), ("q", 10, -1)
     )
-
-
-def test_rows_in_another_layout_are_written_the_same():
-    rows = DETECTIONS.rows(x_px=[1.0], y_px=[2.0], w_px=[3.0], h_px=[4.0], score=[0.5], class_id=[1])
-    tight = np.array(rows.tolist(), [(name, rows.dtype[name]) for name in rows.dtype.names])
-    assert DETECTIONS.codec.encode(tight) == DETECTIONS.codec.encode(rows)
 
 
 def test_bytes_that_are_no_message_are_refused():

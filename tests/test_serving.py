@@ -42,12 +42,8 @@ def path(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(path) -> Iterator[Server]:
-    with Server({path.name: path, "layout.json": b"{}"}) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-        thread.start()
+    with serving({path.name: path, "layout.json": b"{}"}) as server:
         yield server
-        server.shutdown()
-        thread.join()
 
 
 def ask(address: str, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
@@ -150,9 +146,9 @@ def test_only_the_given_files_are_served_and_only_to_this_machine(server, path):
 
 
 @contextmanager
-def serving(files: Mapping[str, Path | bytes], **limits: float) -> Iterator[Server]:
+def serving(files: Mapping[str, Path | bytes], index: Page | None = None, **limits: float) -> Iterator[Server]:
     """Start a server with limits that tests can reach."""
-    with Server(files, limits=Limits(**limits)) as server:
+    with Server(files, index=index, limits=Limits(**limits)) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.02,))
         thread.start()
         try:
@@ -209,10 +205,15 @@ def test_a_request_that_never_ends_is_closed_also_if_it_goes_on_byte_by_byte(pat
         until(is_answered)
 
 
-def test_a_viewer_that_does_not_read_is_disconnected(tmp_path):
-    large = tmp_path / "large"
-    with large.open("wb") as stream:
+@pytest.fixture
+def large(tmp_path) -> Path:
+    path = tmp_path / "large"
+    with path.open("wb") as stream:
         stream.truncate(2**28)
+    return path
+
+
+def test_a_viewer_that_does_not_read_is_disconnected(large):
     with serving({"large": large}, stall_s=0.1) as server, connect(server) as greedy:
         where = urlsplit(server.address("large"))
         greedy.sendall(f"GET {where.path} HTTP/1.1\r\nHost: {where.netloc}\r\n\r\n".encode())
@@ -247,10 +248,7 @@ def test_idle_connections_are_closed_for_new_ones(path):
             connection.close()
 
 
-def test_the_number_of_connections_is_limited(tmp_path):
-    large = tmp_path / "large"
-    with large.open("wb") as stream:
-        stream.truncate(2**28)
+def test_the_number_of_connections_is_limited(large):
     with serving({"large": large}, connections=2) as server:
         where = urlsplit(server.address("large"))
         request = f"GET {where.path} HTTP/1.1\r\nHost: {where.netloc}\r\n\r\n".encode()
@@ -351,14 +349,8 @@ def test_warnings_of_a_page_go_to_the_listener_of_the_server():
         notices.warn("odd")
         return b""
 
-    with notices.listening(heard.append):
-        server = Server({}, index=Page(content))
-    with server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.02,))
-        thread.start()
+    with notices.listening(heard.append), serving({}, Page(content)) as server:
         assert ask(server.root)[0] == 200
-        server.shutdown()
-        thread.join()
     assert [notice.message for notice in heard] == ["odd"]
 
 

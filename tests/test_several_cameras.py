@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import shutil
 from pathlib import Path
 
+import cv2
 import pytest
 
 import mcaptrack
@@ -16,9 +19,11 @@ from mcaptrack.pipeline import scenes
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, Frame
 from mcaptrack.schema.provenance import Provenance
-from tests.commands import call, done
+from tests.commands import call
+from tests.logs import recorder
 from tests.places import CAMERAS, HEIGHT, WIDTH, ran_copy, said, topics, write_log
-from tests.tiers import thorough
+from tests.tiers import one_in, thorough
+from tests.worlds import small_scene
 
 
 @pytest.fixture(scope="module")
@@ -87,12 +92,6 @@ class TestAllCameras:
         assert again.is_up_to_date
         assert list(again.cameras) == list(ran[1].cameras)
         assert ran[0].read_bytes() == before
-
-    def test_the_command_prints_a_line_for_each_camera(self, ran: tuple[Path, RunResult]) -> None:
-        told = done("run", ran[0], "--no-tables").err
-        lines = {line.split()[0]: line for line in told.splitlines() if line.startswith("  ")}
-        assert "tracks" in lines["south"]
-        assert "left out: it has neither pictures nor boxes" in lines["labelled"]
 
 
 class TestChoice:
@@ -182,3 +181,67 @@ class TestWithoutScenes:
         assert line.startswith("/world/detections is out of date, and stays as it is: ")
         with log.read(path) as opened:
             assert [message.payload for message in opened.messages("/world/detections")] == before
+
+
+# Pictures that are recorded twice, and depths: one camera is run once
+
+
+RAW, COMPRESSED, DEPTH = "/cam/color/image_raw", "/cam/color/image_raw/compressed", "/cam/depth/image_rect"
+
+
+def written(path: Path, *topics: str) -> Path:
+    """A log of the same pictures on these topics: as jpeg on one, as distances on the last."""
+    with recorder(path) as writer:
+        for topic in topics:
+            name = "foxglove.CompressedImage" if topic == COMPRESSED else "foxglove.RawImage"
+            channel = writer.add_channel(topic, (name, "jsonschema", b"{}"))
+            for number, shot in enumerate(small_scene(1.5).shots()):
+                image = cv2.cvtColor(shot.image, cv2.COLOR_BGR2GRAY)
+                height, width = image.shape
+                data, encoding, step = image.tobytes(), "mono8", width
+                if topic == DEPTH:
+                    data, encoding, step = (image.astype("<u2") * 20).tobytes(), "16UC1", 2 * width
+                if topic == COMPRESSED:
+                    data = cv2.imencode(".jpg", shot.image)[1].tobytes()
+                t_ns = 10**9 + number * 10**8
+                stamp = {"timestamp": {"sec": t_ns // 10**9, "nsec": t_ns % 10**9}, "format": "jpeg"}
+                about = {"width": width, "height": height, "encoding": encoding, "step": step}
+                content = json.dumps(stamp | about | {"data": base64.b64encode(data).decode()}).encode()
+                writer.add_message(channel, t_ns, content, t_ns)
+    return path
+
+
+@pytest.mark.parametrize("more", one_in(2, [[COMPRESSED], []]))
+def test_a_camera_that_is_recorded_twice_is_run_once(tmp_path, more):
+    topics = (RAW, *more, DEPTH)
+    result = mcaptrack.run(written(tmp_path / "a.mcap", *topics), tables=False)
+    assert {topic for topic in result.channels if topic.endswith("/detections")} == {"/cam/color/detections"}
+    assert len(result.left_out) == len(topics) - 1
+    assert ("cam/depth" in result.left_out) is (DEPTH in topics)
+    name = next(iter(result.left_out))
+    if name == "cam/depth":
+        with pytest.raises(mcaptrack.McaptrackError, match=r"has depths in .* \(16UC1\)|has depths \(16UC1\)"):
+            mcaptrack.run(tmp_path / "a.mcap", camera=name, tables=False)
+        named = mcaptrack.run(tmp_path / "a.mcap", topic=DEPTH, tables=False)
+    else:
+        named = mcaptrack.run(tmp_path / "a.mcap", camera=name, tables=False)
+    assert named.stages[0] == "detect"
+
+
+def test_the_only_pictures_are_run_whatever_their_names(tmp_path):
+    assert (
+        "/cam/color/image_raw/detections"
+        in mcaptrack.run(written(tmp_path / "a.mcap", COMPRESSED), tables=False).channels
+    )
+
+
+def test_the_pictures_of_the_only_camera_need_no_name(tmp_path):
+    with mcaptrack.open(written(tmp_path / "a.mcap", RAW)) as opened:
+        assert len(list(opened.frames())) == len(list(opened.frames("image_raw"))) == 15
+    with (
+        mcaptrack.open(written(tmp_path / "b.mcap", RAW, "/other/image")) as opened,
+        pytest.raises(
+            mcaptrack.McaptrackError, match=f"no channel video with pictures; it has pictures in {RAW}, /other/image"
+        ),
+    ):
+        opened.frames()

@@ -188,14 +188,6 @@ def test_rows_of_a_track_stand_together_and_the_file_says_in_which_order(tmp_pat
     assert read.column("row").to_pylist() == [2, 5, 8, 11, 1, 4, 7, 10, 0, 3, 6, 9]
 
 
-@given(st.lists(st.integers(-(2**63), 2**63 - 1) | st.integers(-3, 70_000), max_size=40))
-def test_whole_numbers_are_ordered_as_a_stable_sort_does(values):
-    from mcaptrack.tables.rows import stable_order
-
-    array = np.array(values, np.int64)
-    assert stable_order(array).tolist() == np.argsort(array, kind="stable").tolist()
-
-
 def test_columns_are_compressed_and_described_as_they_should_be(tmp_path):
     people = [{n: (n / 7, n / 3) for n in range(50)} for _ in range(40)]
     tables.write(tmp_path / "t.parquet", some_tracks(people), {}, TABLES["tracks"].order)

@@ -15,7 +15,7 @@ from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.mixtures import Tails, mass_within, squared_radius
 from mcaptrack.notices import Notice, listening
 from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
-from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative, running
+from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative
 from mcaptrack.predictors.tail_calibration import (
     Learned,
     TailCalibration,
@@ -473,25 +473,6 @@ class TestLevels:
         (found,) = correct(AT_ONE_TIME, counts[None]).narrow_scale
         assert found[2] > found[0] > 0.5
 
-    def test_several_times_are_corrected_as_each_of_them(self):
-        step = np.repeat(np.arange(AHEAD), 200)
-        rng = np.random.default_rng(4)
-        counts = np.stack([
-            level_counts(step, size * rng.exponential(size=len(step)), taken(SHAPE, step), AHEAD) for size in (0.3, 2)
-        ])  # fmt: skip
-        together = correct(Tails(*(np.tile(part, (2, 1)) for part in SHAPE)), counts)
-        for number, one in enumerate(counts):
-            for part, alone in zip(together, correct(AT_ONE_TIME, one[None]), strict=True):
-                assert part[number].tolist() == alone[0].tolist()
-
-
-def test_running_sums_are_those_of_each_time_after_the_one_before():
-    before, kept, new = np.array([4.0, 1.0]), np.array([0.5, 0.1, 1.0]), np.arange(6.0).reshape(3, 2)
-    sums, last = running(before, kept, new)
-    assert sums.tolist() == [[2.0, 1.5], pytest.approx([2.2, 3.15]), pytest.approx([6.2, 8.15])]
-    assert last.tolist() == sums[-1].tolist()
-    assert running(before, kept[:0], new[:0])[1].tolist() == [4, 1]
-
 
 class TestNoise:
     def lasting(self, rng: np.random.Generator, sd_m: float, steps: int, *shape: int) -> np.ndarray:
@@ -531,14 +512,6 @@ class TestNoise:
     def test_people_who_turn_are_not_taken_for_noise(self):
         assert np.hypot(*self.seen(0.01, 0.0, turns=0.5)) < 0.06
         assert self.seen(0.1, 0.0, turns=0.5)[0] == pytest.approx(0.1, rel=0.3)
-
-    def test_times_one_by_one_say_the_same_as_together(self):
-        past = self.paths(0.1, 0.2)[:30]
-        place = np.repeat(np.arange(30), 60)
-        together = PositionNoise(STEP_S).variances_m2(np.ones(30, int), place, past.reshape(-1, 8, 2))
-        noise, none = PositionNoise(STEP_S), np.zeros(60, int)
-        alone = [noise.variances_m2(np.ones(1, int), none, one) for one in past]
-        assert np.array(together).T.tolist() == [[white.item(), lasting.item()] for white, lasting in alone]
 
     def test_what_is_older_counts_less(self):
         noise, passed, none = PositionNoise(STEP_S), np.array([1]), np.zeros(60 * 93, int)

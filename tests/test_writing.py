@@ -94,10 +94,6 @@ class TestDetections:
         assert [corners.rows[name].item() for name in ("x_px", "y_px", "w_px", "h_px")] == [10, 20, 20, 40]
         assert np.isnan(corners.rows["score"]).all()
 
-    def test_a_picture_without_detections_is_a_frame(self):
-        frame = mcaptrack.detections([], t_ns=7, box_format="xywh")
-        assert (frame.t_ns, len(frame.rows), frame.rows.dtype) == (7, 0, DETECTIONS.dtype)
-
     def test_supervision_is_taken_as_it_is(self, made):
         found = made(np.array([[10.0, 20, 30, 60]]), confidence=np.array([0.5]), class_id=np.array([3]))
         (row,) = mcaptrack.detections(found, t_ns=5).rows

@@ -188,9 +188,6 @@ class TestConvention:
         )
         assert words.endswith(f"choose `layout={file!r}`")
 
-    def test_nothing_in_empty_pictures_is_no_fault(self, network):
-        assert boxes(OnnxDetector(file=str(network())), blue_blocks(SIZE), blue_blocks(SIZE)) == [[], []]
-
     def test_a_layout_that_does_not_fit_is_refused_with_those_that_do(self, network):
         words = refused(OnnxDetector(file=str(network()), layout="rtdetr"))
         assert "gives output 1 x 420 x 85" in words

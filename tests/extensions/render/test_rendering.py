@@ -19,16 +19,22 @@ from scipy.spatial.transform import Rotation
 import mcaptrack
 from mcaptrack import foxglove, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.render import video
 from mcaptrack.extensions.render.legend import with_legend
 from mcaptrack.extensions.render.video import RenderOptions, render
+from mcaptrack.sources.ingest import IngestOptions, ingest
+from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import write_clip
 from mcaptrack.viewing import from_above
 from mcaptrack.viewing.from_above import Sight
 from mcaptrack.viewing.painting import draw, message_at
 from tests.commands import call, done, printed
 from tests.logs import recorder
+from tests.robot_runs import passing_robot, place, write_passing
 from tests.robots import write_log
+from tests.test_pictures import COUNT, TOPIC, X264
 from tests.tiers import thorough
+from tests.worlds import write_clip as drawn_clip
 
 GREY = np.full((100, 200, 3), 100, np.uint8)
 
@@ -296,3 +302,94 @@ def test_views_that_a_log_lacks_are_drawn_and_the_log_stays_as_it_is(template, t
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     mcaptrack.render(path, tmp_path / "a.gif", width=64, end_s=0.2)
     assert (path.read_bytes(), [*(tmp_path / "temporary").iterdir()]) == (content, [])
+
+
+# A late part of a video: as many pictures are decoded as it takes
+
+
+def test_a_late_part_is_rendered_without_decoding_what_is_before_it(tmp_path, monkeypatch):
+    drawn_clip(tmp_path / "a.mkv", frames=COUNT, options=X264)
+    ingest(tmp_path / "a.mkv", tmp_path / "a.mcap", IngestOptions())
+    used = []
+
+    class Counted(Pictures):
+        def __init__(self, *given):
+            super().__init__(*given)
+            used.append(self)
+
+    monkeypatch.setattr(video, "Pictures", Counted)
+    with log.read(tmp_path / "a.mcap") as opened:
+        options = RenderOptions(start_s=4.4, end_s=4.95)
+        assert render(opened, TOPIC, (), tmp_path / "late.mp4", options) == 6
+        assert used[-1].decoded == 10  # 40 to 49: the key picture, and four that are not shown
+        assert render(opened, TOPIC, (), tmp_path / "all.mp4", RenderOptions()) == COUNT
+        assert used[-1].decoded == COUNT
+        thin = RenderOptions(max_fps=1.0)
+        assert render(opened, TOPIC, (), tmp_path / "thin.mp4", thin) == 6
+        assert used[-1].decoded == 6
+    with av.open(str(tmp_path / "late.mp4")) as late, av.open(str(tmp_path / "all.mp4")) as whole:
+        wanted = [frame.to_ndarray(format="gray") for frame in whole.decode(video=0)][44:50]
+        found = [frame.to_ndarray(format="gray") for frame in late.decode(video=0)]
+    assert len(found) == 6
+    for one, other in zip(found, wanted, strict=True):
+        assert np.abs(one.astype(int) - other).mean() < 2
+
+
+# Videos of a robot's log: from above, with all objects in their places
+
+
+SHOTS = 20
+
+
+@pytest.fixture(scope="module")
+def passed(tmp_path_factory) -> Path:
+    """A log of a robot after ``run``."""
+    path, _ = write_passing(tmp_path_factory.mktemp("robot"), shots=SHOTS)
+    mcaptrack.run(path, sidecar=False, tables=False)
+    return path
+
+
+def test_a_video_from_above_follows_the_robot_and_has_all_objects_in_their_places(passed, tmp_path):
+    result = mcaptrack.render(passed, tmp_path / "a.mp4", start_s=1.15, end_s=1.35)
+    assert result.views == ("/lidar/retracks/full/view/scene", "/lidar/retracks/predictions/view/scene")
+    with log.read(passed) as opened:
+        t_ns = opened.times(result.views[0])[12:14]
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        frames = [frame.to_ndarray(format="bgr24").astype(int) for frame in container.decode(video=0)]
+    assert len(frames) == len(t_ns) == result.pictures
+    robot = passing_robot(SHOTS)
+    start_ns = robot.shots[0].stamp_ns
+    image, at_ns = frames[0], int(t_ns[0])
+    base = [np.interp(at_ns, robot.stamps.astype(float), robot.place[:, axis]) for axis in (0, 1)]
+    assert image.shape[0] > 720  # a legend below
+    assert image.shape[1:] == (960, 3)
+    assert image[360, 480].min() > 180  # the robot is in the middle, in white
+    x, y = (place(3, at_ns, start_ns)[:2] - base) * 12 * [1, -1] + [480, 360]
+    near = image[round(y) + 3 : round(y) + 6, round(x) - 12 : round(x) - 2].reshape(-1, 3)  # beside the label
+    with mcaptrack.open(passed) as opened:
+        rows = opened.array("tracks", "/lidar/retracks/full")
+    now = rows[rows["t_ns"] == at_ns]
+    nearest = np.hypot(now["x_m"] - place(3, at_ns, start_ns)[0], now["y_m"] - place(3, at_ns, start_ns)[1]).argmin()
+    wanted = np.array(foxglove.colour(int(now["track_id"][nearest]))[2::-1]) * 255
+    paint = near - [32, 28, 26]
+    share = (paint * (wanted - [32, 28, 26])).sum(axis=1) / np.sum((wanted - [32, 28, 26]) ** 2)
+    assert np.median(share) == pytest.approx(0.625, abs=0.12)
+    away = image[round(720 - y), round(960 - x)]
+    assert np.abs(away - [32, 28, 26]).max() < 40
+
+
+def test_without_a_robot_all_places_are_in_the_video(tmp_path):
+    rows = [f"{n * 100_000_000},{k},{100 + 300 * k + n},{50 - 20 * k},0.5,4,2,1.5,0" for n in range(16) for k in (1, 2)]
+    (tmp_path / "truth.csv").write_text("\n".join(["t_ns,id,x_m,y_m,z_m,length_m,width_m,height_m,heading_rad", *rows]))
+    path = tmp_path / "a.mcap"
+    mcaptrack.ingest(tmp_path / "truth.csv", output=path, role="tracks", frame="map")
+    mcaptrack.run(path, tables=False, events=False)
+    result = mcaptrack.render(path, tmp_path / "a.gif", topic="/camera/tracks", width=320)
+    assert (result.pictures, result.views) == (16, ("/camera/tracks/view/scene",))
+    with av.open(str(tmp_path / "a.gif")) as container:
+        image = next(container.decode(video=0)).to_ndarray(format="bgr24").astype(int)
+    bright = np.argwhere(image[:240].max(axis=2) > 120)[:, 1]
+    assert image.shape[0] > 240  # a legend below
+    assert image.shape[1:] == (320, 3)
+    assert (bright < 60).any()
+    assert (bright > 260).any()
