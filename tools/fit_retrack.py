@@ -42,7 +42,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
-from mcaptrack.transforms.retrack.decisions import draw_worlds, find_joins
+from mcaptrack.transforms.retrack.decisions import JOINS, draw_worlds, find_joins
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.motion_model import Tracks, Trajectories, filtered, to_trajectories
 from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers, motion_model
@@ -379,7 +379,8 @@ def named(names: tuple[str, ...], weights: np.ndarray) -> dict[str, float]:
 
 def install(module: Any, name: str, fitted: dict[str, Any]) -> None:
     """Let a module decide by these weights, in this process; ``name`` is that of its regression."""
-    setattr(module, name, Logistic(np.array(list(fitted["weights"].values())), fitted["bias"], fitted))
+    weights = fitted["weights"]
+    setattr(module, name, Logistic(tuple(weights), np.array([*weights.values()]), fitted["bias"], fitted))
 
 
 def held(seeds: list[int], steps: int) -> None:
@@ -399,7 +400,7 @@ def held(seeds: list[int], steps: int) -> None:
         row = summary(combine(side))
         print(f"{name:12}{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")
     made, *people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
-    show_reliability("joins", offline.JOINS.probability(made[0]), made[1])
+    show_reliability("joins", JOINS.probability(made[0]), made[1])
     for name, (log_odds, are_people) in zip(("people and false tracks", "short tracks"), people, strict=True):
         is_person = probability(log_odds[:, 0])
         is_right = np.where(is_person >= 0.5, are_people, ~are_people)
@@ -430,7 +431,8 @@ def main() -> None:
     pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)
     install(linking, "_LINKS", links)
-    linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
+    linking._PRIOR = links["usual"]
+    linking.MIN_LOG_ODDS = hypotheses.MIN_LOG_ODDS = links["least"]
     linking._BY_GAP = np.array(links["usual by gap"])
     more = [*scenes, *runs(MORE, given.steps)]
     choices = fit_choices(list(told(choices_of, more, "choices")))
@@ -441,7 +443,7 @@ def main() -> None:
     false_tracks._THROUGHOUT = people["stands throughout"]
     for name in ("mean", "spread"):
         setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))
-    offline.PERSON = offline.SHORT = Logistic(np.ones(1), 0.0, {})  # what is fitted
+    offline.PERSON = offline.SHORT = Logistic((), np.ones(1), 0.0, {})  # what is fitted
     offline._SHORT = np.inf
     judged = fit_decisions(others)
     card = {
