@@ -275,7 +275,7 @@ def decisions_of(run: Run) -> tuple[Judged, Judged, Judged]:
     is_person = np.bincount(track, people >= 0) * 2 >= count
     log, *_ = reached("_people", *run.args)
     lasts = [np.ptp(tracks.step[tracks.track == name]) for name in np.unique(tracks.track)]
-    short = np.array(lasts) < round(log.least_s * DEFAULT.rate_hz)
+    short = np.array(lasts) < log.least_steps
     return joins, *(Judged(decided.log_odds[some, None], is_person[some]) for some in (~short, short))
 
 
@@ -284,9 +284,8 @@ def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
     number that was decided, and those that 5 %, 50 % and 95 % of the worlds don't exceed.
     """
     log, decided = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
-    least_steps = round(log.least_s * DEFAULT.rate_hz)
     tracks, choices, tracklets = decided.tracks, decided.hypotheses, decided.hypotheses.tracklets
-    some_worlds = draw_worlds(50, decided, DEFAULT.link_confidence, least_steps)
+    some_worlds = draw_worlds(50, decided, DEFAULT.link_confidence, log.least_steps)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
     link = find_joins(decided, run.args[1].step_s).link
     before, after = choices.before[link], choices.after[link]
