@@ -215,21 +215,6 @@ def test_links_are_less_likely_the_less_both_sides_fit(tall):
     )
 
 
-def test_a_way_that_is_hidden_throughout_is_likelier_than_one_that_is_hidden_in_part():
-    """Somebody nearer to the camera stands before the whole way or before its middle, while track 1 is missed."""
-
-    def least_likely(tall: float) -> float:
-        frames = with_gap(100.0, range(8, 12))
-        x = walking(10, 100.0)[0]
-        hiding = {n: frame(n, {5: (x, 450.0, tall)}).rows for n in range(7, 13)}
-        both = [np.concatenate([one.rows, hiding.get(one.index, one.rows[:0])]) for one in frames]
-        frames = [one._replace(rows=rows) for one, rows in zip(frames, both, strict=True)]
-        asked = 1 / (1 + np.exp(-np.linspace(-8, 8, 65)))
-        return max((least for least in asked.tolist() if ids_in_picture(frames, 4.0, least) == {1, 5}), default=0.0)
-
-    assert least_likely(600.0) > least_likely(200.0) > 0
-
-
 def test_a_track_is_cut_where_another_one_goes_on_there():
     """The tracker continues track 1 with somebody much smaller far away, and begins track 2 where the person is."""
 
