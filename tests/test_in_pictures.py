@@ -255,6 +255,18 @@ def test_gaps_are_filled_only_as_long_as_a_straight_line_is_right():
     assert steady_s([], 4.0) == 4.0
 
 
+def test_gaps_are_filled_where_nine_in_ten_walk_straight():
+    """Of people a hundred heights apart some turn every second: of 0.5 s and more a straight line is wrong for these."""
+
+    def boxes(n: int, people: int) -> dict[int, Box]:
+        turned = 100.0 * float(np.sin(2 * np.pi * n / 10))
+        return {k: (9e3 * k + (turned if k == 0 else 10.0 * n), 300, 90) for k in range(people)}
+
+    for people, is_filled in ((5, False), (30, True)):
+        longest_s = steady_s([frame(n, boxes(n, people), 10.0) for n in range(100)], 4.0)
+        assert (longest_s == 4.0) == is_filled, people
+
+
 def test_the_longest_gaps_are_linked_and_no_longer_ones():
     for missed, joined in ((10, True), (11, False)):  # 4.0 and 4.4 s between the samples before and after
         frames = with_gap(100.0, range(4, 3 + missed))
