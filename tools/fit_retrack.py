@@ -42,7 +42,7 @@ from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Sample
 from mcaptrack.transforms.retrack import false_tracks, hypotheses, linking, offline
-from mcaptrack.transforms.retrack.decisions import draw_worlds, find_joins
+from mcaptrack.transforms.retrack.decisions import JOINS, draw_worlds, find_joins
 from mcaptrack.transforms.retrack.hypotheses import Hypotheses, Tracklets
 from mcaptrack.transforms.retrack.motion_model import Tracks, Trajectories, filtered, to_trajectories
 from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers, motion_model
@@ -275,7 +275,7 @@ def decisions_of(run: Run) -> tuple[Judged, Judged, Judged]:
     is_person = np.bincount(track, people >= 0) * 2 >= count
     log, *_ = reached("_people", *run.args)
     lasts = [np.ptp(tracks.step[tracks.track == name]) for name in np.unique(tracks.track)]
-    short = np.array(lasts) < round(log.least_s * DEFAULT.rate_hz)
+    short = np.array(lasts) < log.least_steps
     return joins, *(Judged(decided.log_odds[some, None], is_person[some]) for some in (~short, short))
 
 
@@ -284,9 +284,8 @@ def worlds_of(run: Run) -> tuple[Judged, np.ndarray]:
     number that was decided, and those that 5 %, 50 % and 95 % of the worlds don't exceed.
     """
     log, decided = reached("_worlds", replace(DEFAULT, worlds=50), *run.args[1:])
-    least_steps = round(log.least_s * DEFAULT.rate_hz)
     tracks, choices, tracklets = decided.tracks, decided.hypotheses, decided.hypotheses.tracklets
-    some_worlds = draw_worlds(50, decided, DEFAULT.link_confidence, least_steps)
+    some_worlds = draw_worlds(50, decided, DEFAULT.link_confidence, log.least_steps)
     begins, ends = sides_of(tracks, tracklets, run.people(tracks))
     link = find_joins(decided, run.args[1].step_s).link
     before, after = choices.before[link], choices.after[link]
@@ -379,7 +378,8 @@ def named(names: tuple[str, ...], weights: np.ndarray) -> dict[str, float]:
 
 def install(module: Any, name: str, fitted: dict[str, Any]) -> None:
     """Let a module decide by these weights, in this process; ``name`` is that of its regression."""
-    setattr(module, name, Logistic(np.array(list(fitted["weights"].values())), fitted["bias"], fitted))
+    weights = fitted["weights"]
+    setattr(module, name, Logistic(tuple(weights), np.array([*weights.values()]), fitted["bias"], fitted))
 
 
 def held(seeds: list[int], steps: int) -> None:
@@ -399,7 +399,7 @@ def held(seeds: list[int], steps: int) -> None:
         row = summary(combine(side))
         print(f"{name:12}{100 * row['IDF1']:.1f} / {100 * row['MOTA']:.1f} / {row['IDSW']}")
     made, *people = ([np.concatenate(both) for both in zip(*one, strict=True)] for one in zip(*outcomes, strict=True))
-    show_reliability("joins", offline.JOINS.probability(made[0]), made[1])
+    show_reliability("joins", JOINS.probability(made[0]), made[1])
     for name, (log_odds, are_people) in zip(("people and false tracks", "short tracks"), people, strict=True):
         is_person = probability(log_odds[:, 0])
         is_right = np.where(is_person >= 0.5, are_people, ~are_people)
@@ -430,7 +430,8 @@ def main() -> None:
     pairs = list(told(pairs_of, scenes, "links"))
     links = fit_links(pairs)
     install(linking, "_LINKS", links)
-    linking._PRIOR, linking._MIN_LOG_ODDS = links["usual"], links["least"]
+    linking._PRIOR = links["usual"]
+    linking.MIN_LOG_ODDS = hypotheses.MIN_LOG_ODDS = links["least"]
     linking._BY_GAP = np.array(links["usual by gap"])
     more = [*scenes, *runs(MORE, given.steps)]
     choices = fit_choices(list(told(choices_of, more, "choices")))
@@ -441,7 +442,7 @@ def main() -> None:
     false_tracks._THROUGHOUT = people["stands throughout"]
     for name in ("mean", "spread"):
         setattr(false_tracks, f"_{name.upper()}", np.array(list(people[name].values())))
-    offline.PERSON = offline.SHORT = Logistic(np.ones(1), 0.0, {})  # what is fitted
+    offline.PERSON = offline.SHORT = Logistic((), np.ones(1), 0.0, {})  # what is fitted
     offline._SHORT = np.inf
     judged = fit_decisions(others)
     card = {

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.geometry.angles import wrapped
-from mcaptrack.geometry.arrays import Ints
+from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows, framing
 from mcaptrack.schema.framing import frame_times, join_frames, row_ends
 
 #: The columns of a track that are interpolated, and those that are angles.
-LINEAR: Final = (
+_LINEAR: Final = (
     *("x_px", "y_px", "w_px", "h_px", "x_m", "y_m", "score"),
     *("z_m", "length_m", "width_m", "height_m", "vx_m_per_s", "vy_m_per_s"),
 )
-ANGLES: Final = ("heading_rad",)
+_ANGLES: Final = ("heading_rad",)
 #: A step longer than this many median frame intervals is a gap: rows in it are not observed.
 _MAX_STEP: Final = 1.5
 
@@ -73,17 +73,24 @@ def resample(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int, usual_ns: fl
     span = np.where(is_linked, step_ns, 1)[before]
     share = (at_ns[at] - row_ns[before]) / span
 
-    out = rows.take(before)
-    for name in LINEAR:
-        start, end = rows[name][before], rows[name][after]
-        out[name] = np.where(share == 0, start, start + share * (end - start))
-    for name in ANGLES:
-        start, end = rows[name][before], rows[name][after]
-        out[name] = np.where(share == 0, start, wrapped(start + share * wrapped(end - start)))
-    between = rows["observed"][before] & rows["observed"][after] & (span <= _MAX_STEP * usual_ns)
-    out["observed"] = np.where(share == 0, rows["observed"][before], between)
+    start, end = rows.take(before), rows.take(after)
+    out = between(start, end, share)
+    is_seen = start["observed"] & end["observed"] & (span <= _MAX_STEP * usual_ns)
+    out["observed"] = np.where(share == 0, start["observed"], is_seen)
     order = np.lexsort((out["track_id"], at))
     return out.take(order), at[order].astype(np.int64)
+
+
+def between(before: Rows, after: Rows, share: Floats) -> Rows:
+    """Copies of rows of tracks (S,), moved by a ``share`` (S,) of the way to others; a share of 0 changes nothing."""
+    out = before.copy()
+    for name in _LINEAR:
+        start, end = before[name], after[name]
+        out[name] = np.where(share == 0, start, start + share * (end - start))
+    for name in _ANGLES:
+        start, end = before[name], after[name]
+        out[name] = np.where(share == 0, start, wrapped(start + share * wrapped(end - start)))
+    return out
 
 
 def resample_parts(frames: Sequence[Frame], at_ns: Ints, max_gap_ns: int) -> Iterator[tuple[int, int, Rows, Ints]]:

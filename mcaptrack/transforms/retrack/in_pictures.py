@@ -5,9 +5,9 @@ is measured well, and so is its height. Positions, speeds, noise and gates are t
 people near and far move alike. A tracker associates boxes by their overlap at the rate of the video, which is right
 from picture to picture, and often wrong after people were hidden. So its tracks are cut wherever they have a gap, and
 which pieces are of one person is decided once for the whole log: an assignment by log odds. These are a logistic
-regression, of how well motion and size before a gap fit those after it, of the tracker's own decision, and of how far
-people nearer to the camera hide the way in between. A second one weighs each pair against the others that would take
-its place. What people wear counts, too, where the log has pictures that tell people apart.
+regression, of how well motion and size before a gap fit those after it, and of the tracker's own decision. A second one
+weighs each pair against the others that would take its place. What people wear counts, too, where the log has pictures
+that tell people apart.
 
 Letters: K pieces of tracks, N rows, E candidate links.
 """
@@ -22,7 +22,7 @@ import numpy as np
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.ragged import batches, group_index, ragged_range, run_starts
+from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import TRACKS, Rows
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, filtered_rows, joined_parts, mapped_rows
@@ -51,12 +51,6 @@ _MOST_MISSED: Final = 10.0
 _SHARE_OF_ODDS: Final = 0.5
 #: Log odds count for no more than that in those of others.
 _MOST: Final = 30.0
-#: So many times within a gap it is asked whether the way is hidden.
-_TIMES: Final = 6
-#: A box hides those behind it: its lower edge is at most so many of their heights above theirs.
-_BEHIND: Final = 0.05
-#: Pairs of boxes at once, for what is hidden.
-_AT_ONCE: Final = 2**17
 #: The height of a person, for how far people may have walked between two places in the picture: as if all were as far
 #: away as the usual box.
 _PERSON_M: Final = 1.7
@@ -142,7 +136,7 @@ class BoxPieces(NamedTuple):
     """The boxes of what trackers were sure of: those of piece k are ``first[k]`` to ``first[k + 1]`` of N, by time.
 
     ``source`` (K,) are the ids of their tracks and ``classes`` (K,) their classes; pieces are ordered by track, then
-    by time. ``usual_s`` is the usual time from frame to frame, ``frame_s`` (F,) the times of all frames.
+    by time. ``usual_s`` is the usual time from frame to frame.
     """
 
     source: Ints
@@ -151,7 +145,6 @@ class BoxPieces(NamedTuple):
     t_s: Floats
     frame: Ints
     classes: Ints
-    frame_s: Floats
     usual_s: float
 
     @property
@@ -172,33 +165,29 @@ def find_pieces(frames: FrameColumns, fixed: Collection[int]) -> BoxPieces:
     order = np.flatnonzero(kept)[np.lexsort((frame[kept], track[kept]))]
     track, boxes, frame = track[order], boxes[order], frame[order]
     usual_s = interval_ns(frames.t_ns) / NS_PER_S
-    frame_s = (frames.t_ns - frames.t_ns[:1]) / NS_PER_S
-    t_s = frame_s[frame]
+    t_s = (frames.t_ns[frame] - frames.t_ns[:1]) / NS_PER_S
     is_first = run_starts(track)
     gap_s = np.diff(t_s, prepend=t_s[:1])
     is_first |= (gap_s > max(CUT_S, _MISSING_FRAMES * usual_s)) & ~np.isin(track, np.array(sorted(fixed), np.int64))
     first = np.append(np.flatnonzero(is_first), len(track))
-    return BoxPieces(track[first[:-1]], first, boxes, t_s, frame, classes[order][first[:-1]], frame_s, usual_s)
+    return BoxPieces(track[first[:-1]], first, boxes, t_s, frame, classes[order][first[:-1]], usual_s)
 
 
 class _Ends(NamedTuple):
     """The ends or the beginnings of K pieces.
 
-    Times (K,) in s and frames (K,); boxes (K, 4); positions (K, 2) in px and velocities (K, 2) in px/s; heights (K,) in
-    px and their logarithms (K,) there; variances of positions and of velocities (K,), in squared heights; durations
-    (K,) in s, of which these are known.
+    Times (K,) in s; widths (K,) in px; positions (K, 2) in px and velocities (K, 2) in px/s; heights (K,) in px and
+    their logarithms (K,) there; variances of positions and of velocities (K,), in squared heights.
     """
 
     t_s: Floats
-    frame: Ints
-    boxes: Floats
+    width_px: Floats
     xy_px: Floats
     v_px_per_s: Floats
     height_px: Floats
     log_height: Floats
     variance: Floats
     speed_variance: Floats
-    known_s: Floats
 
 
 def _ends(pieces: BoxPieces, at: Ints) -> _Ends:
@@ -215,35 +204,17 @@ def _ends(pieces: BoxPieces, at: Ints) -> _Ends:
     height_px = total(boxes[:, 3]) / count
     zero, first, two = weight * count, weight * total(since), weight * total(since**2)
 
-    def fitted(values: Floats, noise: float, speed: float) -> tuple[Floats, Floats, Floats, Floats]:
-        """Value and slope at the end, and their variances: a line, with slopes of about ``speed``."""
+    def fitted(values: Floats, noise: float, speed: float) -> Floats:
+        """Value and slope at the end, and their variances, (4, K): a line, with slopes of about ``speed``."""
         low, mixed, high = zero / noise**2, first / noise**2, two / noise**2 + 1 / speed**2
         a, b = weight * total(values) / noise**2, weight * total(values * since) / noise**2
-        determinant = low * high - mixed**2
-        return (
-            (high * a - mixed * b) / determinant,
-            (low * b - mixed * a) / determinant,
-            high / determinant,
-            low / determinant,
-        )
+        return np.asarray(np.stack([high * a - mixed * b, low * b - mixed * a, high, low]) / (low * high - mixed**2))
 
     middle = (boxes[:, :2] + boxes[:, 2:] / 2) / height_px[piece, None]
     fits = [fitted(middle[:, axis], _NOISE, _SPEED) for axis in (0, 1)]
     place, speed = (np.stack([fit[k] for fit in fits], axis=-1) * height_px[:, None] for k in (0, 1))
     log_height, *_ = fitted(np.log(boxes[:, 3]), _HEIGHT_NOISE, _GROWTH)
-    known_s = count * pieces.usual_s
-    return _Ends(
-        pieces.t_s[at],
-        pieces.frame[at],
-        pieces.boxes[at],
-        place,
-        speed,
-        height_px,
-        log_height,
-        fits[0][2],
-        fits[0][3],
-        known_s,
-    )
+    return _Ends(pieces.t_s[at], pieces.boxes[at, 2], place, speed, height_px, log_height, *fits[0][2:])
 
 
 def _appearance(
@@ -326,18 +297,12 @@ def find_candidates(pieces: BoxPieces, max_gap_s: float, across_classes: bool = 
         return np.asarray(((off / height_px[:, None]) ** 2).sum(axis=1) / spread / 2)
 
     miss, edge = miss_at(0.0), np.minimum(miss_at(-1.0), miss_at(1.0))  # a box shrinks at one end, where it is hidden
-    wider = np.abs(np.log(begun.boxes[j, 2] / lost.boxes[i, 2]))
+    wider = np.abs(np.log(begun.width_px[j] / lost.width_px[i]))
     tall = _HEIGHT_END_NOISE**2 + (_HEIGHT_DRIFT * gap_s) ** 2
     growth = (begun.log_height[j] - lost.log_height[i]) ** 2 / tall / 2
     near = np.flatnonzero((miss < _MOST_MISSED) & (growth < _MOST_MISSED))
     i, j, gap_s = i[near], j[near], gap_s[near]
     rarity = -np.log(2 * np.pi * spread[near]) - np.log(tall[near]) / 2 - np.log(_births(pieces))
-    hidden = _hidden_between(pieces, lost, begun, i, j)
-    every = np.arange(len(pieces.source))
-    hidden_after = np.maximum(
-        _hidden(pieces, begun.frame, begun.boxes, every, every),
-        _hidden(pieces, np.maximum(begun.frame - 1, 0), begun.boxes, every, every),
-    )
     values = {
         "log miss": np.log1p(edge[near]),
         "log growth": np.log1p(growth[near]),
@@ -345,12 +310,7 @@ def find_candidates(pieces: BoxPieces, max_gap_s: float, across_classes: bool = 
         "log gap": np.log(gap_s),
         "gap": gap_s,
         "same track": (pieces.source[i] == pieces.source[j]) & (j == i + 1),
-        "hidden after": hidden_after[j],
-        "hidden": hidden.mean(axis=1),
-        "least hidden": hidden.min(axis=1, initial=1.0),
         "log rarity": rarity,
-        "short before": 1 / np.sqrt(_ERRORS_PER_S * lost.known_s[i] + 0.1),
-        "short after": 1 / np.sqrt(_ERRORS_PER_S * begun.known_s[j] + 0.1),
     }
     return i, j, columns(FEATURES, values)
 
@@ -364,31 +324,3 @@ def _births(pieces: BoxPieces) -> float:
     far = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) - boxes[:, :2].min(axis=0)
     seconds = max(float(np.ptp(pieces.t_s)), 1.0)
     return len(pieces.source) / (seconds * max(float(far.prod()) / usual_px**2, 1.0))
-
-
-def _hidden_between(pieces: BoxPieces, lost: _Ends, begun: _Ends, i: Ints, j: Ints) -> Floats:
-    """The hidden share of the way between ends ``i`` (E,) and beginnings ``j`` (E,), at ``_TIMES`` times, (E, T)."""
-    out = np.empty((len(i), _TIMES))
-    for number in range(_TIMES):
-        share = (number + 1) / (_TIMES + 1)
-        when = lost.t_s[i] + share * (begun.t_s[j] - lost.t_s[i])
-        frame = np.minimum(np.searchsorted(pieces.frame_s, when), len(pieces.frame_s) - 1)
-        boxes = lost.boxes[i] + share * (begun.boxes[j] - lost.boxes[i])
-        out[:, number] = _hidden(pieces, frame, boxes, i, j)
-    return out
-
-
-def _hidden(pieces: BoxPieces, frame: Ints, boxes: Floats, own: Ints, other: Ints) -> Floats:
-    """The share of boxes (E, 4) at frames (E,) that one box of a third piece hides, which is nearer to the camera."""
-    order = np.argsort(pieces.frame, kind="stable")
-    low, high = (np.searchsorted(pieces.frame[order], frame, side) for side in ("left", "right"))
-    share, piece_of = np.zeros(len(frame)), pieces.piece
-    for part in batches(high - low, _AT_ONCE):
-        which, row = part.start + group_index((high - low)[part]), order[ragged_range(low[part], (high - low)[part])]
-        hiding, hidden, piece = pieces.boxes[row], boxes[which], piece_of[row]
-        corner = np.minimum(hiding[:, :2] + hiding[:, 2:], hidden[:, :2] + hidden[:, 2:])
-        overlap = np.clip(corner - np.maximum(hiding[:, :2], hidden[:, :2]), 0, None).prod(axis=1)
-        is_nearer = hiding[:, 1] + hiding[:, 3] > hidden[:, 1] + (1 - _BEHIND) * hidden[:, 3]
-        counts = is_nearer & (piece != own[which]) & (piece != other[which])
-        np.maximum.at(share, which, np.where(counts, overlap / hidden[:, 2:].prod(axis=1), 0.0))
-    return share

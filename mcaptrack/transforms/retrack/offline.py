@@ -12,7 +12,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
@@ -20,7 +19,7 @@ from mcaptrack.schema import APPEARANCE, DECISIONS, TRACKS, WORLDS, Rows
 from mcaptrack.schema.classes import majority
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import spans_of
-from mcaptrack.schema.resampling import ANGLES, LINEAR
+from mcaptrack.schema.resampling import between
 from mcaptrack.transforms.retrack.appearance import Appearance, AppearanceCalibration, Sides, appearance_rows
 from mcaptrack.transforms.retrack.decisions import (
     CERTAIN,
@@ -131,13 +130,9 @@ def rows_by_step(
 def _rows(which: TrackRows, samples: FrameColumns) -> Rows:
     """Rows (R,) of tracks."""
     before, is_sample = samples.take(which.before), which.is_sample
-    after, rows = before.copy(), before.copy()
+    after = before.copy()
     after[~is_sample] = samples.take(which.after[~is_sample])
-    for name in LINEAR:
-        rows[name] += which.share * (after[name] - before[name])
-    for name in ANGLES:
-        step_rad = wrapped(after[name] - before[name])
-        rows[name] = np.where(is_sample, rows[name], wrapped(rows[name] + which.share * step_rad))
+    rows = between(before, after, which.share)
     rows["source_id"] = np.where(is_sample, rows["track_id"], -1)
     rows["observed"] &= is_sample
     rows["track_id"] = which.track
@@ -163,10 +158,11 @@ class WholeLog(NamedTuple):
         return self.options.link_s / self.movers.unit_m
 
     @property
-    def least_s(self) -> float:
-        """The least seconds that tracks last."""
+    def least_steps(self) -> int:
+        """The least steps that tracks last."""
         steps, share = self.run.steps, _CONFIRMED_SHARE if self.movers.on_ground else 1.0
-        return share * self.options.shortest_s((steps[-1] - steps[0]) * self.model.step_s)
+        least_s = share * self.options.shortest_s((steps[-1] - steps[0]) * self.model.step_s)
+        return round(least_s * self.options.rate_hz)
 
 
 def offline_tracks(
@@ -260,7 +256,7 @@ def _people(log: WholeLog, tracks: Tracks, rows: TrackRows, paths: Trajectories)
     is_fixed = np.isin(ids, tracks.track[np.isin(tracks.source, np.array(options.fixed_ids, np.int64))])
     is_fixed |= np.isin(ids, log.answers.persons(tracks, yes=True))
     is_clutter = np.isin(ids, log.answers.persons(tracks, yes=False)) & ~is_fixed
-    is_short = np.diff(paths.first) <= round(log.least_s * options.rate_hz)
+    is_short = np.diff(paths.first) <= log.least_steps
     smoothed = smooth(log.model, paths)
     if movers.on_ground:
         odds = scored_log_odds(
@@ -284,8 +280,7 @@ def _worlds(log: WholeLog, decided: Decided) -> Worlds:
     """The worlds of what was decided; those of each class have a seed of their own."""
     options, tracks, first = log.options, decided.tracks, decided.hypotheses.tracklets.first
     of_class = int(column(log.run.samples, "class_id")[0])
-    least_steps = round(log.least_s * options.rate_hz)
-    worlds = draw_worlds(options.worlds, decided, options.link_confidence, least_steps, of_class)
+    worlds = draw_worlds(options.worlds, decided, options.link_confidence, log.least_steps, of_class)
     if options.fixed_ids:
         for track in worlds.track:
             whole = tracks._replace(track=track[decided.hypotheses.tracklets.of])

@@ -46,7 +46,7 @@ from mcaptrack.transforms.retrack.options import LikelihoodOptions, RetrackOptio
 from mcaptrack.transforms.to_video_rate import move_rows
 
 
-def column(frames: FrameColumns, name: str) -> NDArray[Any]:
+def column(frames: Sequence[Frame], name: str) -> NDArray[Any]:
     """A column of all rows of tracks, (N,).
 
     A person who is seen for an hour has 9,000 samples at 2.5 Hz. What re-tracking holds for each of them, from the
@@ -144,8 +144,7 @@ PEOPLE: Final[Movers] = Movers()
 
 def usual_score(frames: Sequence[Frame]) -> float:
     """The median score of the observed rows of a log; 1 where there are none."""
-    parts = [part.rows["score"][part.rows["observed"]] for _, _, part in joined_parts(TRACKS, frames)]
-    scores = np.concatenate([np.empty(0, np.float32), *parts])
+    scores = column(frames, "score")[column(frames, "observed")]
     scores = scores[np.isfinite(scores)]
     return max(float(np.median(scores)), 1e-6) if len(scores) else 1.0
 
