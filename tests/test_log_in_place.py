@@ -257,25 +257,21 @@ def test_owner_and_group_stay(path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("user.note", b"take 3"), ("system.posix_acl_access", ACCESS_LIST)], ids=["note", "access"]
+    ("place", "name", "value"),
+    [
+        ("a.mcap", "user.note", b"take 3"),
+        ("a.mcap", "system.posix_acl_access", ACCESS_LIST),
+        (".", "system.posix_acl_default", ACCESS_LIST),
+    ],
+    ids=["note", "access", "of the folder"],
 )
-def test_attributes_stay(path, name, value):
+def test_attributes_stay_and_what_a_folder_gives_to_new_files_does_not_come(path, place, name, value):
     try:
-        os.setxattr(path, name, value)
-    except OSError as error:
-        pytest.skip(f"the file system keeps no attributes: {error.strerror}")
-    before = attributes(path)
-    assert name in before
-    add(path)
-    assert attributes(path) == before
-
-
-def test_what_a_folder_gives_to_new_files_does_not_come_to_an_old_one(path, tmp_path):
-    try:
-        os.setxattr(tmp_path, "system.posix_acl_default", ACCESS_LIST)
+        os.setxattr(path.parent / place, name, value)
     except OSError as error:
         pytest.skip(f"the file system keeps no attributes: {error.strerror}")
     before = attributes(path), path.stat().st_mode
+    assert (name in before[0]) == (place == path.name)
     add(path)
     assert (attributes(path), path.stat().st_mode) == before
 
