@@ -115,8 +115,6 @@ class Robot:
 
 # Writers
 
-Message = tuple[str, int, bytes]
-
 
 @cache
 def ros(name: str, definition: str = "", ros1: bool = False) -> Ros:

@@ -563,15 +563,11 @@ def times_of(path: Path) -> tuple[dict[int, int], list[notices.Notice]]:
     return {len(frame.rows): frame.t_ns for frame in frames}, said
 
 
-@pytest.mark.parametrize("header", ["header", "image_header"])
-def test_boxes_are_at_the_time_of_the_picture_with_their_stamp(tmp_path, header):
-    times, said = times_of(written(tmp_path / "a.mcap", taken_s, header=header))
-    assert times == {number: ns(taken_s(number) + LATE_S) for number in range(COUNT)}
-    assert said == []
-
-
-def test_a_picture_that_was_not_recorded_is_as_late_as_the_others(tmp_path):
-    times, said = times_of(written(tmp_path / "a.mcap", taken_s, pictures=[n for n in range(COUNT) if n % 3]))
+@pytest.mark.parametrize(
+    "how", [{}, {"header": "image_header"}, {"pictures": [number for number in range(COUNT) if number % 3]}]
+)
+def test_boxes_are_at_the_time_of_their_picture_also_if_it_was_not_recorded(tmp_path, how):
+    times, said = times_of(written(tmp_path / "a.mcap", taken_s, **how))
     assert times == {number: ns(taken_s(number) + LATE_S) for number in range(COUNT)}
     assert said == []
 

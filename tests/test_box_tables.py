@@ -15,9 +15,6 @@ from mcaptrack.sources.ingest.labels import delimited
 from mcaptrack.sources.ingest.labels.timeline import Timeline
 from tests.label_cases import read, refused, said, table
 
-NAN = float("nan")
-
-
 # Numbers up to their bounds
 
 

@@ -499,21 +499,54 @@ def textured(height: int = 160, width: int = 240, seed: int = 3) -> np.ndarray:
 
 def shifted(wide: np.ndarray, by: float) -> np.ndarray:
     """A view of 240 x 160 pixels into a wide picture, so many pixels from its left edge."""
-    import cv2
-
     moved = cv2.warpAffine(wide, np.array([[1.0, 0, -by], [0, 1, 0]]), (wide.shape[1], wide.shape[0]))
     return np.ascontiguousarray(moved[:, :240])
 
 
-def test_a_shift_of_more_than_a_tenth_of_the_diagonal_is_motion():
+@pytest.mark.parametrize(("degrees", "scale", "shift"), [(2.0, 1.0, (0, 0)), (0.0, 1.03, (0, 0)), (1.0, 0.98, (3, -2))])
+def test_rotation_scale_and_shift_are_estimated(degrees, scale, shift):
+    still, camera = textured(), Registration()
+    matrix = cv2.getRotationMatrix2D((120, 80), degrees, scale)
+    matrix[:, 2] += shift
+    camera.register(still)
+    image = cv2.warpAffine(still, matrix, (240, 160), borderMode=cv2.BORDER_REPLICATE)
+    found, begins = camera.register(image)
+    assert not begins
+    corners = np.array([[0.0, 0.0], [240, 0], [0, 160], [240, 160]])
+    np.testing.assert_allclose(move_points(found, move_points(matrix, corners)), corners, atol=0.5)
+
+
+def test_a_view_begins_where_the_camera_has_settled_further_away_than_a_tenth_of_the_diagonal():
     """A tenth of the diagonal of 240 x 160 pixels is 28.8 px; the camera turns slowly, so that each picture fits."""
-    wide, camera, views = textured(width=480), Registration(), {}
-    for by in range(33):
-        camera.register(shifted(wide, by))
-        views[by] = camera.view
-    assert {by: view for by, view in views.items() if abs(by - 28.8) > 0.5} == {
-        by: "moving" if by > 28.8 else "steady" for by in views if abs(by - 28.8) > 0.5
-    }
+    wide, camera = textured(width=480), Registration()
+    path = [*[0] * 5, *range(1, 50), *[50] * 60, 52]
+    seen = [(by, *camera.register(shifted(wide, by)), camera.view) for by in path]
+    first, second = (number for number, (_, _, begins, _) in enumerate(seen) if begins)
+    assert (first, path.index(50) < second <= path.index(50) + 15) == (0, True)
+    views = [(by > 28.8, view) for by, _, _, view in seen[:second] if abs(by - 28.8) > 0.5]
+    assert [view for _, view in views] == ["moving" if is_far else "steady" for is_far, _ in views]
+    assert all(np.array_equal(found, IDENTITY) for _, found, _, _ in seen[second:-1])
+    assert camera.view == "steady"
+    assert seen[-1][1][0, 2] == pytest.approx(2, abs=0.3)
+
+
+@pytest.mark.parametrize("seen", [1, 5])
+def test_another_view_begins_after_15_pictures_that_do_not_fit(seen):
+    """Whether the camera was seen to stand still before, so that the cut is certain, or not."""
+    camera, still = Registration(), textured()
+    other = np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
+    for picture in [still] * seen + [other] * 10 + [still] + [other] * 15:
+        begins = camera.register(picture)[1]
+        assert (camera.view == "steady") == (picture is still)
+    assert not begins
+    assert [camera.register(other)[1] for _ in range(25)] == [True] + [False] * 24
+    assert camera.view == "steady"
+
+
+def test_pictures_without_corners_have_no_motion():
+    camera = Registration()
+    for _ in range(30):
+        np.testing.assert_array_equal(camera.register(np.full((60, 80), 90, np.uint8))[0], IDENTITY)
 
 
 @pytest.mark.parametrize(("by", "is_moved"), [(0.15, False), (0.6, True)])
@@ -525,38 +558,16 @@ def test_a_shift_below_a_third_of_a_pixel_is_no_motion(by, is_moved):
     assert found[0, 2] == pytest.approx(by * is_moved, abs=0.15)
 
 
-def test_a_picture_without_a_fit_lies_where_the_one_before_it_lay():
+def test_a_picture_without_a_fit_is_moving_or_lost_and_lies_where_the_one_before_it_lay():
+    """Moving: all points share one shift since the picture before. Lost: none of them is found again."""
     wide, other, camera = textured(width=480), textured(width=480, seed=4), Registration()
     camera.register(shifted(wide, 0))
     before, _ = camera.register(shifted(wide, 5))
-    found, begins = camera.register(shifted(other, 5))
-    assert (camera.view, begins) == ("lost", False)
     assert before[0, 2] == pytest.approx(5, abs=0.3)
-    np.testing.assert_array_equal(found, before)
-
-
-def test_a_camera_that_has_come_to_stand_elsewhere_shakes_about_that_place():
-    wide, camera = textured(width=480), Registration()
-    path = [*np.arange(0, 50, 2.0), *[50.0] * 60]
-    begins = [camera.register(shifted(wide, by))[1] for by in path]
-    assert begins[0]
-    assert begins[1:].count(True) == 1
-    found, _ = camera.register(shifted(wide, 52))
     assert camera.view == "steady"
-    assert found[0, 2] == pytest.approx(2, abs=0.3)
-
-
-def test_a_picture_without_a_fit_is_moving_or_lost():
-    """Moving: all points share one shift since the picture before. Lost: none of them is found again."""
-    wide, other = textured(width=480), textured(width=480, seed=4)
-    camera = Registration()
-    camera.register(shifted(wide, 0))
-    assert camera.view == "steady"
-    camera.register(shifted(other, 0))
-    assert camera.view == "lost"
-    camera.register(shifted(other, 0.2))  # a five-hundredth of the diagonal is 0.58 px
-    assert camera.view == "lost"
-    camera.register(shifted(other, 3))
-    assert camera.view == "moving"
+    for by, view in ((0, "lost"), (0.2, "lost"), (3, "moving")):  # a five-hundredth of the diagonal is 0.58 px
+        found, begins = camera.register(shifted(other, by))
+        assert (camera.view, begins) == (view, False)
+        np.testing.assert_array_equal(found, before)
     camera.register(shifted(wide, 0))
     assert camera.view == "steady"

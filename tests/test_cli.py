@@ -163,53 +163,46 @@ class TestErrors:
         assert (tmp_path / "a.mcap").is_file()
 
 
+def ended(app: str, before: str = "", main: str = "ours.main()") -> tuple[int, str]:
+    """The exit code and the errors of a command that does this: lines of a function ``app``, indented."""
+    code = (
+        f"import os, signal, sys, tempfile, time, types, weakref{before}\ndef app():\n{app}"
+        "sys.modules['mcaptrack.cli'] = types.SimpleNamespace(app=app)\n"
+        f"import mcaptrack.__main__ as ours; {main}\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600)
+    return run.returncode, run.stderr
+
+
 @pytest.mark.parametrize("soon_s", [0.01, 1e-5], ids=["soon", "at once"])
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
 def test_an_interruption_ends_the_command_where_python_ignores_exceptions(sent, soon_s):
     """The signal arrives in a callback of the garbage collector, where Python ignores exceptions, and once more soon."""
-    code = (
-        "import os, signal, sys, time, types, weakref\n"
-        "def app():\n"
+    app = (
         "    class Thing: pass\n"
         "    thing = Thing()\n"
         f"    kept = weakref.ref(thing, lambda _: (os.kill(os.getpid(), {int(sent)}), time.sleep(0.01)))\n"
         "    del thing\n"
         "    signal.pause()\n"
-        "sys.modules['mcaptrack.cli'] = types.SimpleNamespace(app=app)\n"
-        f"import mcaptrack.__main__ as ours; ours._SOON_S = {soon_s}; ours.main()\n"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600)
-    assert ended.returncode == 128 + sent
-    assert ended.stderr == ""
+    assert ended(app, main=f"ours._SOON_S = {soon_s}; ours.main()") == (128 + sent, "")
 
 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "kill"])
 def test_an_interruption_that_a_library_replaces_by_its_own_error_counts(sent):
     """Extension modules do that when the signal arrives while they are imported."""
-    code = (
-        "import os, signal, sys, types\n"
-        "def app():\n"
+    app = (
         f"    try: os.kill(os.getpid(), {int(sent)}); signal.pause()\n"
         "    except BaseException: raise ImportError('initialization failed') from None\n"
-        "sys.modules['mcaptrack.cli'] = types.SimpleNamespace(app=app)\n"
-        "from mcaptrack.__main__ import main; main()\n"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600)
-    assert (ended.returncode, ended.stderr) == (128 + sent, "")
+    assert ended(app) == (128 + sent, "")
 
 
 @pytest.mark.parametrize(("before", "wanted"), [("SIG_DFL", 128 + signal.SIGHUP), ("SIG_IGN", 0)], ids=["", "nohup"])
 def test_a_closed_terminal_ends_the_command_after_it_has_cleared_up(tmp_path, before, wanted):
-    code = (
-        f"import os, signal, sys, tempfile, types; signal.signal(signal.SIGHUP, signal.{before})\n"
-        "def app():\n"
-        f"    with tempfile.TemporaryDirectory(dir={str(tmp_path)!r}):\n"
-        "        os.kill(os.getpid(), signal.SIGHUP)\n"
-        "sys.modules['mcaptrack.cli'] = types.SimpleNamespace(app=app)\n"
-        "from mcaptrack.__main__ import main; main()\n"
-    )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=600)
-    assert (ended.returncode, ended.stderr, list(tmp_path.iterdir())) == (wanted, "", [])
+    app = f"    with tempfile.TemporaryDirectory(dir={str(tmp_path)!r}):\n        os.kill(os.getpid(), signal.SIGHUP)\n"
+    assert ended(app, f"; signal.signal(signal.SIGHUP, signal.{before})") == (wanted, "")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_demonstration(tmp_path, monkeypatch):

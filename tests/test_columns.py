@@ -1,4 +1,4 @@
-"""Messages as Arrow columns equal what other software reads: rosbags, mcap-ros2-support and the protobuf runtime."""
+"""Messages as Arrow columns equal what other software reads: rosbags and the protobuf runtime."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import pyarrow as pa
 import pytest
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import DecodeError
-from mcap_ros2._dynamic import generate_dynamic
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mcaptrack.columns import Malformed, ProtobufColumns, RosColumns, Unsupported
@@ -226,23 +225,6 @@ def test_columns_equal_what_rosbags_reads(encoding: str) -> None:
             )
             for row, payload in zip(rows, payloads, strict=True):
                 assert same(without_empty(read_by_rosbags(store, encoding, name, payload)), row), (name, payload)
-
-
-def test_columns_equal_what_mcap_ros2_reads() -> None:
-    store = store_of("cdr")
-    for name in (
-        "sensor_msgs/msg/Imu",
-        "tf2_msgs/msg/TFMessage",
-        "visualization_msgs/msg/MarkerArray",
-        "test_msgs/msg/Odd",
-    ):
-        definition = store.generate_msgdef(name, ros_version=2)[0]
-        decode = generate_dynamic(name, definition)[name]
-        columns = RosColumns(store.fielddefs, name)
-        for _, payloads in batches("cdr", name, store, 6):
-            rows = rows_of(columns.read(*laid_out(payloads, None)), len(payloads))
-            for row, payload in zip(rows, payloads, strict=True):
-                assert same(without_empty(as_python(store, (2, name), decode(payload))), row), (name, payload)
 
 
 def damaged(draw: random.Random, payload: bytes, has_head: bool) -> bytes:

@@ -17,7 +17,7 @@ from mcaptrack.notices import collected
 from mcaptrack.schema import Frame
 from mcaptrack.sources.demo import SyntheticScene, pairs_scene
 from mcaptrack.transforms import STAGES, KnnDetector, MedianDetector
-from mcaptrack.transforms.detect.background import Registration, _BackgroundModel, _PersonHeight, clear_border, halve
+from mcaptrack.transforms.detect.background import _BackgroundModel, _PersonHeight, clear_border, halve
 from tests.tiers import one_in, thorough
 from tests.worlds import ns, small_scene
 
@@ -162,73 +162,6 @@ def test_no_detections_where_more_than_half_of_the_picture_differs():
     for share, seen in ((0.45, 1), (0.55, 0)):
         *_, boxes = boxes_of([*EMPTY, blocks((0, 0, round(160 * share), 120))])
         assert len(boxes) == seen
-
-
-class TestRegistration:
-    def textured(self, seed: int = 3) -> np.ndarray:
-        rng = np.random.default_rng(seed)
-        return np.kron(rng.integers(40, 200, (20, 30)), np.ones((8, 8))).astype(np.uint8)
-
-    @pytest.mark.parametrize(
-        ("degrees", "scale", "shift"), [(2.0, 1.0, (0, 0)), (0.0, 1.03, (0, 0)), (1.0, 0.98, (3, -2))]
-    )
-    def test_rotation_scale_and_shift_are_estimated(self, degrees, scale, shift):
-        import cv2
-
-        still = self.textured()
-        centre = (still.shape[1] / 2, still.shape[0] / 2)
-        matrix = cv2.getRotationMatrix2D(centre, degrees, scale)
-        matrix[:, 2] += shift
-        image = cv2.warpAffine(still, matrix, still.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
-        camera = Registration()
-        camera.register(still)
-        found, is_new = camera.register(image)
-        assert not is_new
-        corners = np.array([[0, 0, 1], [still.shape[1], 0, 1], [0, still.shape[0], 1], [*still.shape[::-1], 1]])
-        back = np.column_stack([corners @ matrix.T, np.ones(4)]) @ found.T
-        np.testing.assert_allclose(back, corners[:, :2], atol=0.5)
-
-    def other(self) -> np.ndarray:
-        return np.random.default_rng(0).integers(0, 255, (160, 240)).astype(np.uint8)
-
-    @pytest.mark.parametrize("seen", [1, 5])
-    def test_another_view_begins_after_15_pictures_that_do_not_fit(self, seen):
-        """Whether the camera was seen to stand still before, so that the cut is certain, or not."""
-        camera = Registration()
-        for _ in range(seen):
-            camera.register(self.textured())
-        fresh = [camera.register(self.other())[1] for _ in range(40)]
-        assert [n for n, is_new in enumerate(fresh, start=1) if is_new] == [16]
-        assert camera.view == "steady"
-
-    @pytest.mark.parametrize("seen", [1, 5])
-    def test_what_hides_the_view_for_a_while_does_not_end_it(self, seen):
-        camera, still = Registration(), self.textured()
-        for _ in range(seen):
-            camera.register(still)
-        for picture in [self.other()] * 10 + [still] + [self.other()] * 15:
-            assert not camera.register(picture)[1]
-            assert (camera.view == "steady") == (picture is still)
-        assert camera.register(self.other())[1]
-
-    def test_a_view_begins_where_the_camera_has_settled_and_is_the_identity_there(self):
-        wide = np.kron(np.random.default_rng(3).integers(40, 200, (20, 60)), np.ones((8, 8))).astype(np.uint8)
-        camera = Registration()
-        steps = [0] * 5 + list(range(4, 100, 4)) + [100] * 20
-        seen = [(*camera.register(np.ascontiguousarray(wide[:, by : by + 240])), camera.view) for by in steps]
-        begun = [n for n, (_, is_new, _) in enumerate(seen) if is_new]
-        assert begun[0] == 0
-        assert len(begun) == 2
-        assert steps.index(100) < begun[1] <= steps.index(100) + 15
-        assert all(np.array_equal(matrix, [[1, 0, 0], [0, 1, 0]]) for matrix, _, _ in seen[begun[1] :])
-        far = [by > 28.8 for by in steps]
-        assert [view == "moving" for _, _, view in seen[: begun[1]]] == far[: begun[1]]
-
-    def test_pictures_without_corners_have_no_motion(self):
-        camera = Registration()
-        for _ in range(30):
-            found, _ = camera.register(np.full((60, 80), 90, np.uint8))
-            np.testing.assert_array_equal(found, [[1, 0, 0], [0, 1, 0]])
 
 
 @pytest.mark.parametrize("name", ["knn", "median"])

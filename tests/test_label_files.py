@@ -252,6 +252,11 @@ def test_a_homography_says_how_many_numbers_it_found(text, shape, tmp_path):
     assert str(error.value) == f"{path} is not a homography: it needs 3 rows of 3 numbers, not {shape}"
 
 
+def test_numbers_of_a_homography_are_separated_by_commas_or_blanks(tmp_path):
+    path = written(tmp_path / "h.txt", "1.0e0\t0\t0\n0,1,0\n0 0 1")
+    assert read_homography(path) == (1, 0, 0, 0, 1, 0, 0, 0, 1)
+
+
 def test_a_ground_plane_among_labels_is_told_where_it_belongs(tmp_path):
     path = written(tmp_path / "h.txt", "1 0 5\n0 1 6\n0 0 1\n")
     with pytest.raises(McaptrackError, match=r"is given with the video: `mcaptrack.ingest\('VIDEO', ground_plane='"):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
-from collections.abc import Callable, Iterator
-from itertools import groupby
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +32,6 @@ SCENE = [
 KEYS = ("frame", "track_id", "class", "left", "top", "width", "height", "score")
 ROWS = [dict(zip(KEYS, row, strict=True)) for row in SCENE]
 SIZE = (640, 480)
-
-
-def frames() -> Iterator[tuple[int, list[tuple[Any, ...]]]]:
-    """The rows of each of the four pictures; the third has none."""
-    by_frame = {frame: list(rows) for frame, rows in groupby(SCENE, key=lambda row: row[0])}
-    for frame in range(4):
-        yield frame, by_frame.get(frame, [])
 
 
 def text(delimiter: str = ",", header: str | None = None, rows: Any = SCENE) -> str:

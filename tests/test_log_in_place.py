@@ -55,30 +55,21 @@ def test_the_checksum_of_the_beginning_follows_from_that_of_the_whole(first, las
     assert crc_before(zlib.crc32(first + last), zlib.crc32(last), len(last)) == zlib.crc32(first)
 
 
-def test_what_stands_is_not_touched_when_something_is_added(tmp_path):
-    path = tmp_path / "a.mcap"
-    recorded(path)
-    before, node = path.read_bytes(), path.stat().st_ino
-    with log.read(path) as opened:
-        end = opened.index.data_end
-    add_results(path, 1)
-    after = path.read_bytes()
-    assert after[:end] == before[:end]
-    assert path.stat().st_ino == node
-    assert len(after) < len(before) + 10_000
-    assert list(tmp_path.iterdir()) == [path]
-    assert len(contents(path)["/result/b"]) == 50
-
-
 def test_results_are_replaced_in_place_and_leave_nothing_behind(tmp_path):
     path, once = tmp_path / "a.mcap", tmp_path / "b.mcap"
     recorded(path)
     recorded(once)
-    node = path.stat().st_ino
+    before, node = path.read_bytes(), path.stat().st_ino
+    with log.read(path) as opened:
+        end = opened.index.data_end
     for value in (7, 3, 9, 1):  # larger and smaller
         add_results(path, value)
+        assert path.read_bytes()[:end] == before[:end]
     add_results(once, 1)
     assert path.stat().st_ino == node
+    assert sorted(tmp_path.iterdir()) == [path, once]
+    assert len(path.read_bytes()) < len(before) + 10_000
+    assert len(contents(path)["/result/b"]) == 50
     assert contents(path) == contents(once)
     assert path.read_bytes() == once.read_bytes()
 
@@ -266,25 +257,21 @@ def test_owner_and_group_stay(path):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("user.note", b"take 3"), ("system.posix_acl_access", ACCESS_LIST)], ids=["note", "access"]
+    ("place", "name", "value"),
+    [
+        ("a.mcap", "user.note", b"take 3"),
+        ("a.mcap", "system.posix_acl_access", ACCESS_LIST),
+        (".", "system.posix_acl_default", ACCESS_LIST),
+    ],
+    ids=["note", "access", "of the folder"],
 )
-def test_attributes_stay(path, name, value):
+def test_attributes_stay_and_what_a_folder_gives_to_new_files_does_not_come(path, place, name, value):
     try:
-        os.setxattr(path, name, value)
-    except OSError as error:
-        pytest.skip(f"the file system keeps no attributes: {error.strerror}")
-    before = attributes(path)
-    assert name in before
-    add(path)
-    assert attributes(path) == before
-
-
-def test_what_a_folder_gives_to_new_files_does_not_come_to_an_old_one(path, tmp_path):
-    try:
-        os.setxattr(tmp_path, "system.posix_acl_default", ACCESS_LIST)
+        os.setxattr(path.parent / place, name, value)
     except OSError as error:
         pytest.skip(f"the file system keeps no attributes: {error.strerror}")
     before = attributes(path), path.stat().st_mode
+    assert (name in before[0]) == (place == path.name)
     add(path)
     assert (attributes(path), path.stat().st_mode) == before
 
