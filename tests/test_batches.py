@@ -71,7 +71,7 @@ def test_a_missing_input_is_one_line(folder):
 def test_a_command_that_combines_inputs_needs_all_of_them(folder):
     before = sorted(folder.rglob("*"))
     for command in sorted(COMBINING & READING.keys()):
-        name = {"cut": "out.mcap", "tune": "out.toml"}.get(command, "out.html")
+        name = {"cut": "out.mcap", "query": "out.csv", "tune": "out.toml"}.get(command, "out.html")
         outcome = call(command, "a.mcap", "broken.mcap", *of_extensions("NEEDS").get(command, ()), "-o", name)
         assert (outcome.code, outcome.out) == (1, "")
         assert "broken.mcap" in outcome.err
