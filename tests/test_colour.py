@@ -43,7 +43,8 @@ class Coloured(Plain):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pictures")
+    folder = tmp_path_factory.mktemp("pictures") / "frames"
+    folder.mkdir()
     for number in range(3):
         cv2.imwrite(str(folder / f"{number:03}.png"), np.full((48, 64, 3), BGR, np.uint8))
     path = folder.parent / "log.mcap"
