@@ -175,7 +175,7 @@ def test_pages_are_printed_with_their_generated_parts():
 
 
 def test_a_page_that_is_not_there_is_said_with_those_that_are():
-    for page, meant in (("tabels", "tables"), ("detectors", "networks")):
+    for page, meant in (("tabels", "tables"), ("images", "ingest")):
         code, _, err = call("docs", page)
         assert code == 1
         assert err.startswith(f"mcaptrack: there is no page {page}; did you mean {meant}? There are readme, ")
