@@ -267,7 +267,7 @@ WRONG_CLASSES = [
     ('{"": TRACKS}', '{"": DETECTIONS}', "writes mcaptrack.Detections; a tracker writes mcaptrack.Tr"),
     ('{"": TRACKS}', "TRACKS", "writes nothing"),
     ("__call__", "call", "can't be called with frames"),
-    ("gain: float", "gain: dict", "Nearest.gain is a dict; a parameter is a float"),
+    ("gain: float", "gain: dict", "Nearest.gain has the type dict; a parameter is a float"),
     ("    reads:", '    colour: ClassVar = "blue"\n    reads:', "has colour = 'blue'; it is 'bgr' or 'grey'"),
     ("    reads:", "    passes: ClassVar = 3\n    reads:", "has passes = 3; it is 1 or 2"),
     ("    reads:", '    space: ClassVar = "metres"\n    reads:', "has space = 'metres'; it is 'picture' or 'ground'"),
