@@ -266,6 +266,7 @@ WRONG_CLASSES = [
     ("reads: ClassVar = DETECTIONS", "", r"reads no schema \(the class attribute reads\); a tracker"),
     ('{"": TRACKS}', '{"": DETECTIONS}', "writes mcaptrack.Detections; a tracker writes mcaptrack.Tr"),
     ('{"": TRACKS}', "TRACKS", "writes nothing"),
+    ('latency_s: ClassVar = {"": 0.0}', "latency_s: ClassVar = 0.0", "has latency_s = 0.0; it maps outputs to seconds"),
     ("__call__", "call", "can't be called with frames"),
     ("gain: float", "gain: dict", "Nearest.gain has the type dict; a parameter is a float"),
     ("    reads:", '    colour: ClassVar = "blue"\n    reads:', "has colour = 'blue'; it is 'bgr' or 'grey'"),
