@@ -52,6 +52,8 @@ def publish(path: Path) -> Iterator[Path]:
             raise
         raise McaptrackError(f"{path} can't be written: {error.strerror}") from error
     finally:
+        if part.is_dir():  # code of another package may make one
+            rmtree(part, ignore_errors=True)
         with suppress(FileNotFoundError):
             part.unlink()
     sync_folder(path.parent)

@@ -135,7 +135,21 @@ def test_doctor_lists_what_packages_bring_and_what_of_it_fails(site):
     owners = {("exporter", "csv"): "a built-in exporter csv", ("stage", "longest"): "a command longest"}
     install(site, {f"mcaptrack.{kind}s": {name: "speeds:Speeds"} for kind, name in owners}, "taken", "2.0")
     add(site, "command", "gone", "raise OSError('no\\nlicence')")
-    found = json.loads(done("doctor", "--json").out)["plugins"]
+    points = {
+        "mcaptrack.tracker": {"near": "gone:Near"},
+        "mcaptrack.stages": {"placeless": "nearest_tracker:NearestTracker"},
+    }
+    install(site, points, "old", "1.0")
+    with (site / "old-1.0.dist-info" / "METADATA").open("a") as metadata:
+        metadata.write("Requires-Dist: mcaptrack<0.2\nRequires-Dist: numpy>=1.0\nRequires-Dist: lost ; extra == 'a'\n")
+    result = json.loads(done("doctor", "--json").out)
+    found, warned = result["plugins"], [warning["message"] for warning in result["warnings"]]
+    stray = found["entry point near (old 1.0)"]
+    assert stray.endswith("mcaptrack.tracker is no group of entry points; did you mean mcaptrack.trackers?")
+    assert "has input_topic = None" in found["stage placeless (old 1.0)"]
+    assert [message for message in warned if message.startswith("old 1.0 needs")] == [
+        f"old 1.0 needs mcaptrack<0.2, and version {mcaptrack.__version__} is installed; install another version of one"
+    ]
     for (kind, name), owner in owners.items():
         ignored = f"{kind} {name} (taken 2.0)"
         assert found[ignored] == f"{ignored} is ignored: there is {owner}; rename it"
@@ -579,7 +593,8 @@ def test_an_exporter_writes_a_folder_that_is_complete_or_not_there(site, tracked
         ("end = 3\n    def write(self, recording, path): ...", "has end = 3"),
         ("end = '/../x'\n    def write(self, recording, path): ...", "has end = '/../x'"),
         ("pass", "has no method write, so it is no exporter"),
-        ("def write(self, recording, path): return {}", "wrote no file"),
+        ("def write(self, recording, path): return {}", "wrote no file; it has to make the path it gets"),
+        ("def write(self, recording, path): path.mkdir()", "wrote no file; its attribute is_folder says which"),
         ("def __init__(self, a): ...\n    def write(self, recording, path): ...", "could not be made: TypeError"),
         ("def write(self, recording, path): recording.write('x', [])", "has no attribute 'write'"),
         ("def write(self, recording, path): path.write_text('x')", "gave no numbers of rows"),
@@ -665,22 +680,37 @@ def test_a_class_of_a_package_prints_for_its_command(site):
     assert "command odd (another 2.0): another has no class Lost" in one_line("odd")
 
 
-@pytest.mark.parametrize("breaks", [False, True])
-def test_a_page_of_a_package_stands_beside_the_player_and_one_that_breaks_is_left_out(site, tracked, breaks):
-    code = "from mcaptrack.viewing.serving import LogPage\ndef Part():\n    return LogPage(lambda opened: opened.path.name.encode(), '')\n"
-    add(site, "page", "name-of-it", code.replace("return", "return 1 / 0 and") if breaks else code)
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("", []),
+        ("return 1 / 0 and", ["could not be made: ZeroDivisionError: division by zero (another.py, line 3)"]),
+        ("return 3 or", ["gave an int; its function has to give a LogPage"]),
+    ],
+)
+def test_a_page_of_a_package_stands_beside_the_player_and_one_that_breaks_is_left_out(site, tracked, code, said):
+    page = "from mcaptrack.viewing.serving import LogPage\ndef Part():\n    return LogPage(lambda opened: opened.path.name.encode(), '')\n"
+    add(site, "page", "name-of-it", page.replace("return", code or "return"))
     with mcaptrack.view("a.mcap", port=0) as server:
         index = urlopen(server.address).read().decode()
-        assert ('"page-name-of-it"' in index) is not breaks
-        if not breaks:
+        assert ('"page-name-of-it"' in index) is not bool(said)
+        if not said:
             (address,) = re.findall(r'"name-of-it":"([^"]+)"', index)
             assert urlopen(urljoin(server.address, address)).read() == b"a.mcap"
-    said = [notice.message for notice in server.warnings if notice.code == "left-out"]
-    assert said == (
-        ["page name-of-it (another 2.0) could not be made: ZeroDivisionError: division by zero (another.py, line 3)"]
-        if breaks
-        else []
+    warned = [notice.message for notice in server.warnings if notice.code == "left-out"]
+    assert warned == [f"page name-of-it (another 2.0) {words}" for words in said]
+
+
+def test_a_player_of_a_package_that_gives_no_page_is_one_line(site, tracked):
+    add(
+        site,
+        "player",
+        "a-player",
+        "class Part:\n    def show(self, *a, **k): 1 / 0\n    def page(self, *a): return b''\n",
     )
+    assert "player a-player (another 2.0) gave a bytes; page has to give a LogPage" in one_line("view", "a.mcap")
+    with mcaptrack.open("a.mcap") as opened, pytest.raises(McaptrackError, match=r"failed: ZeroDivisionError"):
+        opened.show()
 
 
 def test_a_name_that_is_not_there_proposes_one_of_an_extension():
@@ -1164,6 +1194,18 @@ def test_a_package_makes_a_scene_of_cameras(site, run_cameras):
     shutil.rmtree(site / "another-2.0.dist-info")
     assert mcaptrack.run("a.mcap", tables=False).is_up_to_date
     done("retrack", "a.mcap", "--camera", "world")
+
+
+def test_options_of_a_maker_of_scenes_that_change_nothing_are_named(run_cameras):
+    run_cameras(MEETING.replace("] = True", "] = False"))
+    said = []
+    for _ in range(2):
+        with collected() as warnings:
+            mcaptrack.run.__wrapped__("a.mcap", tables=False, predictor="cv", meet=True)
+        said.append([notice.message for notice in warnings if notice.code == "option-not-used"])
+    assert said[0] == []
+    assert "meet" in said[1][0]
+    assert said[1][0].endswith("changes nothing here: the log has a scene, or another maker of scenes came first")
 
 
 @thorough

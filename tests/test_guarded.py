@@ -147,6 +147,15 @@ def test_scores_that_trackers_cannot_use_are_said_once(scores, said):
     assert [(warning.code, warning.message) for warning in warnings] == ([("scores", expected)] if said else [])
 
 
+@pytest.mark.parametrize(("width", "is_said"), [(0.5, True), (0.6, False)])
+def test_boxes_in_shares_of_the_picture_are_said_once(width, is_said):
+    rows = changed(x_px=[0.1, 0.5], y_px=[0.1, 0.2], w_px=[0.2, width], h_px=[0.2, 0.4])
+    with collected() as warnings:
+        answers(one(rows=rows), "detector")
+    said = "detector mine (pack 1) gave boxes that all lie within one pixel; they are in pixels, not in shares of a picture"
+    assert [(warning.code, warning.message) for warning in warnings] == [("units", said)] * is_said
+
+
 def test_frames_that_are_left_out_are_counted():
     with collected() as warnings:
         assert len(answers(lambda frame: one()(frame) if frame.index % 2 else [])) == 2

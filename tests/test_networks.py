@@ -382,7 +382,7 @@ class Breaks:
             mean = mean[:, :1]
         if self.law == "input":
             people.xy_m[0, -1] = 0.0
-        return mean, cov
+        return mean if self.law == "alone" else (mean, cov)
 
 
 class TestLaws:
@@ -400,6 +400,7 @@ class TestLaws:
             *((one, f"{one}: ") for one in ("pure", "unknown", "order-blind", "batch", "moment", "moves", "rotates")),
             ("covariances", "forecasts: means that are not finite, or covariances"),
             ("shapes", r"forecasts: shapes are \(5, 1, 2\)"),
+            ("alone", "forecasts: predictor Breaks gave no mean and covariance: ValueError"),
             ("input", "pure: it changes its input"),
         ],
     )

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mcaptrack import schema_of
-from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO, Frame
+from mcaptrack.schema import DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame
 from mcaptrack.testing import LawError, check_transform, sample_frames
 
 
@@ -69,7 +69,7 @@ class Numbered:
                 rows["h_px"] = -1
             t_ns = 0 if self.breaks == "time" else frame.t_ns
             result = (Frame(t_ns, 0 if self.breaks == "index" else frame.index, rows),)
-            yield result * 2 if self.breaks == "tuple" else result
+            yield {"tuple": result * 2, "bare": (rows,)}.get(self.breaks, result)
 
 
 def test_a_transform_that_keeps_all_laws_passes():
@@ -80,12 +80,13 @@ def test_a_transform_that_keeps_all_laws_passes():
 @pytest.mark.parametrize(
     ("breaks", "words"),
     [
-        ("schema", "conforms: output '', frame 0 at .* ns: mcaptrack.Tracks has the columns"),
-        ("time", "conforms: output '', frame 1 at 0 ns is not later than 0 ns before it"),
+        ("schema", "conforms: tracker Numbered gave rows at frame 0 .* mcaptrack.Tracks has the columns"),
+        ("time", "conforms: tracker Numbered gave frame 0 of 0 ns at frame 0 .* which is not in its input"),
         ("id", "conforms: tracker Numbered gave rows at frame .* track_id 1 stands in . rows of one frame"),
         ("size", "conforms: tracker Numbered gave rows at frame .* in row 0 h_px is -1"),
         ("index", "conforms: tracker Numbered gave frame 0 of .* which is not in its input"),
-        ("tuple", "conforms: result 0 is no tuple of 1 frames"),
+        ("tuple", "conforms: tracker Numbered gave a tuple of Frame, Frame at frame 0"),
+        ("bare", "conforms: tracker Numbered gave a tuple of ndarray at frame 0"),
         ("state", "pure: the second run differs from the first in result 0 at"),
         ("shared", "pure: the second run differs from the first in result . at"),
         ("late", "causal: output '', frame 1. at .* depends on frames after number 14"),
@@ -104,8 +105,9 @@ def test_a_broken_law_is_named_with_its_place(breaks, words):
 
 @dataclass(frozen=True)
 class Alike:
-    """A row for each track, the same for all but the id."""
+    """A row for each track, the same for all but the id; or, as it is told, one that has the id as a number."""
 
+    counts: bool = False
     reads: ClassVar = TRACKS
     writes: ClassVar = {"": schema_of("Alike", [("track_id", "i8"), ("near", "i4")])}
     latency_s: ClassVar = {"": 0.0}
@@ -113,11 +115,41 @@ class Alike:
     def __call__(self, frames):
         for frame in frames:
             ids = frame.rows["track_id"]
-            yield (frame._replace(rows=self.writes[""].rows(track_id=ids, near=[0] * len(ids))),)
+            yield (frame._replace(rows=self.writes[""].rows(track_id=ids, near=ids if self.counts else 0 * ids)),)
 
 
 def test_rows_that_are_alike_may_change_places_when_rows_are_shuffled():
     check_transform(Alike())
+
+
+def test_numbers_that_are_made_of_the_names_of_tracks_are_noticed():
+    with pytest.raises(LawError, match=r"order-blind: output '', frame 0 at 0 ns depends on the ids of tracks"):
+        check_transform(Alike(counts=True))
+
+
+@dataclass(frozen=True)
+class Apart:
+    """A detection of each sighting, numbered from ``first`` on."""
+
+    first: int = 0
+    reads: ClassVar = SIGHTINGS
+    writes: ClassVar = {"": DETECTIONS, "sightings": SIGHTINGS}
+    latency_s: ClassVar = {"": 0.0, "sightings": 0.0}
+
+    def __call__(self, frames):
+        results = []
+        for frame in frames:
+            rows = np.sort(frame.rows, order=["camera", "box_row"])
+            rows["detection"] = self.first + np.arange(len(rows))
+            places = DETECTIONS.rows(x_m=rows["x_m"], y_m=rows["y_m"], class_id=[1] * len(rows))
+            results.append((frame._replace(rows=places), frame._replace(rows=rows)))
+        return results
+
+
+def test_sightings_of_a_detection_that_is_not_there_are_noticed():
+    check_transform(Apart())  # it returns a list, which a run takes, too
+    with pytest.raises(LawError, match=r"fuser Apart gave sightings .* of detection (\d+); it gave \1, from 0 on"):
+        check_transform(Apart(1))
 
 
 def test_two_ids_that_become_one_when_rows_are_shuffled_are_noticed():

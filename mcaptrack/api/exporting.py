@@ -332,9 +332,8 @@ def write_by(by: FoundExporter, recording: LogReader, part: Path, options: Mappi
     with blamed(by.entry, "failed"):
         rows = by.exporter.write(recording, part, **{name: options[name] for name in by.options & options.keys()})
     if not (part.is_dir() if by.is_folder else part.is_file()):
-        raise McaptrackError(
-            f"{by.entry} wrote no {'folder' if by.is_folder else 'file'}; it has to make the path it gets"
-        )
+        hint = "its attribute is_folder says which it makes" if part.exists() else "it has to make the path it gets"
+        raise McaptrackError(f"{by.entry} wrote no {'folder' if by.is_folder else 'file'}; {hint}")
     with blamed(by.entry, "gave no numbers of rows by the names of tables or channels"):
         return {str(name): operator.index(count) for name, count in dict(rows).items()}
 

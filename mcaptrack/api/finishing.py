@@ -92,9 +92,12 @@ class PartsOfRun:
                 _leave_out(str(error))
         return makers
 
-    def chosen(self, kind: Kind, values: Mapping[str, object]) -> dict[str, bool]:
-        """Return whether each option of a kind has another value than by default."""
-        options = [option for entry in self._of(kind) for option in self._options[entry].values()]
+    def chosen(
+        self, kind: Kind, values: Mapping[str, object], entries: Collection[Entry] | None = None
+    ) -> dict[str, bool]:
+        """Return whether each option of a kind, or of these ``entries``, has another value than by default."""
+        every = self._of(kind) if entries is None else entries
+        options = [option for entry in every for option in self._options[entry].values()]
         return {option.name: values.get(option.name, option.default) != option.default for option in options}
 
     def _of(self, kind: Kind) -> list[Entry]:

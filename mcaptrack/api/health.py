@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import os
 import platform
 import re
@@ -24,6 +25,11 @@ from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
 
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")
+#: How the signs of requirements compare versions.
+_COMPARED: Final[Mapping[str, Callable[[Any, Any], bool]]] = {
+    ">=": operator.ge, "~=": operator.ge, "<=": operator.le, "==": operator.eq, "!=": operator.ne, ">": operator.gt,
+    "<": operator.lt,
+}  # fmt: skip
 _LITTLE_BYTES: Final = 1_000_000_000
 #: The line of a module in the list of files that pip keeps of a package.
 _MODULES: Final = re.compile(r"^([^/,\n]+)/__init__\.py,", re.MULTILINE)
@@ -317,11 +323,11 @@ def _overwritten(packages: Collection[str]) -> Iterator[str]:
             )
 
 
-def _requirements() -> list[str]:
+def _requirements(package: str = "mcaptrack") -> list[str]:
     try:
-        return metadata.requires("mcaptrack") or []
+        return metadata.requires(package) or []
     except metadata.PackageNotFoundError:
-        warn("mcaptrack is not installed as a package: which versions of others it needs is unknown")
+        warn(f"{package} is not installed as a package: which versions of others it needs is unknown")
         return []
 
 
@@ -352,22 +358,42 @@ def _threads(broken: Collection[str]) -> dict[str, str]:
 
 def _plugins() -> dict[str, str]:
     """Import the parts of installed packages; return why each can't be used, or "", and warn of it."""
-    from mcaptrack.registry import KINDS, find, ignored, points, titled
+    from mcaptrack.registry import KINDS, find, ignored, points, strays, titled
+    from mcaptrack.transforms.stages import declared_stage
 
-    reasons = {}
+    reasons, packages = strays(), dict[str, None]()
     for kind in KINDS:
-        for name, reason in ignored(kind).items():
-            reasons[name] = reason
-            warn(reason, "other")
+        reasons |= ignored(kind)
         for point in [point for point in points(kind) if not point.is_own]:
             name = titled(kind, point.name, point.package)
             reasons[name] = ""
+            packages[point.package[0]] = None
             try:
-                find(kind, point.name)
+                entry = find(kind, point.name)
+                if kind == "stage":
+                    declared_stage(entry)
             except McaptrackError as error:
                 reasons[name] = str(error)
-                warn(str(error), "other")
+    for reason in filter(None, reasons.values()):
+        warn(reason, "other")
+    for package in packages:
+        for conflict in _conflicts(package):
+            warn(conflict, "other-version")
     return reasons
+
+
+def _conflicts(package: str) -> Iterator[str]:
+    """Yield a sentence for each requirement of a package that what is installed doesn't meet."""
+    for text in _requirements(package):
+        name, _, marker = text.partition(";")
+        match = _REQUIREMENT.match(name)
+        if match is None or marker:
+            continue
+        have = _version_of(match[1])
+        limits = re.findall(r"(>=|<=|~=|==|!=|>|<)\s*([\d.]+)(?![\d.]|\*)", name)
+        if not have or not all(_COMPARED[sign](_numbers(have), _numbers(limit)) for sign, limit in limits):
+            lack = f"version {have} is installed" if have else "it is not installed"
+            yield f"{package} {_version_of(package)} needs {name.strip()}, and {lack}; install another version of one"
 
 
 def _parts() -> dict[str, str]:

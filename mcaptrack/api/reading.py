@@ -28,6 +28,7 @@ from mcaptrack.api.rows import supervision_of
 from mcaptrack.errors import McaptrackError, call, offer
 from mcaptrack.location import Location, Url
 from mcaptrack.log import Log
+from mcaptrack.registry import blamed
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS, Frame, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.sources.cameras import VIDEO
@@ -406,8 +407,9 @@ class LogReader:
         (11, 11)
 
         """
-        with self._now() as opened:
-            player: Player = log_player().show(
+        entry, maker = log_player()
+        with self._now() as opened, blamed(entry, "failed"):
+            player: Player = maker.show(
                 opened,
                 at_s,
                 topics=names_of(topic),

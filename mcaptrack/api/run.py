@@ -210,6 +210,9 @@ def run(
         )  # fmt: skip
     if not result.cameras:
         warn_unused("one camera is run", **_PARTS.chosen("scene", more))
+    elif unused := joins.unused:
+        why = "the log has a scene, or another maker of scenes came first"
+        warn_unused(why, **_PARTS.chosen("scene", more, unused))
     return result
 
 

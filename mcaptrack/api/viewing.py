@@ -25,7 +25,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, find, names, others
+from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, find, names, of_type, others
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.tables import export
 from mcaptrack.viewing import links
@@ -96,8 +96,9 @@ def _parts(kind: Kind) -> dict[str, Any]:
         try:
             entry = find(kind, name)
             with blamed(entry, "could not be made"):
-                part = entry.cls()
-                parts[name] = part._replace(make=partial(_made_by, entry, part.make))
+                gave = entry.cls()
+            part: Any = of_type(entry, gave, LogPage if kind == "page" else WebViewer, "its function")
+            parts[name] = part._replace(make=partial(_made_by, entry, part.make))
         except McaptrackError as error:
             warn(str(error), "left-out")
     return {name: part for name, part in parts.items() if re.fullmatch(r"\w[\w-]*", name)}
@@ -201,8 +202,11 @@ class LogServer:
         made = partial(_FromLog, contents.path)
         pages = {}
         for number, (_, camera, is_above) in enumerate(contents.views):
-            player = log_player().page(camera, is_above)
-            pages[f"{_FOLDER}/player-{number}.html"] = Page(made(player.make), player.policy)
+            entry, maker = log_player()
+            with blamed(entry, "failed"):
+                gave = maker.page(camera, is_above)
+            player = of_type(entry, gave, LogPage, "page")
+            pages[f"{_FOLDER}/player-{number}.html"] = Page(made(partial(_made_by, entry, player.make)), player.policy)
         for name, page in contents.pages.items():
             pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
         for name in tables.TABLES:

@@ -60,7 +60,7 @@ def documentation(
     if name not in pages:
         about = " or ".join(each for each, path in pages.items() if name in _title(path).lower())
         hint = f"did you mean {about}? " if about else did_you_mean(name, pages)
-        raise McaptrackError(f"there is no page {page}; {hint}There are {', '.join(pages)}")
+        raise McaptrackError(f"there is no page {page}; {hint}{'There' if hint else 'there'} are {', '.join(pages)}")
     return {name: pages[name]}
 
 

@@ -56,7 +56,7 @@ def _lines(result: DoctorResult, verbose: bool) -> Iterator[tuple[str, str]]:
     yield "extensions", ", ".join(name for name, why in result.extensions.items() if not why) or "none"
     yield from ((f"  {name}", why) for name, why in result.extensions.items() if why)
     for name, why in result.plugins.items():
-        yield name, why or "can be imported"
+        yield name, why.removeprefix(name).lstrip(": ") or "can be imported"
     if result.store is not None:
         yield "store", result.store.url
         yield (

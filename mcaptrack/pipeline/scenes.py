@@ -101,12 +101,18 @@ class Scenes:
     def __init__(self, makers: Sequence[tuple[Entry, SceneMaker]] | None = None) -> None:
         every = _usual() if makers is None else makers
         self._makers = [(entry, of_type(entry, maker, SceneMaker, "its function")) for entry, maker in every]
+        self._used = list[SceneMaker]()
 
     def _answers(self, question: Callable[[SceneMaker], T]) -> Iterator[T]:
         for entry, maker in self._makers:
             with blamed(entry, "failed"):
                 answer = question(maker)
             yield answer
+
+    @property
+    def unused(self) -> list[Entry]:
+        """The makers of other packages that have made no scene so far, and don't say why (``off``)."""
+        return [e for e, maker in self._makers if not (e.is_built_in or maker.off or maker in self._used)]
 
     @property
     def off(self) -> str:
@@ -127,7 +133,9 @@ class Scenes:
         """Return the channels of a scene of cameras that can be joined, by topic."""
 
         def join(maker: SceneMaker) -> Mapping[str, Made]:
-            return maker.join(opened, cameras, prefix, progress) if _joinable(maker, opened, cameras)[0] else {}
+            channels = maker.join(opened, cameras, prefix, progress) if _joinable(maker, opened, cameras)[0] else {}
+            self._used += [maker] if channels else []
+            return channels
 
         return next(filter(None, self._answers(join)))
 
@@ -141,7 +149,13 @@ class Scenes:
         how = provenance_of(opened, topic := detections_topic(prefix))
         if how is None or how.transform != FUSE:
             return {}
-        answers = self._answers(lambda maker: maker.join_again(opened, prefix, force, adds, say, progress))
+
+        def join(maker: SceneMaker) -> Mapping[str, Made] | None:
+            channels = maker.join_again(opened, prefix, force, adds, say, progress)
+            self._used += [] if channels is None else [maker]
+            return channels
+
+        answers = self._answers(join)
         channels = next((answer for answer in answers if answer is not None), None)
         if channels is None and is_stale(opened, topic):
             warn(f"{topic} is out of date, and stays as it is: {_nothing()}", "out-of-date")

@@ -250,6 +250,18 @@ def ignored(kind: Kind) -> dict[str, str]:
     return {what: f"{what} is ignored: there is {owner}; rename it" for what, owner in owners.items() if owner}
 
 
+def strays() -> dict[str, str]:
+    """Why entry points of groups that there are not don't count, by their title. Imports nothing."""
+    groups = {_group(kind) for kind in KINDS}
+    out = {}
+    for point in declared().points:
+        if point.group not in groups:
+            what = titled("entry_point", point.name, point.package)
+            hint = did_you_mean(point.group, groups) or f"there are {', '.join(sorted(groups))}"
+            out[what] = f"{what} is ignored: {point.group} is no group of entry points; {hint}".rstrip()
+    return out
+
+
 def _owners(kind: Kind) -> Iterator[tuple[Point, str]]:
     """Each entry point of a kind, and the entry that has its name already: a built-in one, one of an extension, or a
     command; "" if none.

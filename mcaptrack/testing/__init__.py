@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from mcaptrack.predictors import AnyPredictor, PeopleSeen, are_covariances, predict_among
-from mcaptrack.testing.formats import check_exporter, check_label_format, check_message_reader, check_recording_format
+from mcaptrack.registry import failure
+from mcaptrack.testing.formats import (
+    check_exporter,
+    check_label_format,
+    check_message_reader,
+    check_recording_format,
+    object_entry,
+)
 from mcaptrack.testing.functions import check_command, check_finisher, check_report_section, check_scene_maker
 from mcaptrack.testing.transforms import LAWS, LawError, check_transform, same_process, sample_frames
 
@@ -72,9 +79,14 @@ def check_predictor(predictor: AnyPredictor, *, rotates: bool = False, seed: int
 
     kept = [part.copy() for part in people]
 
+    entry = object_entry("predictor", predictor, "predict")
+
     def ask(people: PeopleSeen) -> tuple[Any, Any]:
-        mean, cov = predict_among(predictor, people.xy_m[people.row], people.valid[people.row], people)
-        return np.asarray(mean), np.asarray(cov)
+        try:
+            mean, cov = predict_among(predictor, people.xy_m[people.row], people.valid[people.row], people)
+            return np.asarray(mean), np.asarray(cov)
+        except Exception as error:  # code of other packages may raise anything
+            raise LawError(f"forecasts: {failure(entry, 'gave no mean and covariance', error)}") from error
 
     with same_process(type(predictor).__name__):
         mean, cov = ask(people)

@@ -135,7 +135,7 @@ def _made_format(label_format: LabelFormat | Format) -> tuple[Format, str]:
     """A format as labels are read by it, and its name; one of mcaptrack's own is one already."""
     if isinstance(label_format, Format):
         return label_format, label_format.name
-    entry = _entry("label_format", label_format, "read")
+    entry = object_entry("label_format", label_format, "read")
     with law("declares"):
         return FormatOfPackage(entry, label_format), entry.name
 
@@ -212,7 +212,7 @@ def check_message_reader(reader: MessageReader, messages: Sequence[Any]) -> None
     ...         return [Box(thing.x, thing.y, thing.w, thing.h) for thing in message.things]
     >>> check_message_reader(Things(), [{"things": [{"x": 1, "y": 2, "w": 3, "h": 4}]}])
     """
-    entry = _entry("message_reader", reader, "read")
+    entry = object_entry("message_reader", reader, "read")
     with law("declares"):
         in_space = is_in_space(entry, reader)
     decoded = [_decoded(message) if isinstance(message, dict) else message for message in messages]
@@ -267,8 +267,8 @@ def check_recording_format(recording_format: RecordingFormat, path: PathLike) ->
     LawError
         If it breaks a law; the message names the law.
     """
-    entry = _entry("recording", recording_format, "open")
-    _entry("recording", recording_format, "recognises")
+    entry = object_entry("recording", recording_format, "open")
+    object_entry("recording", recording_format, "recognises")
     file = present(path)
     with same_process(entry.name), TemporaryDirectory() as folder, collected():
         before = _content(file)
@@ -351,7 +351,7 @@ def check_exporter(
     ...         return {"topics": len(recording.topics)}
     >>> check_exporter(Topics(), "log.mcap")
     """
-    entry = _entry("exporter", exporter, "write")
+    entry = object_entry("exporter", exporter, "write")
     with law("declares"):
         by = exporter_for(entry, exporter)
     source = present(log)
@@ -408,7 +408,8 @@ def _check_read_again(label_format: LabelFormat | Format, file: Path, source: Pa
         raise LawError(f"again: {name} reads other {' and '.join(others)} than were written")
 
 
-def _entry(kind: Kind, made: Any, method: str) -> Entry:
+def object_entry(kind: Kind, made: Any, method: str) -> Entry:
+    """An entry for the object of a class, which has this method. Raises LawError for others."""
     if isinstance(made, type):
         raise LawError(f"declares: {made.__name__} is a class; give an object, as in {made.__name__}()")
     cls = type(made)

@@ -6,9 +6,10 @@ Letters: N rows, H and W pixels.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -56,9 +57,9 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     The laws: it declares what the protocol asks for; every output has the rows of its schema, at times that increase;
     the same input gives the same output, also while it runs on another input, and is not changed; the output of the
     past does not depend on the future, but for ``latency_s``; it leaves the process that it runs in as it was (the
-    working folder, random state and so on); shuffling the rows of a frame changes ids at most; frames
-    without rows, and no frames at all, are valid input; the parameters can be kept in a log and give the same transform
-    again.
+    working folder, random state and so on); shuffling the rows of a frame, or naming tracks otherwise, changes ids at
+    most; frames without rows, and no frames at all, are valid input; the parameters can be kept in a log and give the
+    same transform again.
 
     Parameters
     ----------
@@ -263,7 +264,8 @@ def declares(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     for suffix, latency_s in latencies_s.items():
         if not latency_s >= 0:
             raise LawError(f"declares: {name}.latency_s of '{suffix}' is {latency_s}; it is 0 or more, in seconds")
-    check_options(transform)
+    with law("declares"):
+        check_options(transform)
     if hasattr(transform, "input_topic") or hasattr(transform, "output_topic"):
         declared_stage(_entry(transform, "stage"))
 
@@ -275,23 +277,15 @@ def _entry(transform: Transform, kind: str) -> Entry:
 
 def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     """Every output has the rows of its schema, at times that increase; and a run on a log takes it."""
-    for number, result in enumerate(transform(frames)):
-        if not isinstance(result, tuple) or len(result) != len(transform.writes):
-            raise LawError(f"conforms: result {number} is no tuple of {len(transform.writes)} frames, one an output")
-    for (suffix, schema), output in zip(transform.writes.items(), _outputs(transform, frames), strict=True):
-        for number, frame in enumerate(output):
-            try:
-                schema.check(frame.rows)
-            except ValueError as error:
-                raise LawError(f"conforms: {_where(suffix, number, frame)}: {error}") from None
-            if number and frame.t_ns <= output[number - 1].t_ns:
-                before = output[number - 1].t_ns
-                raise LawError(f"conforms: {_where(suffix, number, frame)} is not later than {before} ns before it")
     reads_and_writes = (transform.reads, transform.writes[""])
-    kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker"}.get(reads_and_writes, "transform")
+    kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker", (SIGHTINGS, DETECTIONS): "fuser"}
     with law("conforms"):
-        for _ in guarded(_entry(transform, kind), transform, frames):
-            pass
+        results = list(guarded(_entry(transform, kind.get(reads_and_writes, "transform")), transform, frames))
+    for suffix, output in zip(transform.writes, zip(*results, strict=True), strict=False):
+        for number, (before, frame) in enumerate(pairwise(output), start=1):
+            if frame.t_ns <= before.t_ns:
+                where = _where(suffix, number, frame)
+                raise LawError(f"conforms: {where} is not later than {before.t_ns} ns before it")
 
 
 def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
@@ -301,7 +295,7 @@ def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
     for number, frame in enumerate(frames):
         if _key(frame) != before[number]:
             raise LawError(f"pure: it changes its input, first in frame {number} at {frame.t_ns} ns")
-    other = transform(frames[1:])
+    other = iter(transform(frames[1:]))
     for number, result in enumerate(transform(frames)):
         if number >= len(alone) or [_key(frame) for frame in result] != alone[number]:
             raise LawError(f"pure: the second run differs from the first in result {number} at {result[0].t_ns} ns")
@@ -329,24 +323,40 @@ def causal(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
 
 
 def order_blind(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
-    """Shuffling the rows of a frame changes the ids of tracks at most."""
+    """Shuffling the rows of a frame, or naming tracks otherwise, changes the ids of tracks at most."""
     if transform.reads is VIDEO:
         return  # pictures have no rows
     rng = np.random.default_rng(seed)
     shuffled = [frame._replace(rows=frame.rows[rng.permutation(len(frame.rows))]) for frame in frames]
+    _same_but_ids(transform, frames, shuffled, "the order of rows in a frame", {"track_id"})
+    if "track_id" in (transform.reads.dtype.names or ()):
+        named = [frame._replace(rows=frame.rows.copy()) for frame in frames]
+        last = max((int(frame.rows["track_id"].max()) for frame in frames if len(frame.rows)), default=0)
+        for frame in named:
+            frame.rows["track_id"] = last - frame.rows["track_id"]
+        every = {
+            name for schema in transform.writes.values() for name in schema.dtype.names or () if name.endswith("_id")
+        }
+        _same_but_ids(transform, frames, named, "the ids of tracks", every - {"class_id"})
+
+
+def _same_but_ids(
+    transform: Transform, frames: Sequence[Frame], changed: Sequence[Frame], change: str, ids: Collection[str]
+) -> None:
+    """Check that a change of the input, put in words, changes these columns of the output alone."""
     tracks: dict[int | None, int] = {}
     others: dict[int | None, int] = {}
-    pairs = zip(_outputs(transform, frames), _outputs(transform, shuffled), strict=True)
+    pairs = zip(_outputs(transform, frames), _outputs(transform, changed), strict=True)
     for suffix, (output, other) in zip(transform.writes, pairs, strict=True):
         if len(output) != len(other):
-            raise LawError(f"order-blind: output '{suffix}' has another number of frames when rows are shuffled")
+            raise LawError(f"order-blind: the number of frames of output '{suffix}' depends on {change}")
         for number, (a, b) in enumerate(zip(output, other, strict=True)):
             for frame, past in ((a, tracks), (b, others)):
-                for row, track_id in _without_ids(frame.rows):
+                for row, track_id in _without_ids(frame.rows, ids):
                     past[track_id] = hash((past.get(track_id), suffix, number, row))
             # ids are compared by all their rows so far: of two with equal rows in a frame, either may come first
             if sorted(tracks.values()) != sorted(others.values()):
-                raise LawError(f"order-blind: {_where(suffix, number, a)} depends on the order of rows in a frame")
+                raise LawError(f"order-blind: {_where(suffix, number, a)} depends on {change}")
 
 
 def empties(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
@@ -412,9 +422,12 @@ def _key(frame: Frame) -> tuple[int, int, bytes]:
     return frame.t_ns, frame.index, content
 
 
-def _without_ids(rows: Any) -> list[tuple[tuple[Any, ...], int | None]]:
-    """Rows in an order of their own, with the id apart; numbers to 9 digits, since sums depend on the order."""
-    names = [name for name in rows.dtype.names if name != "track_id"]
+def _without_ids(rows: Any, ids: Collection[str]) -> list[tuple[tuple[Any, ...], int | None]]:
+    """Rows in an order of their own, with these ids left out and that of the track apart.
+
+    Numbers are compared to 9 digits, since sums depend on the order.
+    """
+    names = [name for name in rows.dtype.names if name not in ids]
     has_ids = "track_id" in rows.dtype.names
     out = []
     for row in rows:

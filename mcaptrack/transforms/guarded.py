@@ -15,7 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import warn
 from mcaptrack.registry import Entry, failure, is_interruption
 from mcaptrack.registry.guard import Guard
-from mcaptrack.schema import SCORES_MAPPED, Frame, Schema
+from mcaptrack.schema import SCORES_MAPPED, SIGHTINGS, Frame, Schema
 from mcaptrack.schema.impossible import first_impossible
 from mcaptrack.transforms.protocol import Transform, traits_of
 
@@ -70,7 +70,7 @@ def guarded(
     except BaseException as error:  # code of other packages may raise anything
         raise source.error_of(entry, error) from error
     last_ns: int | None = None
-    low, high = 0.0, 1.0
+    low, high, reach = 0.0, 1.0, 0.0
     while True:
         try:
             with guard.step():
@@ -86,6 +86,8 @@ def guarded(
                 f"{entry} gave frame {main.index} of {main.t_ns} ns {source.where}, which is not in its input or was "
                 "given before; it has to yield one frame for each, with the same t_ns and index"
             )
+        if entry.kind == "detector":
+            reach = float(np.fmax.reduce(main.rows["x_px"] + main.rows["w_px"], initial=reach))
         for frame in checked:
             if "score" in (frame.rows.dtype.names or ()) and len(frame.rows):
                 low = float(np.fmin.reduce(frame.rows["score"], initial=low))
@@ -94,6 +96,10 @@ def guarded(
         last_ns = checked[0].t_ns
     if low < 0 or high > 1:
         warn(f"{entry} gave scores from {low:g} to {high:g}; {SCORES_MAPPED}", "scores")
+    if 0 < reach <= 1:
+        warn(
+            f"{entry} gave boxes that all lie within one pixel; they are in pixels, not in shares of a picture", "units"
+        )
     if entry.kind in _ONE_FOR_EACH and (missing := source.unanswered()):
         warn(
             f"{entry} gave no frame for {missing} of {source.count}; a frame without rows says that nothing was there, "
@@ -170,9 +176,15 @@ def _checked(entry: Entry, transform: Transform, result: object, last_ns: int | 
             gave = f"a tuple of {', '.join(type(value).__name__ for value in frames) or 'nothing'}"
         wanted = f"a tuple with a Frame for each of its outputs ({len(schemas)})"
         raise McaptrackError(f"{entry} gave {gave} {where}; it has to yield {wanted}")
-    return tuple(
+    checked = tuple(
         _checked_frame(entry, frame, schema, last_ns, where) for frame, schema in zip(frames, schemas, strict=True)
     )
+    joined = len(checked[list(transform.writes).index("")].rows)
+    for frame, schema in zip(checked, schemas, strict=True):
+        if schema is SIGHTINGS and (frame.rows["detection"] >= joined).any():
+            last = frame.rows["detection"].max()
+            raise McaptrackError(f"{entry} gave sightings {where} of detection {last}; it gave {joined}, from 0 on")
+    return checked
 
 
 def _checked_frame(entry: Entry, frame: Frame, schema: Schema, last_ns: int | None, where: str) -> Frame:

@@ -326,8 +326,9 @@ def option_problem(cls: type[Any]) -> str:
     for parameter in fields(cls):
         if not (parameter.metadata.get("context") or is_option_type(hints[parameter.name])):
             return (
-                f"{cls.__name__}.{parameter.name} is a {_type_name(hints[parameter.name])}; a parameter is a float, an "
-                "int, a bool, a str, a Literal of names, a tuple of any length of one of these, or one of them or None"
+                f"{cls.__name__}.{parameter.name} has the type {_type_name(hints[parameter.name])}; a parameter is a "
+                "float, an int, a bool, a str, a Literal of names, a tuple of any length of one of these, or one of "
+                "them or None"
             )
         if not parameter.init:
             return f"{cls.__name__}.{parameter.name} can't be given (init=False); make it a property"

@@ -265,6 +265,11 @@ def check_class(entry: Entry) -> None:
         raise McaptrackError(f"{entry} can't be called with frames; it needs a method __call__")
     if problem := trait_problem(cls):
         raise McaptrackError(f"{entry} {problem}")
+    latency_s = inspect.getattr_static(cls, "latency_s", {})
+    if not (isinstance(latency_s, Mapping) or hasattr(latency_s, "__get__")):  # a property has it
+        raise McaptrackError(
+            f"{entry} has latency_s = {latency_s!r:.40}; it maps outputs to seconds, as in {{'': 0.0}}"
+        )
     if problem := option_problem(cls):
         raise McaptrackError(f"{entry}: {problem}")
 

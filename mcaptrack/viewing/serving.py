@@ -34,7 +34,7 @@ from urllib.parse import quote, unquote_to_bytes
 from mcaptrack.errors import McaptrackError
 from mcaptrack.installed import missing_extension
 from mcaptrack.log import Log
-from mcaptrack.registry import find, names
+from mcaptrack.registry import Entry, find, names
 
 __all__ = ["AS_MANY_AS_FIT", "LOOPBACK", "Choice", "LogPage", "Page", "Server", "WebViewer"]
 
@@ -134,11 +134,12 @@ class Choice(NamedTuple):
 AS_MANY_AS_FIT: Final = Choice()
 
 
-def log_player() -> Any:
-    """The maker of players of logs: that of the first entry point. Raises McaptrackError if there is none."""
+def log_player() -> tuple[Entry, Any]:
+    """The maker of players of logs, that of the first entry point. Raises McaptrackError if there is none."""
     if not names("player"):
         raise McaptrackError(missing_extension("Player"))
-    return find("player", names("player")[0]).made("show", "page")
+    entry = find("player", names("player")[0])
+    return entry, entry.made("show", "page")
 
 
 #: What is served: a file, the content of one, or a page.

@@ -93,7 +93,10 @@ def solve(opened: log.Log, prefix: str, answers: Sequence[Frame] | None = None) 
         raise McaptrackError(f"{opened.path} has no {topic} to review; {call('run', opened.path)} makes it")
     transform = rebuild(STAGES["retrack"], how, {})
     if not isinstance(transform, LikelihoodOptions):
-        raise McaptrackError(f"{opened.path}: {topic} was made by a method that knows no probabilities")
+        again = call("retrack", opened.path, retracker="likelihood", force=True)
+        raise McaptrackError(
+            f"{opened.path}: {topic} was made by a method that knows no probabilities; {again} takes one that does"
+        )
     frames, context = pipeline.input_of(opened, prefix, "retrack", transform, how.input)
     given = {} if answers is None else {"answers": answers}
     transform = replace(transform, **context | given, worlds=_WORLDS)

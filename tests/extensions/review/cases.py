@@ -21,7 +21,14 @@ def _answered(scene) -> str:
     return scene.says("review", "LOG", "--answers", "answers.json")
 
 
+def _by_consistency(scene) -> str:
+    """Ask about tracks of the method of the paper, which has no probabilities."""
+    scene.says("retrack", "LOG", "--retracker", "consistency", "--force")
+    return scene.says("review", "LOG")
+
+
 PROPOSALS = {
+    "extensions/review/questions.py:solve:retrack": _by_consistency,
     "extensions/review/questions.py:solve:run": lambda s: s.untracked().says("review", "LOG"),
     "extensions/review/command.py:show:review": _answered,
 }
