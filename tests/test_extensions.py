@@ -141,14 +141,14 @@ def test_doctor_lists_what_packages_bring_and_what_of_it_fails(site):
     }
     install(site, points, "old", "1.0")
     with (site / "old-1.0.dist-info" / "METADATA").open("a") as metadata:
-        metadata.write("Requires-Dist: mcaptrack<0.2\nRequires-Dist: numpy>=1.0\nRequires-Dist: lost ; extra == 'a'\n")
+        metadata.write("Requires-Dist: numpy<1.0\nRequires-Dist: scipy>=1.0\nRequires-Dist: lost ; extra == 'a'\n")
     result = json.loads(done("doctor", "--json").out)
     found, warned = result["plugins"], [warning["message"] for warning in result["warnings"]]
     stray = found["entry point near (old 1.0)"]
     assert stray.endswith("mcaptrack.tracker is no group of entry points; did you mean mcaptrack.trackers?")
     assert "has input_topic = None" in found["stage placeless (old 1.0)"]
     assert [message for message in warned if message.startswith("old 1.0 needs")] == [
-        f"old 1.0 needs mcaptrack<0.2, and version {mcaptrack.__version__} is installed; install another version of one"
+        f"old 1.0 needs numpy<1.0, and version {np.__version__} is installed; install another version of one"
     ]
     for (kind, name), owner in owners.items():
         ignored = f"{kind} {name} (taken 2.0)"
