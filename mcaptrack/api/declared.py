@@ -491,12 +491,17 @@ def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
         return
     is_path = os.PathLike in types  # which text is a name of, too
     meant = [text for kind, text in _TYPES.items() if kind in types and not (is_path and kind is str)]
-    raise McaptrackError(f"`{name}=` is {' or '.join(meant)}, not {' '.join(repr(value).split()):.40}")
+    raise McaptrackError(f"`{name}=` is {' or '.join(meant)}, not {_begin_of(value)}")
 
 
 def _check_members(name: str, value: object, kinds: Sequence[Any]) -> None:
     if Sequence[str] in kinds and isinstance(value, list | tuple) and any(not isinstance(each, str) for each in value):
-        raise McaptrackError(f"`{name}=` holds texts, and no other values, not {' '.join(repr(value).split()):.40}")
+        raise McaptrackError(f"`{name}=` holds texts, and no other values, not {_begin_of(value)}")
+
+
+def _begin_of(value: object) -> str:
+    """The beginning of a value as Python writes it, in one line."""
+    return f"{' '.join(repr(value).split()):.40}"
 
 
 def _check_choice(name: str, value: object, choices: list[Any]) -> None:

@@ -287,13 +287,9 @@ def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:
     packages: dict[str, str] = {}
     lacking: dict[str, list[str]] = {}
     faults = []
-    for text in _requirements():
-        match = _REQUIREMENT.match(text)
-        if match is None:
-            continue
+    for match, have in _requirements("mcaptrack"):
         name, least, marker = match.groups(default="")
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", marker)
-        have = _version_of(name)
         is_enough = bool(have) and _numbers(have) >= _numbers(least)
         if extra is None:
             packages[name] = have
@@ -323,12 +319,14 @@ def _overwritten(packages: Collection[str]) -> Iterator[str]:
             )
 
 
-def _requirements(package: str = "mcaptrack") -> list[str]:
+def _requirements(package: str) -> Iterator[tuple[re.Match[str], str]]:
+    """Yield what a package needs, and which version of it is installed; "" for none."""
     try:
-        return metadata.requires(package) or []
+        texts = metadata.requires(package) or []
     except metadata.PackageNotFoundError:
         warn(f"{package} is not installed as a package: which versions of others it needs is unknown")
-        return []
+        return
+    yield from ((match, _version_of(match[1])) for text in texts if (match := _REQUIREMENT.match(text)))
 
 
 def _version_of(name: str) -> str:
@@ -384,16 +382,13 @@ def _plugins() -> dict[str, str]:
 
 def _conflicts(package: str) -> Iterator[str]:
     """Yield a sentence for each requirement of a package that what is installed doesn't meet."""
-    for text in _requirements(package):
-        name, _, marker = text.partition(";")
-        match = _REQUIREMENT.match(name)
-        if match is None or marker:
-            continue
-        have = _version_of(match[1])
-        limits = re.findall(r"(>=|<=|~=|==|!=|>|<)\s*([\d.]+)(?![\d.]|\*)", name)
-        if not have or not all(_COMPARED[sign](_numbers(have), _numbers(limit)) for sign, limit in limits):
+    for match, have in _requirements(package):
+        limits = re.findall(r"(>=|<=|~=|==|!=|>|<)\s*([\d.]+)(?![\d.]|\*)", match[0])
+        is_met = bool(have) and all(_COMPARED[sign](_numbers(have), _numbers(limit)) for sign, limit in limits)
+        if not match[3] and not is_met:  # with a marker it isn't needed everywhere
+            needs = f"{package} {_version_of(package)} needs {match[0].strip()}"
             lack = f"version {have} is installed" if have else "it is not installed"
-            yield f"{package} {_version_of(package)} needs {name.strip()}, and {lack}; install another version of one"
+            yield f"{needs}, and {lack}; install another version of one"
 
 
 def _parts() -> dict[str, str]:
