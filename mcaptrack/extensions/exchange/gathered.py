@@ -6,6 +6,7 @@ Letters: N rows, C numbers of a box.
 from __future__ import annotations
 
 import math
+import re
 from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,8 @@ from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_ID, NOTHING, Box
 from mcaptrack.sources.ingest.labels.text import MAX_NAME, MAX_ROWS, ClassNames, FrameNames, TrackIds, is_count
 
 _LISTED: Final = 10
+#: A number as a text, of files that are made of XML or tables.
+_NUMBER: Final = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*", re.ASCII)
 
 Part = TypeVar("Part")
 
@@ -26,6 +29,13 @@ Part = TypeVar("Part")
 def is_number(value: Any) -> bool:
     """Whether a value of JSON is a number."""
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def number_in(value: Any) -> float | None:
+    """The number that a value of JSON is, or that its text says; None if it is none."""
+    if isinstance(value, str) and _NUMBER.fullmatch(value):
+        return float(value)
+    return as_float(value) if is_number(value) else None
 
 
 def as_float(value: float) -> float:
@@ -58,15 +68,15 @@ class GatheredRows:
         return missing if value is None else as_float(value)
 
     def numbers(self, place: str, content: Any, keys: Sequence[Any]) -> list[float]:
-        """The numbers with these keys, or at these places. Raises McaptrackError if there aren't all."""
+        """The numbers with these keys, or at these places, also as texts. Raises McaptrackError if there aren't all."""
         try:
-            values = [content[key] for key in keys]
+            values = [number for key in keys if (number := number_in(content[key])) is not None]
         except (KeyError, IndexError, TypeError):
-            values = [None]
-        if not all(map(is_number, values)) or (isinstance(content, list) and len(content) != len(keys)):
+            values = []
+        if len(values) != len(keys) or (isinstance(content, list) and len(content) != len(keys)):
             listed = ", ".join(map(str, keys))
             raise self.refuse(place, f"has no box of {len(keys)} numbers ({listed}): {str(content)[:60]}")
-        return [as_float(value) for value in values]
+        return values
 
     def add(
         self,
