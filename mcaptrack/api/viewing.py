@@ -40,6 +40,8 @@ _VIEWER: Final = "Server and viewer"
 PORT: Final = 8765
 #: Our pages and scripts, below the secret word; files of the log have no folder.
 _FOLDER: Final = "page"
+#: What the functions of a page and of a viewer give.
+_GIVEN: Final[Mapping[str, type[Any]]] = {"make": bytes, "link": str, "why_not": str}
 #: The time in the text of an event.
 _WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
 
@@ -98,15 +100,26 @@ def _parts(kind: Kind) -> dict[str, Any]:
             with blamed(entry, "could not be made"):
                 gave = entry.cls()
             part: Any = of_type(entry, gave, LogPage if kind == "page" else WebViewer, "its function")
-            parts[name] = part._replace(make=partial(_made_by, entry, part.make))
+            parts[name] = part._replace(
+                **{each: partial(_given, entry, each, getattr(part, each)) for each in _GIVEN if hasattr(part, each)}
+            )
         except McaptrackError as error:
             warn(str(error), "left-out")
     return {name: part for name, part in parts.items() if re.fullmatch(r"\w[\w-]*", name)}
 
 
-def _made_by(entry: Entry, make: Callable[[logs.Log], bytes], opened: logs.Log) -> bytes:
+def _given(entry: Entry, name: str, function: Callable[[Any], Any], argument: Any) -> Any:
+    """Return what a function of a part gives."""
     with blamed(entry, "failed"):
-        return make(opened)
+        gave = function(argument)
+    return of_type(entry, gave, _GIVEN[name], name)
+
+
+def _why_not(viewer: WebViewer, opened: logs.Log) -> str:
+    try:
+        return viewer.why_not(opened)
+    except McaptrackError as error:
+        return str(error)
 
 
 def tables_page() -> LogPage:
@@ -206,7 +219,9 @@ class LogServer:
             with blamed(entry, "failed"):
                 gave = maker.page(camera, is_above)
             player = of_type(entry, gave, LogPage, "page")
-            pages[f"{_FOLDER}/player-{number}.html"] = Page(made(partial(_made_by, entry, player.make)), player.policy)
+            pages[f"{_FOLDER}/player-{number}.html"] = Page(
+                made(partial(_given, entry, "make", player.make)), player.policy
+            )
         for name, page in contents.pages.items():
             pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)
         for name in tables.TABLES:
@@ -388,7 +403,7 @@ def view(
             )
         contents = _Contents(
             path, files, layouts, events, _views(shown), _parts("page"),
-            {name: (viewer, viewer.why_not(opened)) for name, viewer in _parts("viewer").items()},
+            {name: (viewer, _why_not(viewer, opened)) for name, viewer in _parts("viewer").items()},
             opened.start_ns, at_ns,
             tuple(notes), tuple(dict.fromkeys(warnings)),
         )  # fmt: skip
