@@ -11,14 +11,16 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import nullcontext
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 from importlib import import_module
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from urllib.parse import urljoin
+from urllib.parse import quote, urlencode, urljoin
 from urllib.request import urlopen
 
 import numpy as np
@@ -43,19 +45,23 @@ from mcaptrack.contracts import (
     SectionTable,
 )
 from mcaptrack.errors import McaptrackError
+from mcaptrack.fleet import Processes
+from mcaptrack.fleet.child import WorkerLimits
+from mcaptrack.fleet.worker import Reply, Request, do
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.scenes import Scenes
-from mcaptrack.registry import BUILT_IN, KINDS, Entry, others
+from mcaptrack.registry import BUILT_IN, KINDS, Entry, find, others, own
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.provenance import Plugin, Provenance
 from mcaptrack.sources import fixed_frame
 from mcaptrack.sources.box_files import MotFile
 from mcaptrack.sources.ingest.labels.of_packages import format_named
 from mcaptrack.testing import LawError
+from mcaptrack.viewing.serving import LogPage, WebViewer
 from tests.commands import call, done
 from tests.distributions import package
 from tests.logs import provenance_of, recorder
-from tests.tiers import thorough
+from tests.tiers import one_in, thorough
 from tools import pages
 
 #: A command and a class of an extension; of the core, where there is no extension.
@@ -701,6 +707,25 @@ def test_a_page_of_a_package_stands_beside_the_player_and_one_that_breaks_is_lef
     assert warned == [f"page name-of-it (another 2.0) {words}" for words in said]
 
 
+@pytest.mark.parametrize(("gives", "said"), [("'text'", "a str; make has to give a bytes"), ("1 / 0", "failed: Zero")])
+def test_a_page_that_is_no_page_says_so_in_its_place(site, tracked, gives, said):
+    code = f"from mcaptrack.viewing.serving import LogPage\ndef Part():\n    return LogPage(lambda _: {gives}, '')\n"
+    add(site, "page", "odd", code)
+    with mcaptrack.view("a.mcap", port=0) as server:
+        (address,) = re.findall(r'"odd":"([^"]+)"', urlopen(server.address).read().decode())
+        assert (
+            f"page odd (another 2.0) gave {said}".replace("gave f", "f")
+            in urlopen(urljoin(server.address, address)).read().decode()
+        )
+
+
+def test_a_viewer_that_fails_is_shown_with_the_reason(site, tracked):
+    code = "from mcaptrack.viewing.serving import WebViewer\ndef Part():\n    return WebViewer('.x', *[lambda _: 1 / 0] * 3)\n"
+    add(site, "viewer", "odd", code)
+    with mcaptrack.view("a.mcap", port=0) as server:
+        assert "viewer odd (another 2.0) failed: ZeroDivisionError" in urlopen(server.address).read().decode()
+
+
 def test_a_player_of_a_package_that_gives_no_page_is_one_line(site, tracked):
     add(
         site,
@@ -977,6 +1002,148 @@ EXPORT_LAWS = {
     "rows": "conforms: .* no numbers of rows", "beside": "conforms: it writes more.txt", "name": "pure: .* other bytes",
     "state": "pure: .* other bytes", "log": "pure: |damaged|conforms", "empty": "empties: ", "folder": "process: ",
 }  # fmt: skip
+JUDGE_LAWS = {
+    "small": "conforms: .* failed at 4 and 4 crops: IndexError", "many": "conforms: .* failed at .*ValueError",
+    "nan": "conforms: .* gives nan as log odds", "state": "pure: the same crops give another number",
+    "crops": "pure: it changes its crops", "distance": "sign: other crops are likelier", "folder": "process: ",
+}  # fmt: skip
+PAGE_LAWS = {
+    "type": "conforms: .* gave a bytes; its function has to give a LogPage", "policy": "declares: its policy, ''",
+    "lines": "declares: its policy", "text": "conforms: .* gave a str; make has to give a bytes",
+    "bytes": "conforms: its page is not in UTF-8", "state": "pure: the same log gives another page",
+    "log": "pure: it changes the log", "empty": "empties: .* KeyError", "folder": "process: ",
+}  # fmt: skip
+VIEWER_LAWS = {
+    "end": "declares: its end is 'txt'", "refuses": "conforms: it makes no file of this log: too old",
+    "number": "conforms: .* gave an int; why_not has to give a str", "text": "conforms: .* make has to give a bytes",
+    "plain": "conforms: its link to .* escaped", "nowhere": "conforms: its link to", "scheme": "conforms: its link to",
+    "log": "pure: it changes the log", "empty": "empties: .* KeyError",
+}  # fmt: skip
+PLAYER_LAWS = {
+    "silent": "conforms: .* AttributeError", "still": "conforms: .* ZeroDivisionError", "large": "conforms: it takes 17.0 MB",
+    "state": "pure: the same log is shown in another way", "type": "conforms: .* gave a bytes; page has to give a LogPage",
+    "policy": "declares: its policy", "log": "pure: it changes the log", "empty": "empties: .* KeyError",
+}  # fmt: skip
+LINE_LAWS = {
+    "none": "conforms: it gives no lines", "number": "conforms: a heading .*: \\('a', 3\\)", "lines": "conforms: a heading",
+    "blank": "conforms: a heading", "list": "conforms: .* gave a list; it has to give a dict",
+    "fails": "conforms: .* failed: ZeroDivisionError", "folder": "process: ",
+}  # fmt: skip
+CREW_LAWS = {
+    "places": "conforms: it has 0 places after 0.5 s", "silent": "conforms: nothing came of good within", "twice": "conforms: good has a second reply",
+    "others": "conforms: good is done, and its reply", "result": "conforms: the result of good is not", "lines": "conforms: good is done",
+    "raises": "conforms: good raises KeyError", "here": "conforms: good is done, and its reply .* in the process that asks",
+    "idle": "conforms: it is busy with", "lost": "conforms: it is busy with .* it lost 'gone'", "endless": "stop: work goes on",
+}  # fmt: skip
+
+
+class Judge:
+    def __init__(self, breaks: str = "") -> None:
+        self.breaks, self.seen = breaks, 0
+
+    def __call__(self, before: list[Any], after: list[Any]) -> Any:
+        self.seen += 1
+        if self.breaks == "folder":
+            os.chdir("/")
+        if self.breaks == "crops":
+            before[0][:] = 0
+        a, b = (np.mean([crop[2 if self.breaks == "small" else 0].mean() for crop in side]) for side in (before, after))
+        own = {"crops": 0.0, "many": "many", "nan": np.nan, "state": self.seen, "distance": abs(a - b)}
+        return own.get(self.breaks, -abs(a - b))
+
+
+def page_of(breaks: str) -> Any:
+    """A page of the topics of a log, which can't be made without any."""
+
+    def make(opened: Any) -> Any:
+        if not opened.channels and breaks != "blank":
+            raise KeyError("topic") if breaks == "empty" else McaptrackError("nothing is here")
+        if breaks == "log":
+            with opened.path.open("ab") as stream:
+                stream.write(b"x")
+        topics = " ".join(opened.channels)
+        own = {"text": topics, "bytes": b"\xff", "state": str(next(NUMBERS)).encode()}
+        return own.get(breaks, topics.encode())
+
+    policy = {"policy": "", "lines": "default-src 'none'\nX: y"}.get(breaks, "default-src 'none'")
+    if breaks == "folder":
+        os.chdir("/")
+    return b"" if breaks == "type" else LogPage(make, policy)
+
+
+def viewer_of(breaks: str) -> WebViewer:
+    def link(address: str) -> str:
+        if breaks == "scheme":
+            return f"javascript:open({quote(address)!r})"
+        return f"https://a.example/?{f'url={address}' if breaks == 'plain' else urlencode({'url': address * (breaks != 'nowhere')})}"
+
+    def why_not(opened: Any) -> Any:
+        return {"refuses": "too old", "number": 3}.get(breaks, "")
+
+    return WebViewer("txt" if breaks == "end" else ".a.txt", page_of(breaks).make, link, why_not)
+
+
+class Player:
+    def __init__(self, breaks: str = "") -> None:
+        self.breaks = breaks
+
+    def show(self, opened: Any, at_s: float | None, **options: Any) -> Any:
+        if not opened.channels:
+            raise KeyError("topic") if self.breaks == "empty" else McaptrackError("nothing is here")
+        if self.breaks == "still":
+            at_s = at_s and 1 / 0
+        own = {"large": "x" * 17_000_000, "state": str(next(NUMBERS))}
+        html = own.get(self.breaks, f"{at_s}")
+        return SimpleNamespace() if self.breaks == "silent" else SimpleNamespace(_repr_html_=lambda: html)
+
+    def page(self, camera: str, is_above: bool) -> Any:
+        return page_of(self.breaks)
+
+
+class Crew(Processes):
+    """Processes, which break a law."""
+
+    def __init__(self, breaks: str = "") -> None:
+        super().__init__(WorkerLimits())
+        self.breaks = breaks
+        self.places = 0 if breaks == "places" else 1
+
+    def start(self, request: Request, then: Callable[[Any], None]) -> None:
+        def changed(future: Future[Reply]) -> None:
+            if self.breaks == "twice":
+                then(future)
+            if self.breaks in ("others", "result", "lines"):
+                own = {"others": {"log": Path("b")}, "result": {"result": None}, "lines": {"error": "a\nb"}}
+                made, future = future.result(), Future()
+                future.set_result(replace(made, **own[self.breaks]))
+            if self.breaks == "raises":
+                future = Future()
+                future.set_exception(KeyError("x"))
+            then(future)
+
+        if self.breaks == "here":
+            here: Future[Reply] = Future()
+            here.set_result(do(request, lambda *_: None))
+            then(here)
+        elif self.breaks != "silent":
+            super().start(request, changed)
+
+    def running(self) -> Any:
+        return () if self.breaks == "idle" else super().running()
+
+    def lost(self) -> str:
+        return "gone" if self.breaks == "lost" else ""
+
+    def stop(self, grace_s: float) -> None:
+        if self.breaks != "endless":
+            super().stop(grace_s)
+
+
+def lines_of(breaks: str) -> Any:
+    if breaks == "folder":
+        os.chdir("/")
+    own = {"none": {}, "number": {"a": 3}, "lines": {"a": "b\nc"}, "blank": {"": "b"}, "list": ["a"]}
+    return 1 / 0 if breaks == "fails" else own.get(breaks, {"a": "b"})
 
 
 def check_format(breaks: str) -> None:
@@ -993,10 +1160,40 @@ def check_recording(breaks: str) -> None:
     testing.check_recording_format(Recordings(breaks), Path("a.numbers"))
 
 
-def check_export(breaks: str) -> None:
+@cache
+def small() -> bytes:
     Path("b.csv").write_text(TABLE)
     done("ingest", "b.csv", "--fps", "10", "--classes", "all", "-o", "a.mcap", "--force")
-    testing.check_exporter(Export(breaks), "a.mcap")
+    return Path("a.mcap").read_bytes()
+
+
+def small_log() -> str:
+    Path("a.mcap").write_bytes(small())
+    return "a.mcap"
+
+
+def check_export(breaks: str) -> None:
+    testing.check_exporter(Export(breaks), small_log())
+
+
+def check_judge(breaks: str) -> None:
+    testing.check_judge(Judge(breaks))
+
+
+def check_page(breaks: str) -> None:
+    testing.check_page(lambda: page_of(breaks), small_log())
+
+
+def check_viewer(breaks: str) -> None:
+    testing.check_viewer(lambda: viewer_of(breaks), small_log())
+
+
+def check_player(breaks: str) -> None:
+    testing.check_player(Player(breaks), small_log())
+
+
+def check_doctor_lines(breaks: str) -> None:
+    testing.check_doctor_lines(lambda: lines_of(breaks))
 
 
 CHECKS: list[tuple[Callable[[str], None], dict[str, str]]] = [
@@ -1004,6 +1201,11 @@ CHECKS: list[tuple[Callable[[str], None], dict[str, str]]] = [
     (check_reader, READER_LAWS),
     (check_recording, RECORDING_LAWS),
     (check_export, EXPORT_LAWS),
+    (check_judge, JUDGE_LAWS),
+    (check_page, PAGE_LAWS),
+    (check_viewer, VIEWER_LAWS),
+    (check_player, PLAYER_LAWS),
+    (check_doctor_lines, LINE_LAWS),
 ]
 
 
@@ -1028,11 +1230,73 @@ def test_a_class_in_the_place_of_an_object_is_refused():
         (testing.check_message_reader, Reader),
         (testing.check_exporter, Export),
         (testing.check_recording_format, Recordings),
+        (testing.check_player, Player),
+        (lambda part, _: testing.check_judge(part), Judge),
+        (lambda part, _: testing.check_crew(part), Crew),
     ):
         with pytest.raises(LawError, match="is a class; give an object"):
             check(part, [])
         with pytest.raises(LawError, match="has no method"):
             check(SimpleNamespace(), [])
+    with pytest.raises(LawError, match="declares: judge function could not be made"):
+        testing.check_judge(lambda before, after: 0.0)
+    with pytest.raises(LawError, match="declares: player Show has no method page"):
+        testing.check_player(type("Show", (), {"show": print})(), "a.mcap")
+
+
+@pytest.mark.parametrize(("breaks", "said"), one_in(len(CREW_LAWS) + 1, {"": "", **CREW_LAWS}.items()))
+def test_the_check_of_a_crew_names_the_law(breaks, said, monkeypatch):
+    monkeypatch.setattr("mcaptrack.testing.crews._STOPPED_S", 10.0 if breaks != "endless" else 1.0)
+    crew = Crew(breaks)
+    try:
+        with pytest.raises(LawError, match=said) if said else nullcontext():
+            testing.check_crew(crew, patience_s=60.0 if breaks not in ("silent", "places") else 0.5)
+    finally:
+        Processes.stop(crew, 0.0)
+
+
+class Undocumented:
+    pass
+
+
+def inner() -> Callable[[], int]:
+    def three() -> int:
+        """Three."""
+        return 3
+
+    return three
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("Format", Entry, ""),
+        ("for", Entry, "is no public name of Python"),
+        ("a-name", Entry, "is no public name of Python"),
+        ("_hidden", Entry, "is no public name of Python"),
+        ("run", Entry, "mcaptrack has the name run already"),
+        ("log", Entry, "mcaptrack has the name log already"),
+        ("Undocumented", Undocumented, "has no docstring"),
+        ("three", 3, "is no class or function but of type int"),
+        ("inner", inner(), "can't be read or found by others"),
+    ],
+)
+def test_the_check_of_a_name_names_the_law(name, value, said):
+    with pytest.raises(LawError, match=f"declares: .*{said}") if said else nullcontext():
+        testing.check_name(name, value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"), [(kind, name) for kind in ("page", "player", "doctor_line", "name") for name in own(kind)]
+)
+def test_parts_of_our_own_keep_the_laws(kind, name, template):
+    entry = find(kind, name)
+    {
+        "page": lambda: testing.check_page(entry.cls, template),
+        "player": lambda: testing.check_player(entry.made(), template),
+        "doctor_line": lambda: testing.check_doctor_lines(entry.cls),
+        "name": lambda: testing.check_name(name, entry.cls),
+    }[kind]()
 
 
 def test_a_file_that_is_not_there_is_one_line():
@@ -1043,6 +1307,9 @@ def test_a_file_that_is_not_there_is_one_line():
         partial(testing.check_finisher, silent),
         partial(testing.check_report_section, silent),
         partial(testing.check_scene_maker, silent),
+        partial(testing.check_page, silent),
+        partial(testing.check_viewer, silent),
+        partial(testing.check_player, Player()),
     ):
         with pytest.raises(McaptrackError, match=r"none\.mcap does not exist") as refusal:
             check("none.mcap")
@@ -1140,7 +1407,9 @@ def test_the_check_of_a_finisher_and_of_a_section_names_the_law(site, finished, 
         check = partial(testing.check_finisher, module.crowded, finished, crowded=2)
     else:
         check = partial(testing.check_report_section, module.lengths, finished)
-    check()
+    with collected() as said_of_copies:
+        check()
+    assert said_of_copies == []
     if part == "crowded":
         with pytest.raises(LawError, match=r"declares: .* can't have its name: the result of run has next"):
             check(name="next")

@@ -128,6 +128,37 @@ def test_numbers_that_are_made_of_the_names_of_tracks_are_noticed():
 
 
 @dataclass(frozen=True)
+class Passed:
+    """A re-tracker that passes tracks on, moved in time or multiplied."""
+
+    delay_ns: int = 0
+    columns: tuple[str, ...] = ()
+    times: float = 1.0
+    reads: ClassVar = TRACKS
+    writes: ClassVar = {"": TRACKS}
+    latency_s: ClassVar = {"": float("inf")}
+
+    def __call__(self, frames):
+        for frame in frames:
+            rows = frame.rows.copy()
+            for name in self.columns:
+                rows[name] *= self.times
+            yield (frame._replace(t_ns=frame.t_ns + self.delay_ns, rows=rows),)
+
+
+def test_a_re_tracker_gives_tracks_where_and_when_it_read_them():
+    check_transform(Passed(columns=("x_m", "y_m", "x_px"), times=1.01))
+    for broken, said in (
+        (Passed(delay_ns=1), "output '', frame 39 at 15600000001 ns is outside of its input, 0 to 15600000000 ns"),
+        (Passed(columns=("x_m", "y_m"), times=1000.0), r"rows are usually [\d.e+]+ m from those that it reads"),
+        (Passed(columns=("x_m", "y_m"), times=3.28), r"rows are usually [\d.]+ m from"),
+        (Passed(columns=("x_px", "y_px", "w_px"), times=0.001), r"rows are usually \d+ px from"),
+    ):
+        with pytest.raises(LawError, match=f"conforms: {said}"):
+            check_transform(broken)
+
+
+@dataclass(frozen=True)
 class Apart:
     """A detection of each sighting, numbered from ``first`` on."""
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from mcaptrack.predictors import AnyPredictor, PeopleSeen, are_covariances, predict_among
 from mcaptrack.registry import failure
+from mcaptrack.testing.crews import check_crew
 from mcaptrack.testing.formats import (
     check_exporter,
     check_label_format,
@@ -19,22 +20,37 @@ from mcaptrack.testing.formats import (
     check_recording_format,
     object_entry,
 )
-from mcaptrack.testing.functions import check_command, check_finisher, check_report_section, check_scene_maker
+from mcaptrack.testing.functions import (
+    check_command,
+    check_doctor_lines,
+    check_finisher,
+    check_name,
+    check_report_section,
+    check_scene_maker,
+)
 from mcaptrack.testing.transforms import LAWS, LawError, check_transform, same_process, sample_frames
+from mcaptrack.testing.views import check_judge, check_page, check_player, check_viewer
 
 __all__ = [
     "LAWS",
     "LawError",
     "check_command",
+    "check_crew",
+    "check_doctor_lines",
     "check_exporter",
     "check_finisher",
+    "check_judge",
     "check_label_format",
     "check_message_reader",
+    "check_name",
+    "check_page",
+    "check_player",
     "check_predictor",
     "check_recording_format",
     "check_report_section",
     "check_scene_maker",
     "check_transform",
+    "check_viewer",
     "sample_frames",
 ]
 

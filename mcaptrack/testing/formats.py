@@ -32,7 +32,6 @@ from mcaptrack.contracts import (
     is_in_space,
 )
 from mcaptrack.errors import McaptrackError
-from mcaptrack.notices import collected
 from mcaptrack.registry import Entry, Kind, blamed, in_words, of_type
 from mcaptrack.sources.box_files import boxes_topic, read_boxes
 from mcaptrack.sources.foreign.boxes import checked_boxes, checked_boxes_3d
@@ -142,8 +141,7 @@ def _made_format(label_format: LabelFormat | Format) -> tuple[Format, str]:
 
 def _labels(made: Format, path: Path, role: Role | None = "detections") -> list[Any]:
     """The boxes of a file as labels, as values that can be compared."""
-    with collected():
-        rows = read_by(made, LabelFile(path), Asked(made.name, role))
+    rows = read_by(made, LabelFile(path), Asked(made.name, role))
     columns = [getattr(rows, name) for name in COLUMNS]
     return [None if column is None else np.asarray(column).tobytes() for column in (*columns, rows.labelled)]
 
@@ -270,7 +268,7 @@ def check_recording_format(recording_format: RecordingFormat, path: PathLike) ->
     entry = object_entry("recording", recording_format, "open")
     object_entry("recording", recording_format, "recognises")
     file = present(path)
-    with same_process(entry.name), TemporaryDirectory() as folder, collected():
+    with same_process(entry.name), TemporaryDirectory() as folder:
         before = _content(file)
         _check_description(entry, recording_format, file)
         with law("conforms"):
@@ -364,7 +362,7 @@ def check_exporter(
             raise LawError(f"conforms: it writes {beside[0]}, too; it has to write the path that it gets alone")
         return rows, _content(file)
 
-    with same_process(entry.name), TemporaryDirectory() as folder, collected():
+    with same_process(entry.name), TemporaryDirectory() as folder:
         before = _content(source)
         places = [Path(folder, name, f"{name}{by.end}") for name in ("a", "other", "empty")]
         with law("conforms"):

@@ -1,19 +1,23 @@
-"""The laws that hold for every command, finisher, maker of scenes and section of the report: functions of packages."""
+"""The laws that hold for functions of packages: commands, finishers, makers of scenes, sections and so on."""
 
 from __future__ import annotations
 
 import inspect
 import json
+import keyword
+import pickle
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, get_type_hints
 
 import numpy as np
 
+from mcaptrack import _MODULES
 from mcaptrack import log as logs
 from mcaptrack.api.declared import Argument, PythonOnly, about, arguments_of, hints_of, options_of, words_of
 from mcaptrack.api.finishing import FORCE, PartsOfRun
@@ -21,11 +25,11 @@ from mcaptrack.api.options import PathLike, no_progress
 from mcaptrack.api.running import RunResult, Where, work
 from mcaptrack.api.stages import track
 from mcaptrack.errors import McaptrackError
-from mcaptrack.notices import collected, listening
+from mcaptrack.notices import collected
 from mcaptrack.pipeline.scenes import Scenes
 from mcaptrack.pipeline.several import write_scene
 from mcaptrack.pipeline.staleness import is_stale
-from mcaptrack.registry import Entry, Kind
+from mcaptrack.registry import Entry, Kind, blamed, of_type
 from mcaptrack.schema.provenance import FUSE
 from mcaptrack.sources.cameras import cameras, detections_topic, provenance_of, scenes_of
 from mcaptrack.testing.transforms import LawError, law, present, same_process
@@ -76,7 +80,7 @@ def check_command(function: Callable[..., Any], *arguments: Any, **options: Any)
     """
     name = getattr(function, "__name__", repr(function))
     _check_declaration(function, name)
-    with same_process(name), collected():
+    with same_process(name):
         result = function(*arguments, **options)
     if not (result is None or isinstance(result, _PRINTED) or hasattr(result, "__dataclass_fields__")):
         raise LawError(f"conforms: {name} returns a {type(result).__name__}, which can't be printed")
@@ -147,7 +151,7 @@ def check_finisher(function: Callable[..., Any], log: PathLike, *, name: str = "
         for again in (options, {}):
             if topics := _finished(parts, copy, again).channels:
                 raise LawError(f"again: it makes {topics[0]} again, which is up to date, with the options {again}")
-        with suppress(McaptrackError), listening(lambda _: None):  # without detections; of the copy there is no word
+        with suppress(McaptrackError):  # without detections
             track(copy, tracker="ocsort", force=True)
         _finished(parts, copy, {})
         with logs.read(copy) as opened:
@@ -239,7 +243,7 @@ def check_report_section(function: Callable[..., Any], log: PathLike) -> None:
     LawError
         If it breaks a law; the message names the law.
     """
-    entry = _entry_of("report_section", function, "")
+    entry = function_entry("report_section", function)
     path = present(log)
     before = path.read_bytes()
 
@@ -248,7 +252,7 @@ def check_report_section(function: Callable[..., Any], log: PathLike) -> None:
             prefixes = [camera.prefix for camera in cameras(opened)] or ["/camera"]
             return [section_of(entry, opened, prefix, _NAMES) for prefix in prefixes]
 
-    with same_process(entry.name), collected(), TemporaryDirectory() as folder:
+    with same_process(entry.name), TemporaryDirectory() as folder:
         first = sections(path)
         if not any(first):
             raise LawError("conforms: it says nothing of this log")
@@ -262,12 +266,84 @@ def check_report_section(function: Callable[..., Any], log: PathLike) -> None:
             raise LawError("empties: a log without channels has a section")
 
 
+def check_doctor_lines(function: Callable[[], Mapping[str, str]]) -> None:
+    """Check lines of ``doctor`` against the laws that hold for all.
+
+    The laws: the function gives texts by their headings, as a dictionary, each in one line; it leaves the process that
+    it runs in as it was.
+
+    Parameters
+    ----------
+    function : callable
+        The function of the entry point.
+
+    Raises
+    ------
+    LawError
+        If it breaks a law; the message names the law.
+
+    Examples
+    --------
+    >>> from mcaptrack.testing import check_doctor_lines
+    >>> check_doctor_lines(lambda: {"my camera": "connected"})
+    """
+    entry = function_entry("doctor_line", function)
+    with same_process(entry.name), law("conforms"):
+        with blamed(entry, "failed"):
+            gave = function()
+        lines = of_type(entry, gave, dict, "it")
+    if not lines:
+        raise LawError("conforms: it gives no lines")
+    for line in lines.items():
+        if not all(isinstance(text, str) and text and text.isprintable() for text in line):
+            raise LawError(f"conforms: a heading and its text are not a line of text each: {line!r:.80}")
+
+
+def check_name(name: str, value: Any) -> None:
+    """Check a name in Python, such as a class of results, against the laws that hold for every one.
+
+    The laws: it is a name of Python that ``mcaptrack`` doesn't have; what it names is a class or function with a
+    docstring, and annotations that can be read, which other processes find in its module.
+
+    Parameters
+    ----------
+    name : str
+        The name of the entry point.
+    value : class or function
+        What it names.
+
+    Raises
+    ------
+    LawError
+        If it breaks a law; the message names the law.
+
+    Examples
+    --------
+    >>> from fractions import Fraction
+    >>> from mcaptrack.testing import check_name
+    >>> check_name("Fraction", Fraction)
+    """
+    if not name.isidentifier() or name.startswith("_") or keyword.iskeyword(name):
+        raise LawError(f"declares: {name!r} is no public name of Python")
+    if name in _MODULES or find_spec(f"mcaptrack.{name}"):
+        raise LawError(f"declares: mcaptrack has the name {name} already")
+    if not callable(value) or not hasattr(value, "__qualname__"):
+        raise LawError(f"declares: {name} is no class or function but of type {type(value).__name__}")
+    if not value.__doc__:
+        raise LawError(f"declares: {name} has no docstring")
+    try:
+        get_type_hints(value)
+        pickle.dumps(value)
+    except Exception as error:
+        raise LawError(f"declares: {name} can't be read or found by others: {error}") from None
+
+
 @contextmanager
 def _part_of_run(kind: Kind, function: Callable[..., Any], name: str) -> Iterator[PartsOfRun]:
     """A part of ``run``, of which the declaration is checked; what this block changes in the process is a LawError."""
-    entry = _entry_of(kind, function, name)
+    entry = function_entry(kind, function, name)
     _check_declaration(function, entry.name, [FORCE])
-    with same_process(entry.name), collected():
+    with same_process(entry.name):
         parts = PartsOfRun([entry])
         parts.options(())
         if parts.faults:
@@ -275,5 +351,6 @@ def _part_of_run(kind: Kind, function: Callable[..., Any], name: str) -> Iterato
         yield parts
 
 
-def _entry_of(kind: Kind, function: Callable[..., Any], name: str) -> Entry:
+def function_entry(kind: Kind, function: Callable[..., Any], name: str = "") -> Entry:
+    """An entry for a function, by default of its own name."""
     return Entry(name or function.__name__, kind, function, function.__module__, "", "")

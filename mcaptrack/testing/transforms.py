@@ -21,13 +21,16 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import missing
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.notices import collected
+from mcaptrack.notices import Notice, listening, warn
 from mcaptrack.registry import Entry
 from mcaptrack.registry.guard import UNDONE, Guard
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, SIGHTINGS, TRACKS, VIDEO, Frame, Schema
 from mcaptrack.transforms.guarded import guarded
 from mcaptrack.transforms.protocol import Colour, Transform, check_options, latency_of, traits_of
 from mcaptrack.transforms.stages import declared_stage
+
+#: How far most rows of a re-tracker may be from all rows that it reads.
+_NEAR_M, _NEAR_PX = 1.0, 30.0
 
 
 class LawError(AssertionError):
@@ -86,19 +89,24 @@ def check_transform(transform: Transform, frames: Sequence[Frame] | None = None,
     inputs = list(sample)
     if not inputs:
         raise LawError("there are no frames to check the transform with")
-    with same_process(type(transform).__name__):
+    with same_process(type(transform).__name__) as said:
         for holds in LAWS.values():
             holds(transform, [frame._replace(rows=frame.rows.copy()) for frame in inputs], seed)
+    for notice in said:
+        warn(notice.message, notice.code)
 
 
 @contextmanager
-def same_process(name: str) -> Iterator[None]:
-    """Check that this block leaves the process as it was; what it changes is undone. Raises LawError if it doesn't."""
-    guard = Guard(name)
-    with collected() as said:
+def same_process(name: str) -> Iterator[list[Notice]]:
+    """Check that this block leaves the process as it was; what it changes is undone. Raises LawError if it doesn't.
+
+    Warnings of the block go into the list alone: most are about copies of files.
+    """
+    guard, said = Guard(name), list[Notice]()
+    with listening(said.append):
         try:
             with guard.step():
-                yield
+                yield said
         finally:
             guard.end()
     if guard.changed:
@@ -276,7 +284,10 @@ def _entry(transform: Transform, kind: str) -> Entry:
 
 
 def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
-    """Every output has the rows of its schema, at times that increase; and a run on a log takes it."""
+    """Every output has the rows of its schema, at times of its input that increase; and a run on a log takes it.
+
+    A re-tracker gives tracks where its input has some.
+    """
     reads_and_writes = (transform.reads, transform.writes[""])
     kind = {(VIDEO, DETECTIONS): "detector", (DETECTIONS, TRACKS): "tracker", (SIGHTINGS, DETECTIONS): "fuser"}
     with law("conforms"):
@@ -286,6 +297,29 @@ def conforms(transform: Transform, frames: Sequence[Frame], seed: int) -> None:
             if frame.t_ns <= before.t_ns:
                 where = _where(suffix, number, frame)
                 raise LawError(f"conforms: {where} is not later than {before.t_ns} ns before it")
+        for number, frame in enumerate(output):
+            if not frames[0].t_ns <= frame.t_ns <= frames[-1].t_ns:
+                span = f"{frames[0].t_ns} to {frames[-1].t_ns} ns"
+                raise LawError(f"conforms: {_where(suffix, number, frame)} is outside of its input, {span}")
+    if reads_and_writes == (TRACKS, TRACKS) and not hasattr(transform, "input_topic"):
+        _keeps_places(frames, [result[[*transform.writes].index("")] for result in results])
+
+
+def _keeps_places(frames: Sequence[Frame], output: Sequence[Frame]) -> None:
+    """Check that most rows of an output are near rows of the input at the same time, or the nearest."""
+    times = np.array([frame.t_ns for frame in frames])
+    for *names, limit, unit in (("x_m", "y_m", _NEAR_M, "m"), ("x_px", "y_px", _NEAR_PX, "px")):
+        away = []
+        for frame in output:
+            places, others = (
+                np.stack([rows[name] for name in names], axis=-1).astype(float)
+                for rows in (frame.rows, frames[int(np.abs(times - frame.t_ns).argmin())].rows)
+            )
+            distances = np.linalg.norm(places[:, None] - others[None], axis=-1)
+            away += np.fmin.reduce(distances, axis=1, initial=np.inf).tolist()
+        known = [distance for distance in away if np.isfinite(distance)]
+        if known and (usual := float(np.median(known))) > limit:
+            raise LawError(f"conforms: rows are usually {usual:.3g} {unit} from those that it reads; tracks stay there")
 
 
 def repeats(transform: Transform, frames: Sequence[Frame], seed: int) -> None:

@@ -12,6 +12,8 @@ import pytest
 from mcaptrack import fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.dask import cluster
+from mcaptrack.fleet.child import WorkerLimits
+from mcaptrack.testing import check_crew
 from tests import fleet_tasks
 from tests.extensions.dask import fleet_cluster
 from tests.tiers import thorough
@@ -23,6 +25,11 @@ pytestmark = pytest.mark.usefixtures("never_waits")
 def scheduler(tmp_path_factory) -> Iterator[fleet_cluster.Running]:
     with fleet_cluster.cluster(tmp_path_factory.mktemp("cluster")) as running:
         yield running
+
+
+@thorough
+def test_a_cluster_keeps_the_laws(scheduler):
+    check_crew(cluster.Cluster(scheduler.address, WorkerLimits(), None))
 
 
 @thorough

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack import log
+from mcaptrack import log, testing
+from mcaptrack.extensions.rerun import recording
 from mcaptrack.foxglove.palette import colours
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame
@@ -260,3 +261,8 @@ def test_a_video_stays_one(rerun, template, tmp_path):
     assert len(stream.of("ground/forecasts")) == forecasts
     assert len(stream.of("camera/boxes")) == len(pictures) == 30
     assert not warnings
+
+
+def test_the_viewer_keeps_the_laws(rerun, template, monkeypatch):
+    monkeypatch.setattr(recording, "version", lambda _: "0.41.0")
+    testing.check_viewer(recording.viewer, template)
