@@ -107,6 +107,9 @@ SCHEMA_VERSION: int
 # fuser feet: mcaptrack.extensions.cameras
 # report_section zones: mcaptrack.extensions.zones
 # scene fused: mcaptrack.extensions.cameras
+# store az: mcaptrack.extensions.stores
+# store gs: mcaptrack.extensions.stores
+# store s3: mcaptrack.extensions.stores
 # exporter rosbag2: mcaptrack.extensions.bags
 # exporter rosbag2-sqlite3: mcaptrack.extensions.bags
 # predictor onnx: mcaptrack.extensions.networks

@@ -48,7 +48,9 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import Processes
 from mcaptrack.fleet.child import WorkerLimits
 from mcaptrack.fleet.worker import Reply, Request, do
+from mcaptrack.location import Url
 from mcaptrack.notices import collected
+from mcaptrack.objects import AbsentError, StoreCheck, Version, replaced
 from mcaptrack.pipeline.scenes import Scenes
 from mcaptrack.registry import BUILT_IN, KINDS, Entry, find, others, own
 from mcaptrack.schema import DETECTIONS, TRACKS
@@ -1029,6 +1031,14 @@ LINE_LAWS = {
     "blank": "conforms: a heading", "list": "conforms: .* gave a list; it has to give a dict",
     "fails": "conforms: .* failed: ZeroDivisionError", "folder": "process: ",
 }  # fmt: skip
+STORE_LAWS = {
+    "ghost": "absent: `find` finds", "silent": "absent: `why_absent` gives no", "empty": "absent: `read_end` reads",
+    "raises": "conforms: find raises KeyError", "lines": "conforms: read_end says", "size": "conforms: the size of a version",
+    "end": "conforms: `read_end` of 5 bytes", "ranges": "conforms: `read_ranges` gives other", "etag": "versions: another content",
+    "prefix": "conforms: `list_objects` gives others", "stale": "versions: `read_ranges` reads", "left": "conforms: `check` leaves",
+    "careless": "versions: `replace` overwrites another version than Version", "writes": "versions: what was refused is written",
+    "check": "conforms: `check` says {}", "faults": "conforms: `check` says Store", "keeps": "conforms: `delete` leaves", "folder": "process: ",
+}  # fmt: skip
 CREW_LAWS = {
     "places": "conforms: it has 0 places after 0.5 s", "silent": "conforms: nothing came of good within", "twice": "conforms: good has a second reply",
     "others": "conforms: good is done, and its reply", "result": "conforms: the result of good is not", "lines": "conforms: good is done",
@@ -1139,6 +1149,59 @@ class Crew(Processes):
             super().stop(grace_s)
 
 
+def memory(breaks: str, objects: dict[str, bytes]) -> type:
+    """A store that keeps objects here, which breaks a law."""
+
+    class Memory:
+        def __init__(self, url: Url) -> None:
+            if breaks == "folder":
+                os.chdir("/")
+
+        def find(self, url: Url) -> Any:
+            if breaks in ("raises", "ghost") and url not in objects:
+                return Version(1, "a") if breaks == "ghost" else objects[url]
+            size, tag = (
+                len(objects.get(url, "")) + (breaks == "size"),
+                None if breaks == "etag" else str(objects.get(url)),
+            )
+            return Version(size, tag) if url in objects else None
+
+        def read_end(self, url: Url, size: int) -> Any:
+            if url not in objects and breaks != "empty":
+                raise AbsentError(f"{url} is not here" + "\n" * (breaks == "lines"))
+            return self.find(url), objects.get(url, b"")[-99 if breaks == "end" else -size :]
+
+        def read_ranges(self, url: Url, version: Version, ranges: Any) -> list[bytes]:
+            if self.find(url) != version and breaks != "stale":
+                raise replaced(url)
+            return [objects[url][start:end] for start, end in (reversed(ranges) if breaks == "ranges" else ranges)]
+
+        def replace(self, url: Url, file: Path, before: Version | None) -> Any:
+            if self.find(url) != before and breaks != "careless":
+                objects.update({url: file.read_bytes()} if breaks == "writes" else {})
+                raise McaptrackError(f"{url} was written by another process")
+            objects[url] = file.read_bytes()
+            return self.find(url)
+
+        def delete(self, url: Url) -> None:
+            if breaks != "keeps":
+                objects.pop(url, None)
+
+        def list_objects(self, prefix: Url) -> Any:
+            return [(url, self.find(url)) for url in objects if url.startswith(prefix + "/" * (breaks != "prefix"))]
+
+        def why_absent(self, url: Url) -> str:
+            return "" if breaks == "silent" else "nothing is here"
+
+        def check(self, url: Url) -> Any:
+            if breaks == "left":
+                objects[url / "b"] = b""
+            why = "no" if breaks == "faults" else ""
+            return {} if breaks == "check" else StoreCheck(url, "here", "", "none", {"list": why})
+
+    return Memory
+
+
 def lines_of(breaks: str) -> Any:
     if breaks == "folder":
         os.chdir("/")
@@ -1196,6 +1259,10 @@ def check_doctor_lines(breaks: str) -> None:
     testing.check_doctor_lines(lambda: lines_of(breaks))
 
 
+def check_store(breaks: str) -> None:
+    testing.check_store(memory(breaks, {}), "s3://bucket/night")
+
+
 CHECKS: list[tuple[Callable[[str], None], dict[str, str]]] = [
     (check_format, FORMAT_LAWS),
     (check_reader, READER_LAWS),
@@ -1206,6 +1273,7 @@ CHECKS: list[tuple[Callable[[str], None], dict[str, str]]] = [
     (check_viewer, VIEWER_LAWS),
     (check_player, PLAYER_LAWS),
     (check_doctor_lines, LINE_LAWS),
+    (check_store, STORE_LAWS),
 ]
 
 
@@ -1242,6 +1310,28 @@ def test_a_class_in_the_place_of_an_object_is_refused():
         testing.check_judge(lambda before, after: 0.0)
     with pytest.raises(LawError, match="declares: player Show has no method page"):
         testing.check_player(type("Show", (), {"show": print})(), "a.mcap")
+
+
+def test_a_store_of_a_package_is_read_and_one_that_fails_is_named(site, monkeypatch):
+    objects = {"s3://b/a.mcap": Path(small_log()).read_bytes()}
+    store = memory("", objects)
+    monkeypatch.setattr("mcaptrack.objects.names", lambda _: ("s3",))
+    monkeypatch.setattr("mcaptrack.objects.find", lambda *_: Entry("s3", "store", store, "another", "another", "2.0"))
+    assert json.loads(done("info", "s3://b/a.mcap", "--json").out)["results"][0]["messages"] == 2
+    assert one_line("info", "s3://b/b.mcap") == "mcaptrack: s3://b/b.mcap can't be read: nothing is here"
+    assert "s3://b: objects can't be listed" not in call("doctor", "s3://b").err
+    objects["s3://b/a.mcap"] = None
+    said = (
+        "mcaptrack: store s3 (another 2.0) failed at s3://b/a.mcap: TypeError: object of type 'NoneType' has no len()"
+    )
+    assert one_line("info", "s3://b/a.mcap").startswith(said)
+    monkeypatch.setattr("mcaptrack.objects.names", lambda _: ("gs",))
+    said = "s3://b/a.mcap is in Amazon S3, and what reads it is an extension that isn't installed"
+    monkeypatch.setattr("mcaptrack.installed._extensions", set)
+    assert (
+        one_line("info", "s3://b/a.mcap")
+        == f"mcaptrack: {said}; install mcaptrack again, with mcaptrack/extensions/stores"
+    )
 
 
 @pytest.mark.parametrize(("breaks", "said"), one_in(len(CREW_LAWS) + 1, {"": "", **CREW_LAWS}.items()))

@@ -62,11 +62,11 @@ LOGS = {*((name, "words") for name in COMMANDS), ("evaluate", "inputs")}
 
 def test_only_logs_are_read_from_a_store(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "obstore", None)
+    monkeypatch.setitem(sys.modules, "obstore", None)  # where an extension reads stores by it
     for name, parameter in PATHS:
         said = said_of(name, parameter, "s3://bucket/a/b.mcap")
         is_log = (name, parameter.name) in LOGS or parameter.name == "logs"
-        where = "Amazon S3, which needs obstore, " if is_log and name != "drop" else "a store, "
+        where = "Amazon S3, " if is_log and name != "drop" else "a store, "
         assert said.startswith(f"s3://bucket/a/b.mcap is in {where}"), (name, parameter.name)
 
 

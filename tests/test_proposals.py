@@ -26,7 +26,6 @@ from tests.extension_cases import of_extensions
 from tests.interrupted import interrupt
 from tests.robots import write_log
 from tests.sources import PACKAGE, texts
-from tests.stores import Store, only_in
 from tests.tiers import one_in
 
 #: A name that is difficult for a shell, an option parser and a parser of messages.
@@ -276,10 +275,7 @@ def test_a_proposed_command_works(where, template, tmp_path, monkeypatch, reques
         if where.startswith(f"extensions/{extension}/"):
             prepare(monkeypatch, tmp_path)
     if where == "api/running.py:products:export":
-        store = Store()
-        request.addfinalizer(store.stop)
-        only_in(monkeypatch, store)
-        store.put("a.mcap", template)
+        request.getfixturevalue("store").put("a.mcap", template)
     said = SCENES[where](Scene(template, tmp_path))
     lines = re.findall(r"mcaptrack ((?:" + VERBS + r")\b[^`\n]*?)(?=`|\n|$|    )", said)
     lines = [line for line in lines if verb in ("*", line.split()[0])]

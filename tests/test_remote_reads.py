@@ -42,8 +42,7 @@ class Store:
 
 def opened(monkeypatch: pytest.MonkeyPatch, content: bytes = CONTENT) -> tuple[RemoteFile, Store]:
     store = Store(content)
-    monkeypatch.setattr(remote.objects, "read_end", store.read_end)
-    monkeypatch.setattr(remote.objects, "read_ranges", store.read_ranges)
+    monkeypatch.setattr(remote, "store_of", lambda _: store)
     return RemoteFile(parse("s3://bucket/a.mcap")), store
 
 
@@ -173,8 +172,7 @@ def test_a_channel_of_a_log_takes_few_requests(monkeypatch, tmp_path, compressed
     path = tmp_path / "a.mcap"
     there = messages_log(path, compressed)
     store = Store(path.read_bytes())
-    monkeypatch.setattr(remote.objects, "read_end", store.read_end)
-    monkeypatch.setattr(remote.objects, "read_ranges", store.read_ranges)
+    monkeypatch.setattr(remote, "store_of", lambda _: store)
     monkeypatch.setattr(messages, "GAP_BYTES", 1000)
 
     def read(topic: str, span: tuple = (None, None), only_times: bool = False) -> tuple[list, int, int]:
@@ -210,8 +208,7 @@ def test_an_uncompressed_chunk_that_is_too_large_for_memory_stays_in_the_store(m
     there = messages_log(path)
     monkeypatch.setattr(chunks, "_MAX_PLAIN_BYTES", 10_000)
     store = Store(path.read_bytes())
-    monkeypatch.setattr(remote.objects, "read_end", store.read_end)
-    monkeypatch.setattr(remote.objects, "read_ranges", store.read_ranges)
+    monkeypatch.setattr(remote, "store_of", lambda _: store)
     for place in (path, parse("s3://bucket/a.mcap")):
         with log.read(place, sidecar=False) as opened:
             for topic, wanted in there.items():

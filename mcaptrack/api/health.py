@@ -20,8 +20,9 @@ from mcaptrack.api.declared import Argument, declared
 from mcaptrack.environment import THREADS, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
 from mcaptrack.installed import missing_extensions
+from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
+from mcaptrack.objects import StoreCheck, store_of
 
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")
@@ -232,7 +233,7 @@ def doctor(
     """
     from mcaptrack.sources.video.self_test import codec_faults
 
-    url = None if store is None else url_of_store(store)
+    url = None if store is None else _url_of_store(store)
     with collected() as warnings:
         packages, extras, faults = _packages()
         faults += list(_overwritten(packages))
@@ -259,7 +260,7 @@ def doctor(
         if free is not None and free < _LITTLE_BYTES:
             warn(f"{folder} has only {free / 1e6:,.0f} MB free; TMPDIR may name another folder")
         plugins = _plugins()
-        checked = None if url is None else check_store(url)
+        checked = None if url is None else store_of(url).check(url)
         faults += checked.faults if checked else ()
         return DoctorResult(
             version=__version__,
@@ -280,6 +281,20 @@ def doctor(
             store=checked,
             warnings=tuple(warnings),
         )
+
+
+def _url_of_store(store: str) -> Url:
+    """Return the URL of a bucket or prefix; that of a log stands for the prefix with it.
+
+    Raises McaptrackError for anything else, and if what reads the store is not installed.
+    """
+    url = parse(store)
+    if not isinstance(url, Url):
+        examples = ", ".join(f"{scheme}://" for scheme in SCHEMES)
+        name = hide_secrets(store) if "://" in store else store
+        raise McaptrackError(f"{name:.200} is no bucket or prefix in a store; give a URL with {examples}")
+    store_of(url)
+    return url.parent if url.suffix.lower() == ".mcap" else url
 
 
 def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:

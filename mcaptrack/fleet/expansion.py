@@ -11,7 +11,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Final
 
-from mcaptrack import objects
 from mcaptrack.api.common import as_location
 from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError
@@ -21,6 +20,7 @@ from mcaptrack.log import results_path
 from mcaptrack.log.recording_files import format_of, listing_of, logs_in, not_mcap, refuse_non_mcap
 from mcaptrack.log.records import MAGIC
 from mcaptrack.notices import collected, warn
+from mcaptrack.objects import store_of
 
 #: The argument that stands for a list of names on standard input.
 LIST: Final = "-"
@@ -53,7 +53,7 @@ def logs_in_store(url: Url, leave_out: str) -> Iterator[tuple[Url, Path]]:
 
 def _below(prefix: Url, leave_out: str) -> Iterator[tuple[Url, Path]]:
     """Yield all logs below a prefix, in order of their names."""
-    for url, _ in sorted(objects.list_objects(prefix)):
+    for url, _ in sorted(store_of(prefix).list_objects(prefix)):
         name = url.key.removeprefix(prefix.key.rstrip("/")).lstrip("/")
         if _is_log(url, leave_out) and not any(part.startswith(".") for part in name.split("/")):
             yield url, Path(name)
@@ -66,7 +66,7 @@ def _in_store_matching(pattern: Url, leave_out: str) -> Iterator[tuple[Url, Path
     prefix = Url(f"{pattern.scheme}://{pattern.bucket}")
     for part in parts[:fixed]:
         prefix /= part
-    for url, _ in sorted(objects.list_objects(prefix)):
+    for url, _ in sorted(store_of(prefix).list_objects(prefix)):
         names = url.key.split("/")
         is_below = _is_log(url, leave_out) and any(_fits(names[:end], parts) for end in range(1, len(names)))
         if is_below or _fits(names, parts):

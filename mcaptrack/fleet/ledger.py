@@ -18,12 +18,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack import objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import refuse_special
 from mcaptrack.location import Location, Url
 from mcaptrack.log import results_path
 from mcaptrack.notices import warn
+from mcaptrack.objects import store_of
 from mcaptrack.processes import host, is_running, started
 
 #: Keys that every line has.
@@ -306,7 +306,7 @@ def _about_folder(folder: Path) -> bytes:
 
 def _digest_in_store(url: Url) -> str:
     try:
-        parts = [objects.find(part) for part in dict.fromkeys((url, results_path(url)))]
+        parts = [store_of(part).find(part) for part in dict.fromkeys((url, results_path(url)))]
     except McaptrackError:
         return ""
     return hashlib.sha256(repr([part and tuple(part) for part in parts]).encode()).hexdigest()[:32] if parts[0] else ""

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from mcaptrack import objects
 from mcaptrack.files import temporary_folder
 from mcaptrack.location import Location, Url
 from mcaptrack.log import records
@@ -28,7 +27,7 @@ from mcaptrack.log.recording_files import RESULTS_SUFFIX, listing_of, refuse_non
 from mcaptrack.log.records import MAGIC, Bytes, Record, walk
 from mcaptrack.log.recover import recover
 from mcaptrack.log.writer import LIBRARY, LogWriter, create
-from mcaptrack.objects import AbsentError
+from mcaptrack.objects import AbsentError, store_of
 
 # Opening logs, with their sidecars, and finding channels in them.
 
@@ -87,7 +86,7 @@ def is_current(opened: Log, place: Location) -> bool:
 def _is_at(place: Location, part: Log | None) -> bool:
     """Whether a place still holds a part of a log as it was opened; None is nothing there."""
     if isinstance(place, Url):
-        return objects.find(place) == (part.version if part else None)
+        return store_of(place).find(place) == (part.version if part else None)
     return part.snapshot.is_at(place) if part else not place.exists()
 
 
@@ -104,9 +103,8 @@ def find_results(path: Location) -> Location | None:
     if path.name.endswith(RESULTS_SUFFIX):
         return None
     if isinstance(path, Url):
-        objects.library(path)
         url = results_path(path)
-        return None if objects.find(url) is None else url
+        return None if store_of(path).find(url) is None else url
     results = results_path(path)
     return results if results.exists() else None
 

@@ -13,14 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Final
 
-from mcaptrack import objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import temporary_folder
 from mcaptrack.location import Url
 from mcaptrack.log.byte_source import GAP_BYTES, MIN_AHEAD, Signature
 from mcaptrack.log.recording_files import RESULTS_SUFFIX
 from mcaptrack.log.records import Damaged
-from mcaptrack.objects import AbsentError, Version, replaced
+from mcaptrack.objects import AbsentError, Version, replaced, store_of
 
 #: The bytes at the end of an object that are read when it is opened. The index of most logs fits in.
 _END_BYTES: Final = 128 * 2**10
@@ -45,9 +44,9 @@ class RemoteFile:
         try:
             if not url.key.strip("/"):
                 raise AbsentError
-            self.version, end = objects.read_end(url, _END_BYTES)
+            self.version, end = store_of(url).read_end(url, _END_BYTES)
         except AbsentError:
-            why = "" if url.name.endswith(RESULTS_SUFFIX) else objects.why_absent(url)  # results may be absent
+            why = "" if url.name.endswith(RESULTS_SUFFIX) else store_of(url).why_absent(url)  # results may be absent
             raise AbsentError(f"{url} can't be read: {why}") from None
         if not self.version.size:
             raise McaptrackError(f"{url} can't be read as an MCAP file: it is empty")
@@ -119,7 +118,9 @@ class RemoteFile:
         wanted = self._announced(at, end) or [(at, self._look_ahead(at, end))]
         wanted = [(start, min(stop, self._end_at)) for start, stop in wanted]
         self._next = wanted[-1][1]
-        for (start, _), data in zip(wanted, objects.read_ranges(self.url, self.version, wanted), strict=True):
+        for (start, _), data in zip(
+            wanted, store_of(self.url).read_ranges(self.url, self.version, wanted), strict=True
+        ):
             self._forget(start)
             until = start + len(data)
             for inner in self._starts[bisect_right(self._starts, start) : bisect_right(self._starts, until)]:
@@ -167,7 +168,7 @@ class RemoteFile:
 
 def refuse_replaced(url: Url, version: Version | None) -> None:
     """Raise McaptrackError if an object is not the version that was opened: results would be those of another log."""
-    if objects.find(url) != version:
+    if store_of(url).find(url) != version:
         raise replaced(url)
 
 
@@ -181,4 +182,4 @@ def publish_object(url: Url, before: Version | None) -> Iterator[IO[bytes]]:
         part = Path(folder, url.name)
         with part.open("xb") as stream:
             yield stream
-        objects.replace(url, part, before)
+        store_of(url).replace(url, part, before)

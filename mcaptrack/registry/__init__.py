@@ -72,6 +72,7 @@ Kind = Literal[
     "scene",  # what makes a scene of several cameras (mcaptrack.pipeline.scenes)
     "doctor_line",  # what `mcaptrack doctor` says of a part
     "crew",  # what processes many logs elsewhere (mcaptrack.fleet.Crew)
+    "store",  # what holds objects, by the scheme of their URLs (mcaptrack.objects.Store)
 ]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 T = TypeVar("T")
@@ -90,7 +91,7 @@ _COMMANDS: Final = (
 #: Kinds that only entry points name.
 _BY_ENTRY_POINT: Final = (
     *("stage", "message_reader", "recording", "finisher", "report_section", "command", "page", "player", "viewer"),
-    *("name", "scene", "doctor_line", "crew"),
+    *("name", "scene", "doctor_line", "crew", "store"),
 )
 #: Module and class, or function, of the built-in entries, by kind and name; the first of a kind is its default.
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = MappingProxyType(

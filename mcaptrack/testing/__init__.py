@@ -28,6 +28,7 @@ from mcaptrack.testing.functions import (
     check_report_section,
     check_scene_maker,
 )
+from mcaptrack.testing.stores import check_store
 from mcaptrack.testing.transforms import LAWS, LawError, check_transform, same_process, sample_frames
 from mcaptrack.testing.views import check_judge, check_page, check_player, check_viewer
 
@@ -49,6 +50,7 @@ __all__ = [
     "check_recording_format",
     "check_report_section",
     "check_scene_maker",
+    "check_store",
     "check_transform",
     "check_viewer",
     "sample_frames",

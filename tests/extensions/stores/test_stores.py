@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import sys
+from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
 
@@ -15,16 +16,27 @@ import pyarrow.parquet as pq
 import pytest
 
 import mcaptrack
-from mcaptrack import log, objects
+from mcaptrack import log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.extensions.stores import objects, trial
+from mcaptrack.extensions.stores.store import ObjectStore
 from mcaptrack.fleet import find_logs
 from mcaptrack.location import parse
-from mcaptrack.objects import trial
 from mcaptrack.schema import TRACKS, Frame
+from mcaptrack.testing import check_store
 from tests.commands import call, done
 from tests.extension_cases import of_extensions
 from tests.logs import some_log
 from tests.tiers import one_in, thorough
+
+
+@pytest.fixture
+def impatient(monkeypatch) -> Iterator[None]:
+    """Failed requests to stores are sent again once only."""
+    monkeypatch.setattr(objects, "_RETRIES", 1)
+    objects._made_store.cache_clear()
+    yield
+    objects._made_store.cache_clear()
 
 
 def _tracks(frames: int = 150, each: int = 8) -> list[Frame]:
@@ -325,6 +337,11 @@ def test_a_process_that_was_forked_from_one_that_has_used_a_store_says_so(store,
 NIGHT = parse("s3://bucket/night")
 
 
+def test_it_keeps_the_laws_of_stores(store):
+    check_store(ObjectStore, str(NIGHT))
+    assert store.names() == []
+
+
 def test_of_two_writers_one_succeeds(store):
     url = NIGHT / "a"
     first = objects.put_if_unchanged(url, b"one", None)
@@ -333,7 +350,7 @@ def test_of_two_writers_one_succeeds(store):
     second = objects.put_if_unchanged(url, b"three", first)
     assert second not in (None, first)
     assert objects.put_if_unchanged(url, b"four", first) is None
-    assert objects.read(url) == b"three"
+    assert store.get(url.key) == b"three"
     objects.delete(url)
     objects.delete(url)
     assert objects.put_if_unchanged(url, b"five", second) is None

@@ -1,11 +1,10 @@
-"""Objects in stores (Amazon S3, Google Cloud Storage, Azure): read by ranges, replaced as a whole. Only here: obstore.
+"""Objects in Amazon S3, Google Cloud Storage and Azure Blob Storage. Only here: obstore.
 
 Credentials, regions and endpoints are found as the programs of these services find them: in the environment, in the
 profiles of AWS, on the machine itself. Requests that fail are sent again, with growing pauses. What can't be mended by
 that is a McaptrackError that names the URL; no message contains a secret.
 
-An object is never changed, only replaced, and each version of it has another entity tag (etag). Every request for a
-part of an object asks for the version that was opened, so that parts of two versions are never mixed.
+Every request for a part of an object asks for the version that was opened.
 """
 
 from __future__ import annotations
@@ -20,10 +19,11 @@ from contextlib import contextmanager, suppress
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.location import SCHEMES, Url, hide_secrets
+from mcaptrack.objects import AbsentError, Version, replaced
 
 #: Requests at the same time, and the most bytes of one.
 _AT_ONCE: Final = 8
@@ -32,13 +32,6 @@ _MAX_BYTES: Final = 8 * 2**20
 _PART_BYTES: Final = 16 * 2**20
 #: An answer that breaks off is asked for so often.
 _TRIES: Final = 3
-
-
-class Version(NamedTuple):
-    """A version of an object: its size in bytes, and its entity tag if the store gives one."""
-
-    size: int
-    etag: str | None
 
 
 # The stores that URLs name, with credentials, region and endpoint as the environment or a profile gives them.
@@ -206,15 +199,6 @@ _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 _MACHINE_HOSTS: Final = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 
 
-class AbsentError(McaptrackError):
-    """There is no such object."""
-
-
-def replaced(url: Url) -> McaptrackError:
-    """The error for an object that has another version now than when it was opened."""
-    return McaptrackError(f"{url} was replaced by another version while it was being read; try again")
-
-
 def overtaken(url: Url) -> McaptrackError:
     """The error for an object that was written since it was opened, and is not overwritten."""
     return McaptrackError(f"{url} was written by another process meanwhile, and is left as it is now; try again")
@@ -366,12 +350,6 @@ def find(url: Url) -> Version | None:
     with suppress(AbsentError), reporting_faults(url):
         return _version(library(url).head(store_of(url), url.key))
     return None
-
-
-def read(url: Url) -> bytes:
-    """A small object. Raises McaptrackError if there is none, or if it can't be read."""
-    with reporting_faults(url):
-        return _get(library(url), url, {})[1]
 
 
 def replace(url: Url, file: Path, before: Version | None) -> Version:

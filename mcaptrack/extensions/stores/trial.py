@@ -5,90 +5,30 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import islice
 from typing import Final
 from uuid import uuid4
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.location import SCHEMES, Url, hide_secrets, parse
-from mcaptrack.objects import (
-    Version,
+from mcaptrack.extensions.stores.objects import (
     delete,
     described,
     find,
-    library,
     list_objects,
     put_if_unchanged,
     read_end,
     read_ranges,
 )
+from mcaptrack.location import Url
+from mcaptrack.objects import StoreCheck, Version
 
-#: The operations, and the consequence of one that fails.
-_TRIED: Final = {
-    "list": "objects can't be listed",
-    "write": "objects can't be written",
-    "read": "objects can't be read",
-    "put-if-absent": "two commands at once may both write the first results of a log",
-    "replace": "results of two commands at once may replace each other",
-    "delete": "objects can't be removed",
-}
 _REASON: Final = re.compile(r"^.*? can't be (?:read|written|removed): ")
-
-
-@dataclass(frozen=True)
-class StoreCheck:
-    """The operations that a bucket or a prefix allows.
-
-    Attributes
-    ----------
-    url : str
-        The bucket or prefix.
-    server, region : str
-        The address of the server, or the name of the service; and its region ("" where there are none).
-    credentials : str
-        Where they come from.
-    access : dict of str to str
-        Why each of "list", "write", "read", "put-if-absent" (write an object only if it is absent), "replace" (only if
-        it is unchanged) and "delete" fails; "" where it works. What could not be tried is not there.
-
-    """
-
-    url: str
-    server: str
-    region: str
-    credentials: str
-    access: dict[str, str]
-
-    @property
-    def faults(self) -> tuple[str, ...]:
-        """One line for each reason."""
-        reasons: dict[str, list[str]] = {}
-        for name, why in self.access.items():
-            if why:
-                reasons.setdefault(why, []).append(_TRIED[name])
-        return tuple(f"{self.url}: {' and '.join(tried)}: {why}" for why, tried in reasons.items())
-
-
-def url_of_store(store: str) -> Url:
-    """Return the URL of a bucket or prefix; that of a log stands for the prefix with it.
-
-    Raises McaptrackError for anything else, and if what reads the store is not installed.
-    """
-    url = parse(store)
-    if not isinstance(url, Url):
-        examples = ", ".join(f"{scheme}://" for scheme in SCHEMES)
-        name = hide_secrets(store) if "://" in store else store
-        raise McaptrackError(f"{name:.200} is no bucket or prefix in a store; give a URL with {examples}")
-    library(url)
-    return url.parent if url.suffix.lower() == ".mcap" else url
 
 
 def check_store(url: Url) -> StoreCheck:
     """Try the operations of a run on a store."""
     server, region, credentials = described(url)
-    access = dict(_tries(url))
-    return StoreCheck(str(url), server, region, credentials, {name: access[name] for name in _TRIED if name in access})
+    return StoreCheck(str(url), server, region, credentials, dict(_tries(url)))
 
 
 def _tries(url: Url) -> Iterator[tuple[str, str]]:
