@@ -170,7 +170,7 @@ READERS = (
     "cli/settings.py",
     "cli/plugins.py",
     "fleet/child.py",
-    "objects/__init__.py",
+    "extensions/stores/objects.py",
     "api/health.py",
 )
 
