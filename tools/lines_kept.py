@@ -39,7 +39,7 @@ class Records:
         self._collected: dict[str, dict[str, set[int]]] = {}
 
     def _path(self, file: str) -> Path:
-        return self._folder / f"{Path(file).stem}.json.gz"
+        return self._folder / f"{file.replace('/', '-')}.json.gz"  # two folders may have files of one name
 
     def knows(self, file: str) -> bool:
         """Whether this test file has been recorded as it is now."""

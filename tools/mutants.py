@@ -216,7 +216,7 @@ def main() -> None:
     parser.add_argument("--most-s", type=float, default=inf, help="run the quickest tests of a mutant, for so long")
     parser.add_argument("--verbose", action="store_true", help="print what caught the others")
     options = parser.parse_args()
-    files = options.tests or sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").glob("test_*.py"))
+    files = options.tests or sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py"))
     mutants = find(options.places)
     if options.mutant:
         chosen = [mutant for mutant in mutants if mutant.name in options.mutant]

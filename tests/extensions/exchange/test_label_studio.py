@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from tests.label_cases import Row, Writer, as_json
+from tests.label_cases import Row, Writer, as_json, read
 
 
 def label_studio(rows: Sequence[Row]) -> Any:
@@ -26,3 +26,7 @@ def label_studio(rows: Sequence[Row]) -> Any:
 WRITERS = {
     "label-studio": Writer(as_json(label_studio), "score numbered", first="stated", shares=True),
 }
+
+
+def test_frames_and_their_duration_give_the_rate(tmp_path):
+    assert read(tmp_path, label_studio([Row(3, 1, (64, 48, 64, 48))])).facts.fps == 10
