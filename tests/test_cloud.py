@@ -19,7 +19,6 @@ from mcaptrack import log, objects
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import find_logs
 from mcaptrack.location import parse
-from mcaptrack.objects import trial
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call, done
 from tests.extension_cases import of_extensions
@@ -370,7 +369,7 @@ class TestDoctor:
 
     def test_a_store_that_ignores_conditions_is_found_out(self, store, monkeypatch):
         real = objects.put_if_unchanged
-        monkeypatch.setattr(trial, "put_if_unchanged", lambda url, data, _: real(url, data, objects.find(url)))
+        monkeypatch.setattr(objects, "put_if_unchanged", lambda url, data, _: real(url, data, objects.find(url)))
         code, access, err = self.access(str(NIGHT))
         assert code == 1
         assert [name for name, why in access.items() if why] == ["put-if-absent", "replace"]

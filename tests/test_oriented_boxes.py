@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mcaptrack.geometry.oriented_boxes import (
+from mcaptrack.geometry.boxes import (
     bev_corners,
     bev_intersection_of_pairs,
     bev_iou_of_pairs,

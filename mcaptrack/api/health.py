@@ -21,7 +21,7 @@ from mcaptrack.environment import THREADS, memory_bytes, share_of_cores
 from mcaptrack.errors import McaptrackError
 from mcaptrack.installed import missing_extensions
 from mcaptrack.notices import Notice, collected, warn
-from mcaptrack.objects.trial import StoreCheck, check_store, url_of_store
+from mcaptrack.objects import StoreCheck, check_store, url_of_store
 
 #: Extras for people who work on mcaptrack itself, or read its examples.
 _NOT_SHOWN: Final = ("docs", "examples", "test")
@@ -230,7 +230,7 @@ def doctor(
     >>> mcaptrack.doctor().faults
     ()
     """
-    from mcaptrack.sources.video.self_test import codec_faults
+    from mcaptrack.sources.video.codecs import codec_faults
 
     url = None if store is None else url_of_store(store)
     with collected() as warnings:

@@ -138,8 +138,7 @@ def _limit(text: str) -> tuple[str, float]:
 
 def print_results(scores: Scores, all_gates: bool, verbose: bool) -> None:
     """Print the verdict, the scores as a table, and those of predictions below it."""
-    from mcaptrack.evaluation import COMBINED
-    from mcaptrack.evaluation.verdict import main_results, matched_by, verdict
+    from mcaptrack.evaluation import COMBINED, main_results, matched_by, verdict
 
     show(*verdict(scores.results), "")
     results = sorted(scores.results, key=lambda r: (r.sequence == COMBINED, r.sequence, r.similarity, r.gate))
@@ -214,7 +213,7 @@ def _compared(result: EvaluationRow) -> tuple[Any, ...]:
 
 
 def _gate_cell(result: EvaluationRow) -> str:
-    from mcaptrack.evaluation.verdict import OVERLAPS
+    from mcaptrack.evaluation import OVERLAPS
 
     return f"{OVERLAPS[result.similarity]} {result.gate:g}" if result.similarity in OVERLAPS else f"{result.gate:g} m"
 

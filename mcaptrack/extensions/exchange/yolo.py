@@ -18,9 +18,8 @@ from mcaptrack.extensions.exchange.gathered import frame_numbers
 from mcaptrack.extensions.exchange.pictures import files_in
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, read_numbers, states_number
+from mcaptrack.sources.ingest.labels.text import LISTS, MAX_ROWS, lines_of, name_classes, read_numbers, states_number
 
 _READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
 _NOT_LABELS: Final = (*LISTS, *_READMES, "train.txt", "val.txt", "test.txt")

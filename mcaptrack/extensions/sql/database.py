@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError, call, did_you_mean
-from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
-from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
+from mcaptrack.evaluation.world_tracks import WorldInterval, WorldTracks, lacks_intervals, tracks_in_worlds
 from mcaptrack.extensions.sql.answers import tidy
 from mcaptrack.files import place_of
 from mcaptrack.geometry.arrays import Floats
