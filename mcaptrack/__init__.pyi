@@ -65,8 +65,8 @@ from mcaptrack.extensions.sql.api import TableInfo as TableInfo
 from mcaptrack.extensions.sql.api import TableList as TableList
 from mcaptrack.extensions.sql.api import list_tables as list_tables
 from mcaptrack.extensions.sql.api import query as query
+from mcaptrack.extensions.training.api import TrainResult as TrainResult
 from mcaptrack.extensions.training.api import train as train
-from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
 from mcaptrack.extensions.tuning.api import tune as tune
 from mcaptrack.extensions.zones.api import draw_zones as draw_zones
