@@ -449,7 +449,7 @@ def sequence_of_files(
 
 
 #: Similarities that are overlaps, as text.
-OVERLAPS: Final = {"iou": "IoU", "bev-iou": "BEV IoU", "3d-iou": "3D IoU"}
+_OVERLAPS: Final = {"iou": "IoU", "bev-iou": "BEV IoU", "3d-iou": "3D IoU"}
 #: A smaller difference of errors, as a share, is no difference.
 _ALIKE: Final = 0.01
 
@@ -476,10 +476,15 @@ def main_results(results: Sequence[EvaluationRow]) -> list[EvaluationRow]:
     return [result for result in by_distance if result.gate == gate_m]
 
 
+def gate_text(result: EvaluationRow) -> str:
+    """The gate of a result: "1 m" or "IoU 0.5"."""
+    overlap = _OVERLAPS.get(result.similarity)
+    return f"{overlap} {result.gate:g}" if overlap else f"{result.gate:g} m"
+
+
 def matched_by(result: EvaluationRow) -> str:
     """The rule by which tracks match ground truth: "within 1 m" or "with IoU 0.5"."""
-    overlap = OVERLAPS.get(result.similarity)
-    return f"with {overlap} {result.gate:g}" if overlap else f"within {result.gate:g} m"
+    return f"{'with' if result.similarity in _OVERLAPS else 'within'} {gate_text(result)}"
 
 
 def verdict(results: Sequence[EvaluationRow]) -> list[str]:

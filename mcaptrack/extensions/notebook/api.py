@@ -14,7 +14,7 @@ from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -192,7 +192,7 @@ def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int |
         opened.path, source.topic, source.is_above, source.views, 1, 1, 1, seconds, seconds, html="", still=jpeg
     )
     title = f"{opened.path.name}: {player.caption}"
-    return replace(player, html=still_html(jpeg, image.shape[1], title))
+    return replace(player, html=_in_notebook(jpeg, image.shape[1], title))
 
 
 def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: float, progress: Progress) -> Player:
@@ -206,16 +206,16 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
         seconds = [source.seconds(t_ns) for t_ns in taken.t_ns]
         opens_at = max(0, int(np.searchsorted(taken.t_ns, at_ns, "right")) - 1) if at_ns <= taken.t_ns[-1] else 0
         image = source.still(taken.numbers[opens_at], choice.width_px or min(PLAYER_PX, taken.sizes[0][0]))
-        still = Still(still_jpeg(image), image.shape[1])
+        jpeg = still_jpeg(image)
         span = seconds[0], seconds[-1]
         player = Player(
             opened.path, source.topic, source.is_above, source.views,
-            len(seconds), len(numbers), every, *span, html="", still=still.jpeg,
+            len(seconds), len(numbers), every, *span, html="", still=jpeg,
         )  # fmt: skip
         inside = [event for event in events if span[0] <= event[0] <= span[1]]
         caption = f"{opened.path.name}: {player.caption}"
-        page = player_page(taken, seconds, inside, opens_at, caption)
-        html = player_html(page, still, caption)
+        page = _player_page(taken, seconds, inside, opens_at, caption)
+        html = _in_notebook(jpeg, max(image.shape[1], _LEAST_PX), caption, page)
         if len(html) <= max_mb * _MB or len(seconds) == 1:
             return replace(player, html=html, page=page)
         if choice.every is not None:
@@ -235,25 +235,12 @@ def _ordinal(number: int) -> str:
 _LEAST_PX: Final = 420
 
 
-class Still(NamedTuple):
-    """A picture with drawings as a JPEG file, and its width in pixels."""
-
-    jpeg: bytes
-    width_px: int
+def _in_notebook(jpeg: bytes, width_px: int, caption: str, page: str = "") -> str:
+    """Return a still with a caption, below the frame of a player if there is one."""
+    return str(render("in_notebook.html", __package__ or "", width=width_px, jpeg=jpeg, caption=caption, page=page))
 
 
-def still_html(jpeg: bytes, width_px: int, caption: str) -> str:
-    """Return a picture with a caption."""
-    return str(render("in_notebook.html", __package__ or "", width=width_px, jpeg=jpeg, caption=caption, page=""))
-
-
-def player_html(page: str, still: Still, caption: str) -> str:
-    """Return a player in a frame, for a notebook, with the still below it."""
-    width = max(still.width_px, _LEAST_PX)
-    return str(render("in_notebook.html", __package__ or "", width=width, jpeg=still.jpeg, caption=caption, page=page))
-
-
-def player_page(
+def _player_page(
     taken: Clip, seconds: Sequence[float], events: Sequence[tuple[float, str, str]], opens_at: int, caption: str
 ) -> str:
     """Return the page of a player. ``events`` have a time in seconds, a text, and the topic of their tracks; those of
