@@ -472,6 +472,9 @@ def why_absent(url: Url) -> str:
     return "there is no such object"
 
 
+# A bucket or a prefix in a store is tried with a small hidden object, which is removed again.
+
+
 #: The operations, and the consequence of one that fails.
 _TRIED: Final = {
     "list": "objects can't be listed",

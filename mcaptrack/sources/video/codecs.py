@@ -504,6 +504,9 @@ def is_video_codec(image_format: str) -> bool:
     return image_format in CODECS
 
 
+# A tiny picture is decoded and encoded by each codec, to see whether the FFmpeg that is installed can.
+
+
 _SIZE_PX: Final = 64
 #: Mean error of the brightness: that of video may run from 16 to 235, and compression changes it.
 _MAX_ERROR: Final = 40.0

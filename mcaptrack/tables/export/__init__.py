@@ -516,6 +516,12 @@ def _remove(path: Path) -> None:
             folder.rmdir()
 
 
+# The messages of many channels as tables in one pass over a log: each chunk is opened once for all of them.
+#
+# Pieces of tables are made one after the other, and written by threads where there are several cores; the same bytes
+# come out, however many.
+
+
 #: Tables that are written at once, each to an open file.
 _MOST_AT_ONCE: Final = 256
 #: Rows of all tables together wait for others of their piece in so many bytes at most.
