@@ -8,11 +8,8 @@ from mcaptrack.api.contents import ChannelInfo as ChannelInfo
 from mcaptrack.api.contents import FrameInfo as FrameInfo
 from mcaptrack.api.contents import LogInfo as LogInfo
 from mcaptrack.api.contents import info as info
-from mcaptrack.api.cutting import CutResult as CutResult
-from mcaptrack.api.cutting import cut as cut
 from mcaptrack.api.demonstration import DemoResult as DemoResult
 from mcaptrack.api.demonstration import demo as demo
-from mcaptrack.api.events import events as events
 from mcaptrack.api.exporting import ExportResult as ExportResult
 from mcaptrack.api.exporting import export as export
 from mcaptrack.api.health import DoctorResult as DoctorResult
@@ -21,8 +18,8 @@ from mcaptrack.api.ingesting import IngestResult as IngestResult
 from mcaptrack.api.ingesting import ingest as ingest
 from mcaptrack.api.messages import DecodedMessage as DecodedMessage
 from mcaptrack.api.reading import FetchedMessage as FetchedMessage
-from mcaptrack.api.recording import Recording as Recording
-from mcaptrack.api.recording import open as open  # noqa: A004
+from mcaptrack.api.reading import Recording as Recording
+from mcaptrack.api.reading import open as open  # noqa: A004
 from mcaptrack.api.rows import detections as detections
 from mcaptrack.api.rows import schema_of as schema_of
 from mcaptrack.api.run import run as run
@@ -30,16 +27,19 @@ from mcaptrack.api.running import RunResult as RunResult
 from mcaptrack.api.scoring import Scores as Scores
 from mcaptrack.api.scoring import evaluate as evaluate
 from mcaptrack.api.stages import detect as detect
+from mcaptrack.api.stages import events as events
 from mcaptrack.api.stages import motion as motion
 from mcaptrack.api.stages import predict as predict
 from mcaptrack.api.stages import retrack as retrack
 from mcaptrack.api.stages import sample as sample
 from mcaptrack.api.stages import stage as stage
 from mcaptrack.api.stages import track as track
+from mcaptrack.api.upkeep import CutResult as CutResult
 from mcaptrack.api.upkeep import DropResult as DropResult
 from mcaptrack.api.upkeep import LogCheck as LogCheck
 from mcaptrack.api.upkeep import LogRecovery as LogRecovery
 from mcaptrack.api.upkeep import check as check
+from mcaptrack.api.upkeep import cut as cut
 from mcaptrack.api.upkeep import drop as drop
 from mcaptrack.api.upkeep import recover as recover
 from mcaptrack.api.viewing import LogServer as LogServer
@@ -65,8 +65,8 @@ from mcaptrack.extensions.sql.api import TableInfo as TableInfo
 from mcaptrack.extensions.sql.api import TableList as TableList
 from mcaptrack.extensions.sql.api import list_tables as list_tables
 from mcaptrack.extensions.sql.api import query as query
+from mcaptrack.extensions.training.api import TrainResult as TrainResult
 from mcaptrack.extensions.training.api import train as train
-from mcaptrack.extensions.training.result import TrainResult as TrainResult
 from mcaptrack.extensions.tuning.api import TuneResult as TuneResult
 from mcaptrack.extensions.tuning.api import tune as tune
 from mcaptrack.extensions.zones.api import draw_zones as draw_zones

@@ -1,7 +1,10 @@
-"""Names that options and parameters accept. This module imports nothing, so that declaring a command costs nothing."""
+"""Names and ranges that options and parameters accept. This module imports nothing of the package, so that
+declaring a command costs nothing.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Final, Literal, TypeAlias
 
@@ -31,3 +34,14 @@ LAYOUTS: Final[Mapping[str, str]] = {
     "comparing": ".comparing.layout.json",
     "predictions": ".predictions.layout.json",
 }
+
+
+def limits(least: float, most: float) -> str:
+    """The text of a range, as in "from 0 to 1"; "" if it has no ends."""
+    if most == math.inf:
+        return "" if least == -math.inf else f"at least {_number(least)}"
+    return f"at most {_number(most)}" if least == -math.inf else f"from {_number(least)} to {_number(most)}"
+
+
+def _number(value: float) -> str:
+    return f"{value:.15g}"

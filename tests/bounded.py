@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tracemalloc
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
 from io import StringIO
@@ -221,3 +222,15 @@ def _run(main: object, words: list[str], err: int, moment: tuple[Moment, int] | 
 
 if __name__ == "__main__":
     _serve(sys.stdin)
+
+
+def held(work: Callable[[], object]) -> tuple[int, int]:
+    """Bytes that are alive at the end of a piece of work, and the most while it lasted."""
+    tracemalloc.start()
+    try:
+        kept = work()
+        alive, most = tracemalloc.get_traced_memory()
+        del kept
+        return alive, most
+    finally:
+        tracemalloc.stop()

@@ -17,7 +17,6 @@ import mcaptrack
 from mcaptrack import log
 from mcaptrack.cli.running import _lines_of_summary
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.colour_histograms import BINS, LENGTH, at_border, describe, is_clear, mean_shares
 from mcaptrack.notices import collected
 from mcaptrack.pipeline.pictures import with_descriptors
 from mcaptrack.pipeline.summary import summarise
@@ -26,7 +25,17 @@ from mcaptrack.sources.cameras import provenance_of
 from mcaptrack.sources.demo import Pedestrian, SyntheticFrame, SyntheticScene
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import Retrack, RetrackByConsistency, Sample
-from mcaptrack.transforms.retrack.appearance import Appearance, Descriptors, Sides
+from mcaptrack.transforms.retrack.appearance import (
+    BINS,
+    LENGTH,
+    Appearance,
+    Descriptors,
+    Sides,
+    at_border,
+    describe,
+    is_clear,
+    mean_shares,
+)
 from mcaptrack.transforms.retrack.motion_model import Tracks
 from tests.commands import call, done
 

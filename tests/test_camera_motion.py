@@ -14,7 +14,7 @@ from mcaptrack.geometry.affine import IDENTITY, compose, invert, move_boxes, mov
 from mcaptrack.geometry.camera_path import CameraPath, CameraPose, MotionEstimator, Verdict, poses_of
 from mcaptrack.notices import collected
 from mcaptrack.schema import CAMERA_MOTION, Frame
-from mcaptrack.schema.camera_motion import frames_to_path, pose_to_rows, rows_to_verdict
+from mcaptrack.schema.as_rows import frames_to_path, pose_to_rows, rows_to_verdict
 from mcaptrack.transforms.detect.background import Registration, Steadiness
 from mcaptrack.transforms.motion import EstimateMotion
 from tests.tiers import thorough

@@ -11,8 +11,14 @@ from mcaptrack.geometry.camera_path import CameraPose, Verdict
 from mcaptrack.geometry.pinhole import Lens
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import CAMERA_MOTION, GROUND_PLANE, Frame
-from mcaptrack.schema.camera_motion import frames_to_path, is_motion, pose_to_rows, rows_to_verdict
-from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
+from mcaptrack.schema.as_rows import (
+    frames_to_path,
+    is_motion,
+    plane_to_rows,
+    pose_to_rows,
+    rows_to_plane,
+    rows_to_verdict,
+)
 
 BENT = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 

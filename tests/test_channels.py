@@ -21,9 +21,8 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.log import chunks, messages
 from mcaptrack.notices import collected
-from mcaptrack.tables import files
+from mcaptrack.tables import export, files
 from mcaptrack.tables import messages as tables_of_messages
-from mcaptrack.tables.export import channels
 from tests.logs import recorder
 from tests.tiers import one_in
 
@@ -91,8 +90,8 @@ def test_tables_of_all_channels_hold_what_mcap_reads(
     monkeypatch.setattr(messages, "_BATCH_BYTES", random.Random(seed).choice([1, 1000, 2**22]))
     monkeypatch.setattr(messages, "_WAITING_BYTES", 30_000)
     monkeypatch.setattr(messages, "_WINDOW_BYTES", random.Random(seed).choice([1, 5000, 2**24]))
-    monkeypatch.setattr(channels, "_WAITING_BYTES", 50_000)
-    monkeypatch.setattr(channels, "_MOST_AT_ONCE", 2 + seed)
+    monkeypatch.setattr(export, "_WAITING_BYTES", 50_000)
+    monkeypatch.setattr(export, "_MOST_AT_ONCE", 2 + seed)
     written = []
     for threads in ("1", "3"):
         monkeypatch.setenv("OMP_NUM_THREADS", threads)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import cv2
 import numpy as np
 import pytest
 
+import mcaptrack
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.affine import IDENTITY
 from mcaptrack.geometry.assignment import assign
 from mcaptrack.geometry.boxes import columns_to_boxes, iou
 from mcaptrack.geometry.clocks import FrameClock
 from mcaptrack.notices import collected
-from mcaptrack.schema import Frame
+from mcaptrack.schema import DETECTIONS, VIDEO, Frame
 from mcaptrack.sources.demo import SyntheticScene, pairs_scene
+from mcaptrack.testing import check_transform
 from mcaptrack.transforms import STAGES, KnnDetector, MedianDetector
 from mcaptrack.transforms.detect.background import _BackgroundModel, _PersonHeight, clear_border, halve
 from tests.tiers import one_in, thorough
@@ -217,3 +220,67 @@ def test_leaves_that_sway_do_not_pass_for_people_far_away():
     frames = [Frame(200_000_000 * number, number, shot.image) for number, shot in enumerate(scene.shots())]
     bottom = np.concatenate([frame.rows["y_px"] + frame.rows["h_px"] for (frame,) in MedianDetector()(frames)])
     assert (bottom < 100).sum() < 0.15 * len(bottom)
+
+
+# Detectors get brightness or colours of pictures, as they ask for.
+
+
+#: Blue, green and red of the pictures, which become BT.601 brightness.
+BGR = (200, 90, 30)
+GREY = 0.114 * 200 + 0.587 * 90 + 0.299 * 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plain:
+    """A detector that keeps what it gets, and says nothing of colours."""
+
+    reads: ClassVar = VIDEO
+    writes: ClassVar = {"": DETECTIONS}
+    latency_s: ClassVar = {"": 0.0}
+    seen: ClassVar[list[np.ndarray]] = []
+
+    def __call__(self, frames):
+        for frame in frames:
+            self.seen.append(frame.rows)
+            yield (frame._replace(rows=DETECTIONS.empty()),)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Coloured(Plain):
+    colour: ClassVar = "bgr"
+    seen: ClassVar[list[np.ndarray]] = []
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pictures") / "frames"
+    folder.mkdir()
+    for number in range(3):
+        cv2.imwrite(str(folder / f"{number:03}.png"), np.full((48, 64, 3), BGR, np.uint8))
+    path = folder.parent / "log.mcap"
+    mcaptrack.ingest(folder, output=path, fps=10)
+    return path
+
+
+def test_a_detector_gets_colours_if_it_asks_for_them_and_brightness_otherwise(log, tmp_path):
+    for detector, expected in ((Plain(), GREY), (Coloured(), BGR)):
+        detector.seen.clear()
+        mcaptrack.detect(log, detector=detector, output=tmp_path / f"{type(detector).__name__}.mcap")
+        assert [picture.shape for picture in detector.seen] == [(48, 64, 3)[: np.ndim(expected) + 2]] * 3
+        assert np.abs(detector.seen[0].astype(float) - expected).max() < 6  # video is lossy
+
+
+def test_laws_are_checked_with_the_pictures_that_a_detector_asks_for():
+    for detector, axes in ((Plain, 2), (Coloured, 3)):
+        detector.seen.clear()
+        check_transform(detector())
+        assert {picture.ndim for picture in detector.seen} == {axes}
+
+
+def test_an_unknown_kind_of_picture_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "odd_detector.py").write_text(
+        "from tests.test_detect import Plain\nclass Odd(Plain):\n    colour = 'hsv'\n", encoding="utf-8"
+    )
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(McaptrackError, match=r"detector odd_detector:Odd.*has colour = 'hsv'; it is 'bgr' or 'grey'"):
+        STAGES["detect"].find("odd_detector:Odd")

@@ -17,7 +17,8 @@ import shutil
 import stat
 import webbrowser
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,9 +28,10 @@ from mcaptrack import log
 from mcaptrack.cli.group import Commands
 from mcaptrack.cli.many import NAMES
 from mcaptrack.sources import demo
-from mcaptrack.transforms import STAGES
+from mcaptrack.transforms import STAGES, TRANSFORMS, GroundTracker
 from mcaptrack.viewing.serving import Server
 from tests.commands import GROUP, call, done, press_ctrl_c
+from tests.effects import Case, ground, others
 from tests.effects.commands import CASES
 from tests.extension_cases import of_extensions
 from tests.logs import plain
@@ -268,3 +270,37 @@ def test_an_option_without_effect_is_a_warning(command, base, see):
         ):
             silent.append(case.words)
     assert silent == []
+
+
+# Every option of the transforms without a reference has a scene in which it matters, with the expected effect.
+#
+# Those of SORT and its relatives and of re-tracking are all varied against slow implementations in ``test_sort`` and
+# ``test_retracking_reference``.
+
+
+SCENES = others.CASES | ground.CASES
+KINDS = {name: kind for name, kind in TRANSFORMS.items() if name not in ("track", "retrack")} | {
+    "ground": GroundTracker
+}
+ORDER = ("least", "more", "most")
+
+
+@pytest.mark.parametrize(
+    ("option", "case"), one_in(2, [(name, case) for (_, name), case in SCENES.items()]), ids=map("-".join, SCENES)
+)
+def test_an_option_has_the_effect_that_its_scene_says(option: str, case: Case):
+    found = {}
+    for value in case.wanted:
+        transform = replace(case.transform, **{option: value})
+        found[value] = case.number([list(output) for output in zip(*transform(case.frames), strict=True)])
+    if set(case.wanted.values()) <= set(ORDER):
+        ordered = sorted(found, key=lambda value: ORDER.index(case.wanted[value]))
+        numbers = [found[value] for value in ordered]
+        assert all(more > 1.02 * less for less, more in pairwise(numbers)), found
+    else:
+        assert found == pytest.approx(case.wanted), case.scene
+
+
+def test_every_option_has_a_scene():
+    options = {(kind, o.name) for kind, made in KINDS.items() for o in fields(made) if not o.metadata.get("context")}
+    assert set(SCENES) == options | {("retrack", "class_limits")}

@@ -17,7 +17,7 @@ from mcaptrack import log, tables
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import GROUND_PLANE, TRACKS, Frame
-from mcaptrack.schema.ground_plane import plane_to_rows
+from mcaptrack.schema.as_rows import plane_to_rows
 from mcaptrack.tables import TABLES
 from mcaptrack.tables.export import ALWAYS, LogTables, export, recording_name, topic_folder
 from mcaptrack.tables.fields import table_version

@@ -17,11 +17,11 @@ import pytest
 
 from mcaptrack import environment, fleet
 from mcaptrack.errors import McaptrackError
-from mcaptrack.fleet import child, ledger
-from mcaptrack.fleet.child import Child, WorkerLimits
+from mcaptrack.fleet import ledger
+from mcaptrack.fleet import worker as of_worker
 from mcaptrack.fleet.expansion import NamedLog, outputs_in
 from mcaptrack.fleet.ledger import Claims, Ledger, claim_name
-from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.fleet.worker import Child, Reply, Request, WorkerLimits
 from tests import fleet_tasks
 from tests.awaiting import is_running, until
 from tests.tiers import one_in, thorough
@@ -381,9 +381,9 @@ def test_lines_of_a_ledger_are_whole_though_many_write(tmp_path):
 def test_workers_share_the_cores(monkeypatch):
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(child, "cores", lambda: 9)
+    monkeypatch.setattr(of_worker, "cores", lambda: 9)
     assert environment.threads() == environment.cores()
-    given = [child.environment_of_worker(workers) for workers in (1, 2, 20)]
+    given = [of_worker.environment_of_worker(workers) for workers in (1, 2, 20)]
     assert [(one["OMP_NUM_THREADS"], one["OPENCV_FOR_THREADS_NUM"]) for one in given] == [
         ("9",) * 2,
         ("4",) * 2,
@@ -392,7 +392,7 @@ def test_workers_share_the_cores(monkeypatch):
     for said, wanted in (("3", 3), ("2,1", 2), ("0", environment.cores()), ("many", environment.cores())):
         monkeypatch.setenv("OMP_NUM_THREADS", said)
         assert environment.threads() == wanted
-        assert child.environment_of_worker(2)["OMP_NUM_THREADS"] == said
+        assert of_worker.environment_of_worker(2)["OMP_NUM_THREADS"] == said
 
 
 # Workers that end while they wait, that don't start, and that can't be started.
@@ -413,7 +413,7 @@ while True:
 def test_a_worker_that_was_ended_while_it_waited_is_replaced(monkeypatch):
     """The system may end it for its memory. That was a broken pipe, which ended the whole command."""
     answer = pickle.dumps(Reply(Path("a.mcap"), "done", seconds=7.0)).hex()
-    monkeypatch.setattr(child, "_CODE", LIGHT.format(answer))
+    monkeypatch.setattr(of_worker, "_CODE", LIGHT.format(answer))
     worker, request = Child(WorkerLimits()), Request(Path("a.mcap"), b"", {})
     try:
         for number in range(3):
@@ -427,9 +427,9 @@ def test_a_worker_that_was_ended_while_it_waited_is_replaced(monkeypatch):
 
 
 def test_a_worker_that_does_not_start_is_named_as_that(monkeypatch):
-    monkeypatch.setattr(child, "_CODE", "import signal; signal.pause()")
-    monkeypatch.setattr(child, "_START_S", 0.3)
-    monkeypatch.setattr(child, "_GRACE_S", 0.2)
+    monkeypatch.setattr(of_worker, "_CODE", "import signal; signal.pause()")
+    monkeypatch.setattr(of_worker, "_START_S", 0.3)
+    monkeypatch.setattr(of_worker, "_GRACE_S", 0.2)
     worker = Child(WorkerLimits(timeout_s=3600))
     try:
         reply = worker.do(Request(Path("a.mcap"), b"", {}), lambda: False)
@@ -446,7 +446,7 @@ def test_logs_are_named_where_workers_cannot_be_started(tmp_path, monkeypatch):
         raise FileNotFoundError(2, "No usable temporary directory found in ['/tmp']")
 
     (tmp_path / "a.mcap").touch()
-    monkeypatch.setattr("mcaptrack.fleet.child.tempfile.TemporaryFile", no_folder)
+    monkeypatch.setattr("mcaptrack.fleet.worker.tempfile.TemporaryFile", no_folder)
     done = fleet.run(fleet_tasks.touch, tmp_path)
     assert [(one.state, one.error) for one in done.failed] == [
         (

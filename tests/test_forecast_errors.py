@@ -21,7 +21,7 @@ from mcaptrack.evaluation.forecasts import find_forecast_errors, score_forecasts
 from mcaptrack.evaluation.metrics.displacement import combine_displacements, displacement, pair_forecasts
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame
-from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.schema.as_rows import forecast_to_rows
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import Predict
 from tests.commands import done, printed

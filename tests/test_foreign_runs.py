@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import mcaptrack
 from mcaptrack import log, pipeline
-from mcaptrack.api import recording
+from mcaptrack.api import reading
 from mcaptrack.errors import McaptrackError
 from mcaptrack.foxglove.views import SUFFIX
 from mcaptrack.notices import McaptrackWarning
@@ -200,7 +200,7 @@ def test_recorded_detections_are_in_the_table_of_detections(tmp_path):
     """Class names have numbers, and rows can be joined with their messages."""
     path = tmp_path / "a.mcap"
     counts = boxes_log(path, "person", "car", "7")
-    with recording.open(path) as opened, pytest.warns(McaptrackWarning, match="1 is a person, 8 is 'car'"):
+    with reading.open(path) as opened, pytest.warns(McaptrackWarning, match="1 is a person, 8 is 'car'"):
         rows, frames = opened.array("detections"), opened.array("frames")
     assert frames[["topic", "t_ns", "rows"]].tolist() == [
         ("/lidar/boxes", START_NS + ns(n / 10), count) for n, count in enumerate(counts)

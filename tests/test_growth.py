@@ -28,7 +28,7 @@ from mcaptrack.schema import DETECTIONS, TRACKS, Frame
 from mcaptrack.transforms import Retrack
 from mcaptrack.transforms.ground import GroundTracker
 from mcaptrack.transforms.sort import ByteTrack, OcSort, Sort
-from tests.memory import held
+from tests.bounded import held
 from tests.tiers import one_in
 
 RECTANGLES = st.lists(st.tuples(*[st.integers(0, 12)] * 2, *[st.integers(0, 9)] * 2, st.integers(0, 2)), max_size=14)

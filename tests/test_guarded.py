@@ -11,8 +11,7 @@ import pytest
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.notices import collected
-from mcaptrack.predictors import entry_of
-from mcaptrack.predictors.checked import CheckedPredictor
+from mcaptrack.predictors import CheckedPredictor, entry_of
 from mcaptrack.registry import Entry
 from mcaptrack.schema import BOX_PX, DETECTIONS, PLACE_M, TRACKS, Frame
 from mcaptrack.transforms.guarded import guarded

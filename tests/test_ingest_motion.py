@@ -11,7 +11,7 @@ import pytest
 from mcaptrack import log
 from mcaptrack.geometry.camera_path import Verdict
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, TRACKS, Frame
-from mcaptrack.schema.camera_motion import frames_to_path
+from mcaptrack.schema.as_rows import frames_to_path
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest.job import motion_frames, read_motions
 from tests.commands import call, done

@@ -17,7 +17,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, TRACKS
-from mcaptrack.schema.ground_plane import plane_to_rows, rows_to_plane
+from mcaptrack.schema.as_rows import plane_to_rows, rows_to_plane
 from mcaptrack.schema.provenance import CLOCK
 from mcaptrack.sources.ingest import IngestOptions, IngestReport, RecordingJob, decompression, ingest, plain_yaml
 from mcaptrack.sources.ingest.job import FOR_VIDEOS

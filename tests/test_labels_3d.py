@@ -12,7 +12,7 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.oriented_boxes import columns_to_oriented_boxes
+from mcaptrack.geometry.boxes import columns_to_oriented_boxes
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.framing import join_frames
 from tests.commands import call

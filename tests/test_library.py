@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 import mcaptrack
-from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.text import with_flags
 from mcaptrack.errors import McaptrackError
 from mcaptrack.errors import call as proposed
 from mcaptrack.installed import missing_extension

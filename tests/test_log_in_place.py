@@ -21,8 +21,8 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes
 from mcaptrack.log import in_place
 from mcaptrack.log import writer as writing
-from mcaptrack.log.checksums import crc_before
 from mcaptrack.log.journal import journal_of
+from mcaptrack.log.records import crc_before
 from mcaptrack.log.writer import LogWriter
 from tests.interrupted import contents, killed
 from tests.logs import SCHEMA, SOME, STOCK_OPTIONS, our_messages, write_log, write_stock

@@ -25,7 +25,7 @@ from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack import identity_swaps, passes
 from mcaptrack.transforms.retrack.passes import LikelihoodPass, Movers
 from tests.awaiting import until
-from tests.memory import held
+from tests.bounded import held
 
 runner = import_module("mcaptrack.pipeline.runner")  # the package has a function of its name
 

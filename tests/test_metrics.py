@@ -21,7 +21,7 @@ from mcaptrack.evaluation.occupancy import occupancy
 from mcaptrack.geometry.boxes import iou
 from mcaptrack.predictors import Forecast
 from mcaptrack.schema import PREDICTIONS, Frame
-from mcaptrack.schema.predictions import forecast_to_rows
+from mcaptrack.schema.as_rows import forecast_to_rows
 from tests.forecasts import forecasts, positions, predicted
 from tests.worlds import boxed, ns, tracks_at, walk
 

@@ -22,9 +22,9 @@ import pytest
 import mcaptrack
 from mcaptrack.api.declared import Option
 from mcaptrack.cli import common, text
-from mcaptrack.cli.flags import RUNNING, with_flags
 from mcaptrack.cli.many import ManyOptions
 from mcaptrack.cli.settings import Setting
+from mcaptrack.cli.text import RUNNING, with_flags
 from mcaptrack.errors import McaptrackError
 from mcaptrack.predictors import NAMES
 from mcaptrack.transforms import PROFILES, TRACKERS, TRANSFORMS

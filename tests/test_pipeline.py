@@ -16,7 +16,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
 from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS
-from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.schema.as_rows import rows_to_plane
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.ingest import IngestOptions, ingest
 from mcaptrack.transforms import (

@@ -22,7 +22,7 @@ from mcaptrack.notices import collected
 from mcaptrack.pipeline.plan import check_spaces
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DECISIONS, DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.ground_plane import plane_to_rows
+from mcaptrack.schema.as_rows import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, VIEW, Provenance
 from mcaptrack.transforms import (
     STAGES,

@@ -22,8 +22,8 @@ from mcaptrack.predictors.linear import (
     LinearPredictor,
 )
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.as_rows import forecast_to_rows, tails_of
 from mcaptrack.schema.encodings import CdrCodec, fields_of
-from mcaptrack.schema.predictions import forecast_to_rows, tails_of
 from mcaptrack.transforms import Predict, Sample
 from tests.worlds import ids, ns, places, walk
 

@@ -24,8 +24,7 @@ from mcaptrack import fleet
 from mcaptrack.api.upkeep import LogCheck, LogRecovery
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import FleetResult, LogOutcome
-from mcaptrack.log.check import CheckResult
-from mcaptrack.log.check_summary import Finding
+from mcaptrack.log.check import CheckResult, Finding
 from mcaptrack.notices import Notice
 from mcaptrack.pipeline.several import CameraResult
 from mcaptrack.pipeline.summary import Corrected, Looks, Repair, Summary, SummaryScores

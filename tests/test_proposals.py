@@ -16,7 +16,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import log, pipeline
-from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.text import with_flags
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
 from mcaptrack.schema.provenance import Provenance
@@ -187,7 +187,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
         "run", "LOG"
     ),
     "pipeline/events.py:make:run": lambda s: s.untracked().says("events", "LOG"),
-    "pipeline/drawing.py:find_views:run": Scene.without_views,
+    "pipeline/views.py:find_views:run": Scene.without_views,
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
@@ -223,7 +223,7 @@ def proposals() -> set[str]:
     """Return the places where the package proposes commands: module, function and command."""
     out = set()
     for path in PACKAGE.rglob("*.py"):
-        if path == PACKAGE / "cli" / "flags.py":
+        if path == PACKAGE / "cli" / "text.py":
             continue  # it turns the calls that others propose into commands
         text = path.read_text(encoding="utf-8")
         if "mcaptrack.errors" not in text:

@@ -11,15 +11,14 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.hull import GrowingHull
 from mcaptrack.notices import McaptrackWarning
 from mcaptrack.schema import DECISIONS, PREDICTIONS, TRACKS, Frame, Rows, framing
-from mcaptrack.schema.by_class import join_classes, split_classes
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.transforms import PROFILES, Retrack
 from mcaptrack.transforms.retrack.false_tracks import FEATURES, features, log_odds_in_log, stand_throughout
+from mcaptrack.transforms.retrack.methods import join_classes, split_classes
 from mcaptrack.transforms.retrack.motion_model import MotionModel, State, Trajectories, smooth
-from mcaptrack.transforms.retrack.online_tracker import PlaceOdds
+from mcaptrack.transforms.retrack.online_tracker import GrowingHull, PlaceOdds
 from mcaptrack.transforms.retrack.passes import PEOPLE, KeptIds, LikelihoodPass, Movers, movers_of, usual_score
 from tests.commands import call
 from tests.logs import provenance_of

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mcaptrack.schema import DETECTIONS, EVENTS, SCHEMAS, TRACKS
-from mcaptrack.schema.camera_motion import is_motion
+from mcaptrack.schema.as_rows import is_motion
 from mcaptrack.schema.codec import RowCodec
 from mcaptrack.schema.proto import KINDS, parse
 from mcaptrack.schema.provenance import Plugin, Provenance, digest

@@ -20,7 +20,7 @@ from mcaptrack.evaluation.event_text import PEOPLE, log_messages, nouns_of
 from mcaptrack.evaluation.events import EventOptions, default_rule, find_events
 from mcaptrack.evaluation.metrics import ScoredMatchup, average_over_recalls, metres_to_similarity
 from mcaptrack.evaluation.metrics.matchup import Matchup
-from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
+from mcaptrack.geometry.boxes import ORIENTED_COLUMNS, bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
 from mcaptrack.schema import TRACKS, Frame
 from tests.commands import call
 from tests.logs import recorder
@@ -31,7 +31,7 @@ SIZES = {1: (0.6, 0.6, 1.8), 2: (4.5, 1.9, 1.5), 3: (9.0, 2.6, 3.2)}
 
 
 def frame(number: int, boxes: list, ids: list, classes: list, scores: list | None = None) -> Frame:
-    columns = dict(zip(COLUMNS, np.array(boxes, float).reshape(-1, 7).T, strict=True))
+    columns = dict(zip(ORIENTED_COLUMNS, np.array(boxes, float).reshape(-1, 7).T, strict=True))
     rows = TRACKS.rows(
         track_id=np.array(ids, int),
         observed=np.ones(len(ids), bool),
@@ -160,7 +160,7 @@ def test_averages_of_several_sequences_are_of_all_their_matches_together():
 
 
 def lines(frames: list[Frame]) -> str:
-    names = ("track_id", *COLUMNS, "score")
+    names = ("track_id", *ORIENTED_COLUMNS, "score")
     rows = [
         ",".join([str(one.t_ns), NAMES[int(row["class_id"])], *(str(row[name]) for name in names)])
         for one in frames

@@ -16,8 +16,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import environment
-from mcaptrack.cli.config import MAX_BYTES, user_file
-from mcaptrack.cli.settings import Setting
+from mcaptrack.cli.settings import MAX_BYTES, Setting, user_file
 from tests.commands import GROUP, call, toml_value
 from tests.tiers import one_in
 
@@ -168,8 +167,8 @@ def refused(*words: str) -> str:
 READERS = (
     "environment.py",
     "cli/settings.py",
-    "cli/plugins.py",
-    "fleet/child.py",
+    "cli/stages.py",
+    "fleet/worker.py",
     "extensions/stores/objects.py",
     "api/health.py",
 )

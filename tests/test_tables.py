@@ -36,9 +36,9 @@ from mcaptrack.schema.provenance import Provenance
 from mcaptrack.tables import TABLES, Pointers, build, files, messages, text
 from mcaptrack.tables import files as tables_files
 from mcaptrack.tables.fields import CODES
+from tests.bounded import held
 from tests.commands import call
 from tests.logs import flat_table, write_channels
-from tests.memory import held
 from tests.strategies import columns
 from tests.tiers import one_in, thorough
 from tests.worlds import ns, table_to_frames, tracks_at

@@ -14,11 +14,14 @@ from mcaptrack.evaluation.metrics.displacement import ellipse_levels
 from mcaptrack.geometry.arrays import taken
 from mcaptrack.geometry.mixtures import Tails, mass_within, squared_radius
 from mcaptrack.notices import Notice, listening
-from mcaptrack.predictors import NAMES, Forecast, make, vehicle_tails
+from mcaptrack.predictors import NAMES, Forecast, make, tail_calibration
 from mcaptrack.predictors.position_noise import NoiseOfErrors, PositionNoise, nonnegative
 from mcaptrack.predictors.tail_calibration import (
+    TABLE_OF_CLASS,
+    VEHICLE_TABLES,
     Learned,
     TailCalibration,
+    calibrated_vehicles,
     correct,
     counts_of,
     follow,
@@ -26,7 +29,7 @@ from mcaptrack.predictors.tail_calibration import (
     table_of,
 )
 from mcaptrack.schema import TRACKS, Frame, Rows
-from mcaptrack.schema.predictions import tails_of
+from mcaptrack.schema.as_rows import tails_of
 from mcaptrack.transforms import PROFILES
 from mcaptrack.transforms.motion_limits import LIMITS
 from mcaptrack.transforms.predict import Predict
@@ -313,10 +316,10 @@ def forecast(count: int, steps: int = 3) -> Forecast:
 
 def test_mixtures_by_hand(monkeypatch: pytest.MonkeyPatch):
     """A standing car, a moving bus, a person, and a car whose speed is unknown; steps at 0.75, 1.5 and 2.25 s."""
-    monkeypatch.setattr(vehicle_tails, "tables_in", lambda path: TABLES)
+    monkeypatch.setattr(tail_calibration, "tables_in", lambda path: TABLES)
     given = forecast(4)
     names, speed = ["car", "bus", "person", "car"], np.array([0.4, 0.5, 9.0, np.nan])
-    made, shapes = vehicle_tails.calibrated("red", given, 0.75, names, speed)
+    made, shapes = calibrated_vehicles("red", given, 0.75, names, speed)
     assert shapes is not None
     narrow, wide = np.array([0.1, 0.2, 0.4]), np.array([2.0, 4.0, 8.0])  # the logarithms are interpolated
     for row, weight in ((0, np.array([0.2, 0.3, 0.4])), (1, np.full(3, 0.5))):
@@ -326,16 +329,16 @@ def test_mixtures_by_hand(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_array_equal(made.cov[2:], given.cov[2:])
     assert np.isnan([part[2:] for part in shapes]).all()
     np.testing.assert_array_equal(made.mean, given.mean)
-    assert vehicle_tails.calibrated("cv", given, 0.75, names, speed) == (given, None)
+    assert calibrated_vehicles("cv", given, 0.75, names, speed) == (given, None)
 
 
 def test_the_tables_that_ship_are_distributions_for_all_vehicles():
-    tables = json.loads(vehicle_tails.TABLES.read_text())
+    tables = json.loads(VEHICLE_TABLES.read_text())
     assert "no recordings" in tables["card"]["data"]
-    assert {name for name, row in LIMITS.items() if row.turns} == set(vehicle_tails.TABLE_OF)
-    names = sorted(vehicle_tails.TABLE_OF)
+    assert {name for name, row in LIMITS.items() if row.turns} == set(TABLE_OF_CLASS)
+    names = sorted(TABLE_OF_CLASS)
     for speed in (0.0, 5.0):
-        _, shapes = vehicle_tails.calibrated("red", forecast(len(names)), 0.4, names, np.full(len(names), speed))
+        _, shapes = calibrated_vehicles("red", forecast(len(names)), 0.4, names, np.full(len(names), speed))
         assert shapes is not None
         weight, narrow, wide = shapes
         np.testing.assert_allclose((1 - weight) * narrow + weight * wide, 1.0)
@@ -391,7 +394,7 @@ def axis_m(rows: Rows) -> float:
 def as_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ellipses as predictors make them: otherwise they follow the log, and those of vehicles are mixtures."""
     monkeypatch.setattr(TailCalibration, "of", lambda *_: None)
-    monkeypatch.setattr(vehicle_tails, "tables_in", lambda path: {})
+    monkeypatch.setattr(tail_calibration, "tables_in", lambda path: {})
 
 
 @pytest.mark.usefixtures("as_predicted")

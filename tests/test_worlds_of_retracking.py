@@ -12,8 +12,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from mcaptrack import log
-from mcaptrack.evaluation.intervals import lacks_intervals
-from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
+from mcaptrack.evaluation.world_tracks import WorldTracks, lacks_intervals, tracks_in_worlds
 from mcaptrack.notices import collected
 from mcaptrack.schema import WORLDS, Frame
 from mcaptrack.transforms import Retrack

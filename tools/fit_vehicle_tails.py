@@ -25,10 +25,10 @@ from traffic import CLASSES, Faults, draw_traffic
 
 from mcaptrack import __version__
 from mcaptrack.geometry.mixtures import Tails, mahalanobis_squared, mass_within
-from mcaptrack.predictors import vehicle_tails as shipped
+from mcaptrack.predictors import tail_calibration as shipped
 from mcaptrack.predictors.tail_calibration import counts_of
 from mcaptrack.schema import DETECTIONS, Frame
-from mcaptrack.schema.predictions import tails_of
+from mcaptrack.schema.as_rows import tails_of
 from mcaptrack.transforms import GroundTracker, Retrack, Sample
 
 STEPS, STEP_S, ITERATIONS = 12, 0.4, 300
@@ -72,7 +72,7 @@ def errors(seed: int) -> Iterator[tuple[str, str, str, np.ndarray, np.ndarray, T
             now = int(np.abs(drawn.t_ns - frame.t_ns).argmin())
             true = np.flatnonzero(truth["frame"] == now)
             for row in frame.rows[np.isin(frame.rows["track_id"], made.rows["track_id"])]:
-                kind = shipped.TABLE_OF.get(CLASSES[int(row["class_id"])])
+                kind = shipped.TABLE_OF_CLASS.get(CLASSES[int(row["class_id"])])
                 same = true[truth["class_id"][true] == row["class_id"]]
                 away = np.hypot(truth["x_m"][same] - row["x_m"], truth["y_m"][same] - row["y_m"])
                 if kind is None or not len(away) or away.min() > NEAR_M:
@@ -99,7 +99,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="score the tables on scenes that they weren't fitted on")
     given = parser.parse_args()
     if not given.check:  # forecasts without the tables that are made
-        shipped.TABLES.write_text('{"predictors": {}}')
+        shipped.VEHICLE_TABLES.write_text('{"predictors": {}}')
         shipped.tables_in.cache_clear()
     parts: dict[tuple[str, str, str], list] = {}
     first = given.seed + 1000 * given.check
@@ -127,7 +127,9 @@ def main() -> None:
             "data": "drawn traffic of tools/traffic.py with faults of detectors; no recordings",
             "licence": "Apache-2.0",
         }
-        shipped.TABLES.write_text(json.dumps({"card": card, "predictors": tables}, separators=(",", ":")) + "\n")
+        shipped.VEHICLE_TABLES.write_text(
+            json.dumps({"card": card, "predictors": tables}, separators=(",", ":")) + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 MkDocs calls ``on_config``, then ``on_page_markdown`` for each page (``hooks`` in mkdocs.yml). A page has the text
 ``<!-- generated: NAME -->`` where a part belongs: one of ``GENERATED``, or of those that `mcaptrack docs` prints, too
-(``mcaptrack.cli.generated.PARTS``). Below each query of docs/extensions/sql.md stands what the tables of
+(``mcaptrack.cli.docs.PARTS``). Below each query of docs/extensions/sql.md stands what the tables of
 `mcaptrack demo` answer:
 those in the folder that the environment variable DEMO names, or those of one that is made for it (a minute).
 """
@@ -61,7 +61,7 @@ def on_config(config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """The page, without the marks of its blocks, with what is generated."""
     sys.path[:0] = [path for path in (str(ROOT),) if path not in sys.path]
-    from mcaptrack.cli.generated import PARTS, with_parts
+    from mcaptrack.cli.docs import PARTS, with_parts
     from tools.pages import with_links_that_lead
 
     text = re.sub(r"^ *<!-- (?:not run|file|exit): .+? -->\n", "", with_links_that_lead(markdown), flags=re.M)

@@ -231,7 +231,7 @@ def doctor(
     >>> mcaptrack.doctor().faults
     ()
     """
-    from mcaptrack.sources.video.self_test import codec_faults
+    from mcaptrack.sources.video.codecs import codec_faults
 
     url = None if store is None else _url_of_store(store)
     with collected() as warnings:

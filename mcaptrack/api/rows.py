@@ -27,8 +27,13 @@ from mcaptrack.sources.own_rows import (
     check_frames,
     checked_names,
     columns_in_space,
+    columns_of_dtype,
+    columns_of_objects,
+    columns_of_type,
+    derived,
     frame_of,
     frames_of_columns,
+    is_dataclass,
     kind_of,
     number_of,
     numbered_columns,
@@ -36,7 +41,6 @@ from mcaptrack.sources.own_rows import (
     schema_of_columns,
     time_of,
 )
-from mcaptrack.sources.own_schemas import columns_of_dtype, columns_of_objects, columns_of_type, derived, is_dataclass
 
 if TYPE_CHECKING:
     from supervision import Detections

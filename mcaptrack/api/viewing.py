@@ -303,7 +303,7 @@ class LogServer:
             self._views.close()
 
 
-@declared(heading="Start here", printed_by="mcaptrack.cli.view:ViewCommand")
+@declared(heading="Start here", printed_by="mcaptrack.cli.show:ViewCommand")
 def view(
     log: Annotated[PathLike, Argument("path", "LOG", "The log.", help="The log.")],
     *,

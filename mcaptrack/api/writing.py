@@ -11,9 +11,8 @@ from mcaptrack import log as logs
 from mcaptrack import pipeline
 from mcaptrack.api.common import detail, warnings_about
 from mcaptrack.api.options import no_progress
-from mcaptrack.api.products import write_products
 from mcaptrack.api.rows import frames_of
-from mcaptrack.api.running import warn_stale
+from mcaptrack.api.running import warn_stale, write_products
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes, plane_at
 from mcaptrack.installed import running_program

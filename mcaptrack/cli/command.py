@@ -12,7 +12,6 @@ import typer
 from typer.core import TyperCommand, TyperOption
 
 from mcaptrack.api.declared import Option, Parameter, parameter_of
-from mcaptrack.cli.flags import RUNNING
 from mcaptrack.cli.help import ALL, HELP, LAST_PANELS, write_page
 from mcaptrack.cli.settings import (
     SWITCH,
@@ -25,7 +24,7 @@ from mcaptrack.cli.settings import (
     nearest,
     other_way,
 )
-from mcaptrack.cli.text import refuse_usage, say
+from mcaptrack.cli.text import RUNNING, refuse_usage, say
 from mcaptrack.errors import list_names, similar
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn

@@ -22,8 +22,7 @@ import typer
 
 from mcaptrack import SCHEMA_VERSION, notices
 from mcaptrack.cli.command import check_ranges, is_on_command_line
-from mcaptrack.cli.flags import with_flags
-from mcaptrack.cli.text import Level, is_json, say
+from mcaptrack.cli.text import Level, is_json, say, with_flags
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes, refuse_overwrite, refuse_special, refuse_url
 from mcaptrack.location import Location, is_remote, parse

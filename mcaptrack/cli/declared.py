@@ -30,12 +30,12 @@ from mcaptrack.api.declared import (
     words_of,
 )
 from mcaptrack.api.options import FILES, Force, PathLike
+from mcaptrack.choices import limits
 from mcaptrack.cli import common
 from mcaptrack.cli.command import Settable, set_option, values_set
 from mcaptrack.cli.help import LAST_PANELS, arranged
 from mcaptrack.cli.settings import Elsewhere
 from mcaptrack.cli.text import stdout_to_stderr
-from mcaptrack.ranges import limits
 from mcaptrack.registry import blamed, find
 
 __all__ = ["Once", "Printed"]

@@ -138,14 +138,13 @@ def _limit(text: str) -> tuple[str, float]:
 
 def print_results(scores: Scores, all_gates: bool, verbose: bool) -> None:
     """Print the verdict, the scores as a table, and those of predictions below it."""
-    from mcaptrack.evaluation import COMBINED
-    from mcaptrack.evaluation.verdict import main_results, matched_by, verdict
+    from mcaptrack.evaluation import COMBINED, gate_text, main_results, matched_by, verdict
 
     show(*verdict(scores.results), "")
     results = sorted(scores.results, key=lambda r: (r.sequence == COMBINED, r.sequence, r.similarity, r.gate))
     main = main_results(results)
     _print_scores(results if all_gates else main)
-    others = dict.fromkeys(gate for result in results if (gate := _gate_cell(result)) != _gate_cell(main[0]))
+    others = dict.fromkeys(gate for result in results if (gate := gate_text(result)) != gate_text(main[0]))
     if others and not all_gates:
         show(f"matched {matched_by(main[0])}; --all has the scores of {', '.join(others)}, too")
     forecasts: dict[_Key, Displacement] = {}
@@ -172,6 +171,8 @@ def _print_differences(scores: Scores) -> None:
 
 def _print_scores(results: Sequence[EvaluationRow]) -> None:
     """The scores of tracks; the best rates of those with the same rows of ground truth are bold."""
+    from mcaptrack.evaluation import gate_text
+
     keys = [(result.sequence, result.tracks, result.of_class) for result in results]
     names, first = _first_columns("tracks", keys)
     several_gates = len({(result.similarity, result.gate) for result in results}) > 1
@@ -182,7 +183,7 @@ def _print_scores(results: Sequence[EvaluationRow]) -> None:
     rows: list[list[str | Text]] = []
     previous = None
     for key, result in zip(keys, results, strict=True):
-        by = _gate_cell(result)
+        by = gate_text(result)
         if previous not in (None, (result.sequence, by)):
             rows.append([])
         previous = (result.sequence, by)
@@ -211,12 +212,6 @@ def _compared(result: EvaluationRow) -> tuple[Any, ...]:
     """The key of results with comparable scores: they have the same rows of ground truth."""
     rows = result.score.counts["TP"] + result.score.counts["FN"]
     return result.sequence, result.of_class, result.similarity, result.gate, rows
-
-
-def _gate_cell(result: EvaluationRow) -> str:
-    from mcaptrack.evaluation.verdict import OVERLAPS
-
-    return f"{OVERLAPS[result.similarity]} {result.gate:g}" if result.similarity in OVERLAPS else f"{result.gate:g} m"
 
 
 def _print_forecasts(forecasts: Mapping[_Key, Displacement], more: Mapping[str, str]) -> None:

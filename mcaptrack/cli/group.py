@@ -288,6 +288,6 @@ def _with_plugins(commands: Commands, arguments: list[str], config: Path | None)
     """The functions of commands with options of plug-ins in this call. Where there can be none, nothing is loaded."""
     if not (set(arguments) & set(_WITH_PLUGINS) or config or may_be_set()):
         return {}
-    from mcaptrack.cli.plugins import commands_with_plugins
+    from mcaptrack.cli.stages import commands_with_plugins
 
     return commands_with_plugins(commands, arguments, config)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from mcaptrack.api.declared import Parameter
-from mcaptrack.ranges import limits
+from mcaptrack.choices import limits
 
 #: The first heading, that of options without a theme below it, and the last ones: input and output, many logs, and the
 #: options of all commands.

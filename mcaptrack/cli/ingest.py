@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from mcaptrack.api.ingesting import default_log
 from mcaptrack.cli import common
 from mcaptrack.cli.common import expand, only_one_output
-from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
+from mcaptrack.cli.text import with_flags
 from mcaptrack.location import Location
 
 if TYPE_CHECKING:

@@ -11,9 +11,8 @@ from mcaptrack.api.declared import Option
 from mcaptrack.cli import common
 from mcaptrack.cli.chosen import configured
 from mcaptrack.cli.command import settings_of
-from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
-from mcaptrack.cli.text import counted, stdout_to_stderr
+from mcaptrack.cli.text import counted, stdout_to_stderr, with_flags
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.location import Location
 

@@ -1,26 +1,36 @@
-"""Make the commands of the stages from the parameters of their transforms."""
+"""Make the commands of the stages from the parameters of their transforms, of other packages, too."""
 
 from __future__ import annotations
 
 import inspect
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import MISSING, Field
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
+import typer
+
 from mcaptrack.api.declared import Option, Parameter, parameter_of
 from mcaptrack.api.declared import options_of as options_of_function
+from mcaptrack.cli import common
 from mcaptrack.cli.chosen import Maker, configured, has_flag, options_of, settable_of, tuning_of
-from mcaptrack.cli.command import is_option_given, is_stronger, listed
+from mcaptrack.cli.command import is_option_given, is_stronger, listed, values_of
 from mcaptrack.cli.declared import OfAll, command, help_of, parameters_of
+from mcaptrack.cli.help import HELP
 from mcaptrack.cli.running import RunsStages
-from mcaptrack.cli.text import stdout_to_stderr
+from mcaptrack.cli.settings import ConfigFile, read_files
+from mcaptrack.cli.text import say, stdout_to_stderr
+from mcaptrack.environment import PREFIX
 from mcaptrack.errors import McaptrackError
-from mcaptrack.registry import titled
+from mcaptrack.notices import listening
+from mcaptrack.registry import names, own, titled
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import member_type
 
@@ -174,3 +184,74 @@ def _flags(option: Parameter) -> set[str]:
     """The names that an option has on the command line, without the dashes."""
     flags = {name.removeprefix("--") for flag in option.flags for name in flag.split("/")}
     return flags | {option.name.replace("_", "-")}
+
+
+# The options of plug-ins (detectors, trackers and so on of other packages), for the command that uses them.
+#
+# The command line, the environment and files are searched for names of plug-ins before the command line is parsed. Only
+# plug-ins that are named there are imported; and, if a file or the environment sets an option that no built-in
+# transform has, all that installed packages declare as entry points.
+
+
+def commands_with_plugins(commands: Mapping[str, Any], arguments: Sequence[str], config: Path | None) -> dict[str, Any]:
+    """Return the commands of stages that have options of plug-ins which this call chooses for them.
+
+    A plug-in on the command line that can't be loaded ends the command with exit code 1.
+    """
+    called = next((word for word in arguments if not word.startswith("-")), "")
+    if called not in commands:
+        return {}
+    files = [] if set(arguments) & set(HELP) else read_files(config)
+    functions: dict[str, Any] = {}
+    for stage in STAGES.values():
+        if not stage.option:
+            continue
+        try:
+            with stdout_to_stderr(), listening(lambda notice: say(notice.message, "warning")):
+                plugins = dict(_of_words(stage, arguments)) if called in (stage.name, "run") else {}
+                plugins |= _of_settings(stage, files, commands)
+            plugins = {name: cls for name, cls in plugins.items() if cls is not stage.default}
+            if plugins:
+                functions[stage.name] = StageCommand.function_of(stage.name, plugins)
+        except McaptrackError as error:
+            say(str(error), "error")
+            raise typer.Exit(common.REFUSED) from None
+    return functions
+
+
+def _of_words(stage: Stage, arguments: Sequence[str]) -> Iterator[tuple[str, type[Transform]]]:
+    assert stage.option
+    for name in filter(None, values_of(arguments, f"--{stage.option}")):  # the parser refuses an empty one
+        if stage.split(name)[0] in own(stage.option):
+            continue
+        with nullcontext() if stage.kind else suppress(McaptrackError):  # a predictor: the command reports the error
+            yield name, stage.choose(name)
+
+
+def _of_settings(stage: Stage, files: Sequence[ConfigFile], commands: Mapping[str, Any]) -> dict[str, type[Transform]]:
+    """Return the plug-ins that environment and files name for a stage; the stage that uses it reports a missing one.
+
+    A file in the working folder can't name modules.
+    """
+    kind = stage.option
+    assert kind
+    plugin_names = [os.environ.get(f"{PREFIX}{user}_{kind}".upper(), "") for user in (stage.name, "run")]
+    options: set[str] = set()
+    for file in files:
+        for user in (stage.name, "run"):
+            table = file.tables.get(user)
+            name = table.get(kind) if isinstance(table, dict) else None
+            if isinstance(name, str) and (file.trusted or ":" not in name):
+                plugin_names.append(name)
+        table = file.tables.get(stage.name)
+        options |= {key.replace("_", "-") for key in table} if isinstance(table, dict) else set()
+    start = f"{PREFIX}{stage.name}_".upper()
+    options |= {name.removeprefix(start).lower().replace("_", "-") for name in os.environ if name.startswith(start)}
+    if options and options - set(commands[stage.name].settings):
+        plugin_names += names(kind)
+    out = {}
+    for name in dict.fromkeys(plugin_names):
+        if name and stage.split(name)[0] not in own(kind):
+            with suppress(McaptrackError):
+                out[name] = stage.choose(name)
+    return out

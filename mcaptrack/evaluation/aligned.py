@@ -16,10 +16,15 @@ from mcaptrack.evaluation import metrics
 from mcaptrack.evaluation.metrics import Matchup
 from mcaptrack.evaluation.metrics.matchup import SparseTables
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
-from mcaptrack.geometry.boxes import columns_to_boxes, iou_of_pairs
+from mcaptrack.geometry.boxes import (
+    bev_iou_of_pairs,
+    columns_to_boxes,
+    columns_to_oriented_boxes,
+    iou_3d_of_pairs,
+    iou_of_pairs,
+)
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.neighbours import touching_pairs
-from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs, columns_to_oriented_boxes, iou_3d_of_pairs
 from mcaptrack.geometry.ragged import cross_pairs, group_index
 from mcaptrack.schema import TRACKS, Frame, Rows
 from mcaptrack.schema.classes import PERSON, class_name, is_person, majority

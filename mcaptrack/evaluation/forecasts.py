@@ -29,14 +29,13 @@ from mcaptrack.evaluation.metrics.displacement import (
     pair_forecasts,
 )
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, taken
-from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.clocks import NS_PER_S, RegularClock, seconds_to_ns
 from mcaptrack.geometry.histories import Holt, SmoothedHistory
 from mcaptrack.geometry.mixtures import Tails, squared_radius
-from mcaptrack.geometry.ticks import RegularClock
 from mcaptrack.schema import FORECAST_ERRORS, FORECAST_SCORES, PREDICTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema.as_rows import tails_of
 from mcaptrack.schema.frame_columns import FrameCollector
 from mcaptrack.schema.framing import frame_numbers, frame_times, join_frames, row_ends, spans_of, split_rows
-from mcaptrack.schema.predictions import tails_of
 from mcaptrack.transforms import Predict
 
 #: The channels of forecasts, below the camera's prefix, and the tracks from which each is made.

@@ -25,11 +25,10 @@ from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError, did_you_mean, list_names
 from mcaptrack.files import place_of
 from mcaptrack.fleet import ledger
-from mcaptrack.fleet.child import Child, StoppedError, WorkerLimits, memory_in_bytes
 from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
 from mcaptrack.fleet.ledger import Claims, Ledger, digest_of_log, digest_of_settings
 from mcaptrack.fleet.results import AGAIN, GOOD, FleetResult, FleetStatus, LogOutcome, Running, Watch
-from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.fleet.worker import Child, Reply, Request, StoppedError, WorkerLimits, memory_in_bytes
 from mcaptrack.location import Location, Url
 from mcaptrack.registry import find
 

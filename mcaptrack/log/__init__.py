@@ -16,8 +16,7 @@ from mcap.opcode import Opcode
 from mcaptrack.files import temporary_folder
 from mcaptrack.location import Location, Url
 from mcaptrack.log import records
-from mcaptrack.log.check import CheckResult, check, clock_jumps, jumps_text
-from mcaptrack.log.check_summary import Finding
+from mcaptrack.log.check import CheckResult, Finding, check, clock_jumps, jumps_text
 from mcaptrack.log.chunks import message_head, open_chunk
 from mcaptrack.log.cut import Part, copy_messages, private_records
 from mcaptrack.log.extend import extend, refuse_to_replace_recorded

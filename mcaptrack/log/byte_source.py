@@ -17,9 +17,8 @@ from typing import Final, NamedTuple, Protocol, overload
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import unreadable
 from mcaptrack.location import Location, Url
-from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.recording_files import refuse_non_mcap
-from mcaptrack.log.records import BLOCK, Damaged
+from mcaptrack.log.records import BLOCK, Damaged, crc_of
 
 #: Read-ahead of small reads in bytes: it starts with the minimum and doubles with every sequential read.
 MIN_AHEAD: Final = 4 * 2**10

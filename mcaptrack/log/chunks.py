@@ -18,8 +18,7 @@ from mcaptrack import environment
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource
-from mcaptrack.log.checksums import crc_of
-from mcaptrack.log.records import Bytes, ChunkHead, Damaged, Record, walk
+from mcaptrack.log.records import Bytes, ChunkHead, Damaged, Record, crc_of, walk
 
 Times = NDArray[np.uint64]
 Entries = NDArray[np.uint64]

@@ -26,12 +26,11 @@ from mcaptrack.files import can_replace, publish_stream
 from mcaptrack.location import Url, is_remote
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
-from mcaptrack.log.checksums import crc_before, crc_of
 from mcaptrack.log.chunks import chunk_record, message_head, open_chunk
 from mcaptrack.log.in_place import rewrite_tail
 from mcaptrack.log.index import Index
 from mcaptrack.log.reader import Log
-from mcaptrack.log.records import BLOCK, MAGIC, Bytes, Damaged, Record, walk
+from mcaptrack.log.records import BLOCK, MAGIC, Bytes, Damaged, Record, crc_before, crc_of, walk
 from mcaptrack.log.remote import publish_object, refuse_replaced
 from mcaptrack.log.writer import LogWriter, Sink, refuse_earlier_results, verify
 from mcaptrack.schema.provenance import Provenance

@@ -24,7 +24,6 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import gather_bytes, group_index, ragged_range, run_starts
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import GAP_BYTES, ByteSource
-from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import (
     MAX_NS,
     Entries,
@@ -37,7 +36,17 @@ from mcaptrack.log.chunks import (
     read_index_entries,
 )
 from mcaptrack.log.index import Index
-from mcaptrack.log.records import BLOCK, CHUNK_HEAD_BYTES, MESSAGE_HEAD, Bytes, Damaged, Record, read_chunk, record_at
+from mcaptrack.log.records import (
+    BLOCK,
+    CHUNK_HEAD_BYTES,
+    MESSAGE_HEAD,
+    Bytes,
+    Damaged,
+    Record,
+    crc_of,
+    read_chunk,
+    record_at,
+)
 from mcaptrack.schema import Rows, Schema
 from mcaptrack.schema.encodings import RowReader
 

@@ -26,12 +26,21 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.location import Location
 from mcaptrack.log import records
 from mcaptrack.log.byte_source import ByteSource, RunningChecksum
-from mcaptrack.log.check import content_to_recover, open_bytes
-from mcaptrack.log.check_summary import record_name
-from mcaptrack.log.checksums import attachment_is_whole, crc_of
+from mcaptrack.log.check import content_to_recover, open_bytes, record_name
 from mcaptrack.log.chunks import Entries, contents_of, message_head, open_chunk, scan_entries
 from mcaptrack.log.index import Index, read_intact_summary, starts_with_magic, summary_start
-from mcaptrack.log.records import BLOCK, DATA_OPCODES, MAGIC, Bytes, Damaged, Reader, Record, walk
+from mcaptrack.log.records import (
+    BLOCK,
+    DATA_OPCODES,
+    MAGIC,
+    Bytes,
+    Damaged,
+    Reader,
+    Record,
+    attachment_is_whole,
+    crc_of,
+    walk,
+)
 from mcaptrack.log.writer import LogWriter, create
 
 Progress = Callable[[str, int, int], None]

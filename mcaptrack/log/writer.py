@@ -30,11 +30,10 @@ from mcaptrack.geometry.arrays import Ints
 from mcaptrack.geometry.ragged import gather_bytes
 from mcaptrack.log import journal, records
 from mcaptrack.log.byte_source import ByteSource, OpenFile
-from mcaptrack.log.checksums import crc_of
 from mcaptrack.log.chunks import HEAD, LOG_MAX_NS, MessageHeads
 from mcaptrack.log.index import ChunkList, Index, SummaryEntry, attachment_entry, metadata_entry, read_index
 from mcaptrack.log.recording_files import RESULTS_SUFFIX, results_path
-from mcaptrack.log.records import MAGIC, Damaged
+from mcaptrack.log.records import MAGIC, Damaged, crc_of
 
 #: The library name in the header record, before the version.
 LIBRARY: Final = "mcaptrack"

@@ -1,8 +1,4 @@
 from mcaptrack.pipeline.checks import Job as Job
-from mcaptrack.pipeline.drawing import RobotPath as RobotPath
-from mcaptrack.pipeline.drawing import find_views as find_views
-from mcaptrack.pipeline.drawing import robot_path as robot_path
-from mcaptrack.pipeline.drawing import views_from_above as views_from_above
 from mcaptrack.pipeline.events import Watch as Watch
 from mcaptrack.pipeline.following import Before as Before
 from mcaptrack.pipeline.following import Continued as Continued
@@ -22,6 +18,10 @@ from mcaptrack.pipeline.staleness import read_planes as read_planes
 from mcaptrack.pipeline.staleness import warn_clock_jumps as warn_clock_jumps
 from mcaptrack.pipeline.summary import Summary as Summary
 from mcaptrack.pipeline.summary import summarise as summarise
+from mcaptrack.pipeline.views import RobotPath as RobotPath
+from mcaptrack.pipeline.views import find_views as find_views
+from mcaptrack.pipeline.views import robot_path as robot_path
+from mcaptrack.pipeline.views import views_from_above as views_from_above
 from mcaptrack.pipeline.views import with_views as with_views
 from mcaptrack.pipeline.write import LAYOUTS as LAYOUTS
 from mcaptrack.pipeline.write import Made as Made

@@ -11,7 +11,7 @@ import heapq
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from hashlib import sha256
@@ -21,12 +21,12 @@ from typing import Any, Final, NamedTuple
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
+from mcaptrack.geometry.clocks import parse_ns
 from mcaptrack.log.records import Damaged
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.staleness import planes_to_json, read_planes
 from mcaptrack.schema import GROUND_PLANE
 from mcaptrack.schema.names import plain_name
-from mcaptrack.schema.parts import ALL, NO_END, Span, joined, limits_of, part_digest, read_digest, span_of, within
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import CALIBRATIONS_READ
@@ -35,6 +35,51 @@ from mcaptrack.sources.fixed_frame import LATCHED, TRANSFORMS_READ, edges_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
+
+# Parts of channels: digests of a log that was cut out of a longer one name the whole channels, and which part it is.
+#
+# Parts of a channel are told from the whole, and can be joined again. What is up to date stays so, since the digests of
+# all channels get the same limits: DIGEST@START-END, from a time until before another, in ns.
+
+
+#: From a time until before another, in ns.
+_Span = tuple[int, int]
+_NO_END: Final = 2**64
+_ALL: Final = (0, _NO_END)
+
+
+def _span_of(start_ns: str, end_ns: str) -> _Span:
+    """The span with these limits as texts; "" for none."""
+    return parse_ns(start_ns) or 0, parse_ns(end_ns) or _NO_END
+
+
+def _limits_of(span: _Span) -> tuple[str, str]:
+    """The limits of a span as texts; "" for none."""
+    return str(span[0] or ""), "" if span[1] == _NO_END else str(span[1])
+
+
+def _within(span: _Span, other: _Span) -> _Span:
+    """The span that is in both."""
+    return max(span[0], other[0]), min(span[1], other[1])
+
+
+def _joined(spans: Iterable[_Span]) -> _Span:
+    """The span from the first start to the last end."""
+    starts, ends = zip(*spans, strict=True)
+    return min(starts), max(ends)
+
+
+def _read_digest(digest: str) -> tuple[str, _Span]:
+    """The digest of a whole channel, and which part of it a digest names."""
+    whole, _, limits = digest.partition("@")
+    start_ns, _, end_ns = limits.partition("-")
+    return whole, _span_of(start_ns, end_ns)
+
+
+def _part_digest(whole: str, span: _Span) -> str:
+    """The digest of a part of a channel; "" if that of the whole isn't known."""
+    return f"{whole}@{'-'.join(_limits_of(span))}" if whole and span != _ALL else whole
+
 
 Progress = Callable[[str, int, int], None]
 
@@ -85,7 +130,7 @@ def cut(
 
     Raises McaptrackError if a log can't be read, or changes meanwhile.
     """
-    work = _Cut(logs, topics, (span[0] or 0, NO_END if span[1] is None else span[1]))
+    work = _Cut(logs, topics, (span[0] or 0, _NO_END if span[1] is None else span[1]))
     is_same = len({log.header(opened)[0] for opened in logs}) == 1
     with log.create(output, header=bytes(logs[0].snapshot.record(len(log.MAGIC))) if is_same else None) as writer:
         return work.write(writer, progress)
@@ -94,17 +139,19 @@ def cut(
 class _Cut:
     """The channels of the new log, each with those that it is made of."""
 
-    def __init__(self, logs: Sequence[log.Log], topics: Collection[str], span: Span) -> None:
+    def __init__(self, logs: Sequence[log.Log], topics: Collection[str], span: _Span) -> None:
         self._logs, self._span, self._lost = logs, span, list[str]()
         self._held_ns = 0  # the time at which messages from before the start are written
         #: The part that is taken of each log, without limits that leave nothing out; and the part of a longer log that
         #: it is already.
-        self._taken, self._earlier = list[Span](), list[Span]()
+        self._taken, self._earlier = list[_Span](), list[_Span]()
         for opened in logs:
             start_ns, end_ns = span
-            self._taken.append((start_ns * (start_ns > opened.start_ns), end_ns if end_ns <= opened.end_ns else NO_END))
+            self._taken.append(
+                (start_ns * (start_ns > opened.start_ns), end_ns if end_ns <= opened.end_ns else _NO_END)
+            )
             cut = opened.metadata(CUT) or {}
-            self._earlier.append(span_of(*(cut.get(name, "") for name in _NAMES)))
+            self._earlier.append(_span_of(*(cut.get(name, "") for name in _NAMES)))
         topics = {*topics} - _conflicts(logs, topics)
         self._channels: dict[tuple[Any, ...], list[_Member]] = {}
         for number, opened in enumerate(logs):
@@ -132,7 +179,7 @@ class _Cut:
             for record in log.private_records(part):
                 writer.write(record)
             log.copy_attachments_and_metadata(part, writer, without=[CUT], copied=copied)
-        limits = limits_of(joined(map(within, self._earlier, self._taken)))
+        limits = _limits_of(_joined(map(_within, self._earlier, self._taken)))
         if any(limits):
             writer.add_metadata(CUT, {name: text for name, text in zip(_NAMES, limits, strict=True) if text})
         for _, new, message in sorted(earlier, key=lambda held: held[2].t_ns):
@@ -157,7 +204,7 @@ class _Cut:
             earlier += ((topic, new, message) for message in before)
             spans = []
             for member, own_start in zip(members, self._own_starts(members), strict=True):
-                if own_start < NO_END:  # else another log has all of it
+                if own_start < _NO_END:  # else another log has all of it
                     parts[member.part].ids[member.channel.id] = new
                     parts[member.part].since_ns[member.channel.id] = max(start_ns, own_start)
                     opened = self._logs[member.number]
@@ -170,14 +217,14 @@ class _Cut:
 
     def _own_starts(self, members: Sequence[_Member]) -> list[int]:
         """From when on the messages of each log count: what logs have that are parts of one is taken once."""
-        digests = [read_digest(it.origin.digest or it.origin.input_digest if it.origin else "") for it in members]
+        digests = [_read_digest(it.origin.digest or it.origin.input_digest if it.origin else "") for it in members]
         if digests[0][0] and len({whole for whole, _ in digests}) == 1:
             starts, until = [0] * len(members), 0
             for place in sorted(range(len(members)), key=lambda place: digests[place][1]):
                 starts[place], until = until, max(until, digests[place][1][1])
             return starts
         spans = [self._earlier[member.number] for member in members]
-        cuts = [span for span in spans if span != ALL]  # another one has what was kept from before the start
+        cuts = [span for span in spans if span != _ALL]  # another one has what was kept from before the start
         return [start * any(cut[0] < start <= cut[1] for cut in cuts) for start, _ in spans]
 
     def _metadata(self, members: Sequence[_Member]) -> Mapping[str, str]:
@@ -203,11 +250,11 @@ class _Cut:
 
     def _digest(self, members: Sequence[_Member], digests: Sequence[str]) -> str:
         """The digest of what is left of a channel that these logs have with these digests."""
-        wholes, spans = zip(*map(read_digest, digests), strict=True)
-        left = [within(span, self._taken[member.number]) for span, member in zip(spans, members, strict=True)]
+        wholes, spans = zip(*map(_read_digest, digests), strict=True)
+        left = [_within(span, self._taken[member.number]) for span, member in zip(spans, members, strict=True)]
         if len({*wholes}) == 1:
-            return part_digest(wholes[0], joined(left))
-        return sha256("".join(map(part_digest, wholes, left)).encode()).hexdigest()
+            return _part_digest(wholes[0], _joined(left))
+        return sha256("".join(map(_part_digest, wholes, left)).encode()).hexdigest()
 
     def _planes(self, members: Sequence[_Member], origins: Sequence[Provenance]) -> list[Any]:
         """The ground planes that a channel should name, if those that it names are those of its logs."""
@@ -280,7 +327,7 @@ def _conflicts(logs: Sequence[log.Log], topics: Collection[str]) -> set[str]:
             if (how := provenance_of(opened, topic)) and how.transform != INGEST:
                 origins.setdefault(topic, []).append(how)
     out: set[str] = set()
-    more = {topic for topic, those in origins.items() if len({read_digest(how.digest)[0] for how in those}) > 1}
+    more = {topic for topic, those in origins.items() if len({_read_digest(how.digest)[0] for how in those}) > 1}
     while not more <= out:
         out |= more
         more = {topic for topic, those in origins.items() if any(not out.isdisjoint(how.made_from()) for how in those)}

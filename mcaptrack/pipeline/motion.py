@@ -15,7 +15,7 @@ from mcaptrack.pipeline.checks import Job, fits, read_frames
 from mcaptrack.pipeline.staleness import OFF
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, VIDEO, Frame
-from mcaptrack.schema.camera_motion import frames_to_path
+from mcaptrack.schema.as_rows import frames_to_path
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.camera_motion import motion_topic, path_of, read_ground_truth
 from mcaptrack.sources.cameras import camera_at, provenance_of

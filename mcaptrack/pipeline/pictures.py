@@ -22,7 +22,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.colour_histograms import LENGTH, at_border, describe, is_clear
 from mcaptrack.notices import warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import TRACKS, Frame
@@ -35,7 +34,7 @@ from mcaptrack.sources.pictures import Pictures
 from mcaptrack.sources.video import EncodedPicture, decode_bgr, decode_gray
 from mcaptrack.transforms import Transform
 from mcaptrack.transforms.protocol import latency_of, traits_of
-from mcaptrack.transforms.retrack.appearance import Descriptors
+from mcaptrack.transforms.retrack.appearance import LENGTH, Descriptors, at_border, describe, is_clear
 
 MAX_BYTES: Final = 500_000_000
 

@@ -31,9 +31,9 @@ from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.staleness import digest_of, planes_to_json
 from mcaptrack.pipeline.write import Made, RunState
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS, TRACKS, Frame, Rows, Schema
+from mcaptrack.schema.as_rows import plane_to_rows
 from mcaptrack.schema.classes import PERSON, UNKNOWN, is_person
 from mcaptrack.schema.framing import JoinedFrames, filtered_rows, has_any, join_frames, joined_parts, thinned
-from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.calibrations import holds_calibrations, see_ground

@@ -31,7 +31,7 @@ from mcaptrack.pipeline.scores import DOUBTFUL, score_map, score_range, without_
 from mcaptrack.pipeline.staleness import digest_of, takes_corrections
 from mcaptrack.pipeline.write import RunState
 from mcaptrack.schema import DECISIONS, TRACKS, VIDEO, Frame, Rows, Schema
-from mcaptrack.schema.camera_motion import to_pictures, to_scene
+from mcaptrack.schema.as_rows import to_pictures, to_scene
 from mcaptrack.schema.classes import majority
 from mcaptrack.schema.frame_columns import collect
 from mcaptrack.schema.framing import JoinedFrames, frame_times, join_frames, joined_parts, mapped_rows, row_ends

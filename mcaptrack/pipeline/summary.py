@@ -18,7 +18,7 @@ from mcaptrack.notices import warn
 from mcaptrack.pipeline.planes import fit_of
 from mcaptrack.pipeline.staleness import read_planes
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, PREDICTIONS, TRACKS, Frame, Schema
-from mcaptrack.schema.camera_motion import rows_to_verdict
+from mcaptrack.schema.as_rows import rows_to_verdict
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.frame_columns import FrameColumns
 from mcaptrack.schema.framing import has_any, joined_parts, row_ends, unique_values

@@ -3,7 +3,11 @@
 Predictors are found by name (see ``mcaptrack.registry``). An entry is a class or a function; it is called with
 ``steps``, ``step_s`` and its own parameters, and returns a ``forecast.Predictor``. If it has a parameter ``file``, the
 name ``NAME:FILE`` gives it. A predictor with other steps than requested, such as a network, is resampled
-(``OnClock``). To add a built-in predictor: a function in ``built_in``, and a line in ``registry.BUILT_IN``.
+(``OnClock``), and one of another package is checked (``CheckedPredictor``): whatever it does wrong becomes one line
+that names it. To add a built-in predictor: a module with its class and such a function, and a line in
+``registry.BUILT_IN``.
+
+Letters: B batch, L past positions, T future steps.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -21,7 +25,6 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import missing
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.notices import warn
-from mcaptrack.predictors.checked import CheckedPredictor
 from mcaptrack.predictors.forecast import (
     AnyPredictor,
     Forecast,
@@ -32,7 +35,8 @@ from mcaptrack.predictors.forecast import (
     predict_together,
     uses_people,
 )
-from mcaptrack.registry import Entry, find, own, split_file
+from mcaptrack.registry import Entry, blamed, failure, find, own, split_file
+from mcaptrack.registry.guard import Guard
 
 __all__ = [
     "NAMES",
@@ -58,11 +62,6 @@ PredictorName = str
 NAMES: Final = ("blend", "cv", "holt-cv", "kalman", "lstm", "red", "social")
 #: Those that are less exact than ``cv`` on most recordings (docs/predictors.md).
 WEAK: Final = ("lstm",)
-
-
-# A predictor with steps of its own, resampled to another clock.
-#
-# Letters: B batch, L past positions, T future steps.
 
 
 @dataclass(frozen=True)
@@ -130,6 +129,93 @@ class OnClock:
         at_times = (1 - share[:, None]) * mean[:, low] + share[:, None] * mean[:, low + 1]
         spread = (1 - within) * cov[:, low] + within * cov[:, low + 1]
         return Forecast(at_times, spread * (np.maximum(at / last, 1.0) ** 2)[:, None, None])
+
+
+_WRONG = (TypeError, ValueError, OverflowError)
+#: More steps than anything predicts or looks at; arrays of more do not fit into memory.
+_MOST_STEPS: Final = 10_000
+#: Beyond the square of any distance on Earth; distances and likelihoods of larger numbers overflow.
+_LARGEST: Final = 1e15
+
+
+@dataclass(frozen=True)
+class CheckedPredictor:
+    """``inner``, a predictor of another package, which the registry found as ``entry``."""
+
+    entry: Entry
+    inner: Any
+    steps: int
+    step_s: float
+    past: int
+    guard: Guard
+
+    @classmethod
+    def of(cls, entry: Entry, parameters: Mapping[str, Any]) -> Self:
+        """Make the predictor. Raises McaptrackError if that fails, or if what comes of it is no predictor."""
+        guard = Guard(str(entry))
+        with blamed(entry, f"could not be made with {', '.join(parameters)}", guard):
+            inner = entry.cls(**parameters)
+        if not callable(getattr(inner, "predict", None)):
+            raise McaptrackError(f"{entry} has no method predict, so it is no predictor")
+        try:
+            steps, step_s, past = int(inner.steps), float(inner.step_s), int(inner.past)
+        except (AttributeError, *_WRONG) as error:
+            raise failure(entry, "needs the numbers steps, step_s and past", error) from error
+        if not (0 < steps <= _MOST_STEPS and 0 < past <= _MOST_STEPS and 0 < step_s < np.inf):
+            raise McaptrackError(
+                f"{entry} has steps={steps}, step_s={step_s:g}, past={past}; all have to be above 0, steps and past at "
+                f"most {_MOST_STEPS}"
+            )
+        return cls(entry, inner, steps, step_s, past, guard)
+
+    @property
+    def name(self) -> str:
+        return self.entry.name
+
+    @property
+    def weights_sha256(self) -> str | None:
+        with blamed(self.entry, "could not say its weights_sha256", self.guard):
+            digest = getattr(self.inner, "weights_sha256", None)
+            return None if digest is None else str(digest)
+
+    @property
+    def uses_people(self) -> bool:
+        with blamed(self.entry, "could not say whether it uses_people", self.guard):
+            return uses_people(self.inner)
+
+    def predict(self, xy_m: Floats, valid: Bools, people: PeopleSeen | None = None) -> Forecast:
+        """Positions (B, L', 2) of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        batch = len(valid)
+        if batch == 0:
+            return Forecast(np.empty((0, self.steps, 2)), np.empty((0, self.steps, 2, 2)))
+        with blamed(self.entry, f"failed on {batch} {'track' if batch == 1 else 'tracks'}", self.guard):
+            among = {} if people is None else {"people": people.copied()}
+            forecast = self.inner.predict(xy_m.copy(), valid.copy(), **among)
+        if not isinstance(forecast, tuple | list) or len(forecast) != 2:
+            raise McaptrackError(
+                f"{self.entry} gave a {type(forecast).__name__}; predict has to return mean and covariance"
+            )
+        mean, cov = (self._numbers(part) for part in forecast)
+        wanted = (batch, self.steps, 2), (batch, self.steps, 2, 2)
+        if (mean.shape, cov.shape) != wanted:
+            raise McaptrackError(
+                f"{self.entry} gave mean and covariance of shape {mean.shape} and {cov.shape}; they have to be "
+                f"{wanted[0]} and {wanted[1]}"
+            )
+        if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
+            raise McaptrackError(f"{self.entry} gave numbers that are not finite")
+        if max(np.abs(mean).max(), np.abs(cov).max()) > _LARGEST:
+            raise McaptrackError(f"{self.entry} gave numbers beyond {_LARGEST:g} (metres, and their squares)")
+        if not are_covariances(cov):
+            raise McaptrackError(f"{self.entry} gave covariances that are not symmetric with variances above 0")
+        return Forecast(mean, cov)
+
+    def _numbers(self, values: Any) -> Floats:
+        with blamed(self.entry, "gave what can't be read as numbers", self.guard):
+            array = np.asarray(values)
+            if array.dtype.kind not in "fiu":
+                raise TypeError(f"an array of {array.dtype}")
+            return array.astype(np.float64)
 
 
 def make(name: PredictorName, steps: int, step_s: float, **parameters: Any) -> Predictor:

@@ -190,3 +190,18 @@ class LinearPredictor:
         count = 2 * (valid.sum(axis=1) - 1)  # along both axes, of positions that are not interpolated
         scale = (PRIOR_COUNT + (innovations**2).sum(axis=(1, 2))) / (PRIOR_COUNT + count)
         return np.where(counts > 1, TAIL_FACTOR * np.clip(scale, MIN_SCALE, MAX_SCALE), 1.0)
+
+
+def cv(steps: int, step_s: float) -> LinearPredictor:
+    """Constant velocity."""
+    return LinearPredictor("cv", steps, step_s)
+
+
+def holt_cv(steps: int, step_s: float) -> LinearPredictor:
+    """Constant velocity after Holt's double exponential smoothing."""
+    return LinearPredictor("holt-cv", steps, step_s)
+
+
+def kalman(steps: int, step_s: float) -> LinearPredictor:
+    """A Kalman filter with a constant-velocity model."""
+    return LinearPredictor("kalman", steps, step_s)

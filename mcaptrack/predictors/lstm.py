@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar, Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_gaps, last_positions
 from mcaptrack.predictors.forecast import Forecast
 from mcaptrack.predictors.linear import LinearPredictor
-from mcaptrack.predictors.weights import Network
+from mcaptrack.predictors.weights import SHIPPED, Network, load
 
 PAST: Final = 4
 
@@ -102,3 +103,8 @@ def _cell(gates: Floats, memory: Floats) -> tuple[Floats, Floats]:
     enter, keep, _, leave = gates
     memory = keep * memory + enter * new
     return leave * np.tanh(memory), memory
+
+
+def lstm(steps: int, step_s: float, file: Path | None = None) -> Lstm:
+    """An LSTM encoder and decoder, with the weights of a file or those that come with mcaptrack."""
+    return Lstm.of(load(file or SHIPPED / "lstm.safetensors"))

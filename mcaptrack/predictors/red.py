@@ -4,6 +4,7 @@ The network corrects a linear forecast. Its input is up to eight past positions,
 in a frame of reference with the direction of the linear forecast as first axis. Its output is, for each future step, a
 correction, a width of the error, the ratio along / across, and a correlation. All that depends on the direction fades
 with the speed, so that people who stand have circular ellipses and forecasts rotate with their inputs.
+``blend`` is the mean of that and of constant velocity: it is better than either where one of them is off.
 
 Letters: B batch, L past positions (8), K pairs of them (4), T future steps, H hidden numbers.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -19,7 +21,8 @@ import numpy as np
 from mcaptrack.geometry.arrays import Bools, Floats
 from mcaptrack.geometry.histories import fill_gaps, last_positions
 from mcaptrack.predictors.forecast import Forecast
-from mcaptrack.predictors.weights import Network
+from mcaptrack.predictors.linear import LinearPredictor
+from mcaptrack.predictors.weights import SHIPPED, Network, load
 
 #: Number of past positions, and how many of them form one input of the recurrent unit.
 PAST: Final = 8
@@ -172,3 +175,38 @@ class Red(Network):
         turned[:, 2, 0], turned[:, 2, 3] = -2 * both, 2 * both
         turned[:, 2, 1] = turned[:, 2, 2] = cos * cos - sin * sin
         return Forecast(mean, (parts @ turned).reshape(*mean.shape, 2))
+
+
+@dataclass(frozen=True)
+class Blend(Red):
+    """The mean of what ``red`` and constant velocity predict, with the covariance of ``red``.
+
+    ``red`` is better where positions are noisy, constant velocity where people walk straight on; their mean is no worse
+    than constant velocity in either (docs/predictors.md has the figures).
+
+    References
+    ----------
+    J. M. Bates and C. W. J. Granger, "The combination of forecasts", Operational Research Quarterly, 1969.
+    """
+
+    name: ClassVar[str] = "blend"
+    network: ClassVar[str] = Red.name
+
+    @cached_property
+    def _constant_velocity(self) -> LinearPredictor:
+        return LinearPredictor("cv", self.steps, self.step_s)
+
+    def predict(self, xy_m: Floats, valid: Bools) -> Forecast:
+        """Positions (B, L', 2), of which ``valid`` (B, L') are known, the last one always -> forecasts."""
+        network, straight = super().predict(xy_m, valid), self._constant_velocity.predict(xy_m, valid)
+        return network._replace(mean=(network.mean + straight.mean) / 2)
+
+
+def red(steps: int, step_s: float, file: Path | None = None) -> Red:
+    """A recurrent encoder with a dense head, with the weights of a file or those that come with mcaptrack."""
+    return Red.of(load(file or SHIPPED / "red.safetensors"))
+
+
+def blend(steps: int, step_s: float, file: Path | None = None) -> Blend:
+    """The mean of ``red`` and ``cv``, with the weights of a file or those that come with mcaptrack."""
+    return Blend.of(load(file or SHIPPED / "red.safetensors"))

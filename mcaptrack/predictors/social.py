@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from mcaptrack.geometry.histories import last_positions
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.predictors.forecast import Forecast, PeopleSeen
 from mcaptrack.predictors.red import PAST, Red, prepare
-from mcaptrack.predictors.weights import Network, Weights
+from mcaptrack.predictors.weights import SHIPPED, Network, Weights, load
 
 #: Only so many people are looked at, the nearest, and only within this distance (m).
 MOST_PEOPLE: Final = 16
@@ -239,3 +240,8 @@ def _summed(values: Floats, track: Ints, count: int) -> Floats:
     if len(starts):
         out[track[starts]] = np.add.reduceat(values, starts, axis=0)
     return out
+
+
+def social(steps: int, step_s: float, file: Path | None = None) -> Social:
+    """``red`` corrected by what other people do, with the weights of a file or those that come with mcaptrack."""
+    return Social.of(load(file or SHIPPED / "social.safetensors"))

@@ -11,7 +11,7 @@ Letters: N forecasts, T future steps, L past positions, M comparisons, R fits, B
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
-from mcaptrack.geometry.mixtures import Tails, half_radius, mahalanobis_squared, squared_radius
+from mcaptrack.geometry.mixtures import Tails, half_radius, mahalanobis_squared, normal_tails, squared_radius
 from mcaptrack.notices import warn
 from mcaptrack.predictors.forecast import Forecast, Predictor
 from mcaptrack.predictors.position_noise import PAST, PositionNoise, running
@@ -123,6 +123,10 @@ _LEAST_MEASURED: Final = 0.1
 LEAST_WIDE, MOST_WIDE = 0.02, 0.6
 
 
+#: A column of a table.
+Numbers = Sequence[float] | Floats
+
+
 class TailTable(NamedTuple):
     """The calibration of a predictor, by the time ahead: ``ahead_s`` (K,), and with as many elements:
 
@@ -139,10 +143,13 @@ class TailTable(NamedTuple):
 
     def at(self, ahead_s: Floats) -> TailTable:
         """The table at other times, interpolated; beyond its ends as at the ends."""
-        weight = np.interp(ahead_s, self.ahead_s, self.wide_weight)
-        parts = (self.narrow_scale, self.wide_scale, self.short, self.coasting)
-        scales = [np.exp(np.interp(ahead_s, self.ahead_s, np.log(part))) for part in parts]
-        return TailTable(ahead_s, weight, *scales)
+        return TailTable(ahead_s, *_interpolated(ahead_s, *self))
+
+
+def _interpolated(ahead_s: Floats, table_s: Numbers, weight: Numbers, *scales: Numbers) -> tuple[Floats, ...]:
+    """A weight and scales of a table, by its times ahead, at others; beyond its ends as at the ends."""
+    logs = (np.interp(ahead_s, table_s, np.log(scale)) for scale in scales)
+    return np.interp(ahead_s, table_s, weight), *map(np.exp, logs)
 
 
 @lru_cache(maxsize=2)
@@ -452,3 +459,67 @@ class TailCalibration:
         if count:
             self._fitted, self._tails = self._fitted[count:].copy(), self._tails[count:].copy()
             self._dropped += count
+
+
+# Vehicles that a tracker follows in metres.
+#
+# Predictors know how people move; vehicles keep their velocity better than people do, until they brake or turn: their
+# errors are small or large. So the distribution of a forecast is a mixture of a narrow and a wide normal
+# distribution, by predictor, class, time ahead, and whether the vehicle stands or moves. The tables were fitted on
+# drawn traffic (``tools/fit_vehicle_tails.py``), and on no recording.
+
+
+VEHICLE_TABLES: Final = Path(__file__).parent / "trained" / "vehicle_tails.json"
+#: The table of each class of vehicles, by its name among the limits of motion.
+TABLE_OF_CLASS: Final[Mapping[str, str]] = {
+    "bicycle": "bicycle", "motorcycle": "bicycle", "car": "car",
+    "bus": "truck", "truck": "truck", "trailer": "truck", "train": "truck",
+}  # fmt: skip
+#: Vehicles that are slower than so many m/s stand.
+STANDING_M_PER_S: Final = 0.5
+
+
+def calibrated_vehicles(
+    predictor: str, forecast: Forecast, step_s: float, names: Sequence[str], speed_m_per_s: Floats
+) -> tuple[Forecast, Tails | None]:
+    """Forecasts of which those of vehicles are mixtures.
+
+    Parameters
+    ----------
+    predictor : str
+        Name of the predictor. Only built-in ones have tables.
+    forecast : Forecast
+        N forecasts of T steps of ``step_s`` seconds, in metres.
+    names : sequence of N str
+        The class of each, as among the limits of motion; those of others stay as they are.
+    speed_m_per_s : (N,) of float
+        NaN where it isn't known; these forecasts stay as they are, too.
+
+    Returns
+    -------
+    Forecast, Tails
+        With the covariances of the mixtures, and their shapes (N, T), NaN for normal distributions; None if there is no
+        table.
+    """
+    tables = tables_in(VEHICLE_TABLES).get(predictor)
+    if tables is None:
+        return forecast, None
+    count, steps = forecast.mean.shape[:2]
+    ahead_s = step_s * np.arange(1.0, steps + 1)
+    cov, out = forecast.cov.copy(), normal_tails((count, steps))
+    kinds = np.array([TABLE_OF_CLASS.get(name, "") for name in names])
+    for kind in set(kinds.tolist()) - {""}:
+        for state, is_in in (
+            ("standing", speed_m_per_s < STANDING_M_PER_S),
+            ("moving", speed_m_per_s >= STANDING_M_PER_S),
+        ):
+            here = (kinds == kind) & is_in
+            if here.any():
+                table = tables[kind][state]
+                columns = (table[name] for name in ("ahead_s", "wide_weight", "narrow_scale", "wide_scale"))
+                weight, narrow, wide = _interpolated(ahead_s, *columns)
+                whole = (1 - weight) * narrow + weight * wide
+                cov[here] *= whole[:, None, None]
+                for part, values in zip(out, (weight, narrow / whole, wide / whole), strict=True):
+                    part[here] = values
+    return Forecast(forecast.mean, cov), out

@@ -60,7 +60,8 @@ class Provenance:
     ``columns`` are those of a schema of a user's own (see ``schema.own``). ``scores`` say what scores of its input were
     taken for where these are no likelihoods: by the name of a class, SCORE:LIKELIHOOD of points with straight lines
     between them. ``boxes`` say how boxes of other software in its input were read: their clock, classes, scale and
-    fields, and what a user chose. In a log that was cut out of a longer one, digests name parts (see ``parts``).
+    fields, and what a user chose. In a log that was cut out of a longer one, digests name parts (see
+    ``pipeline.cutting``).
 
     ``parameters`` are those of the transform, and ``weights_sha256`` is the digest of the weights of its network, ""
     without one. ``version`` is that of mcaptrack.

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.boxes import wrapped
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_ends, run_starts
 from mcaptrack.schema import TRACKS, Frame, Rows, framing

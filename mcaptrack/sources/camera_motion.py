@@ -9,15 +9,13 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.angles import headings
-from mcaptrack.geometry.boxes import columns_to_boxes
+from mcaptrack.geometry.boxes import columns_to_boxes, headings
 from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.plane import GroundPlane, Planes, scene_planes
 from mcaptrack.geometry.transform_tree import plain_frame, turned
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame
-from mcaptrack.schema.camera_motion import frames_to_path
+from mcaptrack.schema.as_rows import frames_to_path, rows_to_plane
 from mcaptrack.schema.framing import join_frames, split_rows
-from mcaptrack.schema.ground_plane import rows_to_plane
 from mcaptrack.schema.provenance import Provenance, frame_id_of
 from mcaptrack.sources.cameras import camera_at, lineage, provenance_of
 from mcaptrack.sources.fixed_frame import poses_at

@@ -18,10 +18,9 @@ import numpy as np
 
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names, offer
-from mcaptrack.geometry.angles import headings
 from mcaptrack.geometry.arrays import Bools, Floats, Ints, joined, taken
+from mcaptrack.geometry.boxes import ORIENTED_COLUMNS, headings
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.geometry.oriented_boxes import COLUMNS
 from mcaptrack.geometry.transform_tree import (
     OTHER_CLOCK_S,
     Poses,
@@ -846,6 +845,6 @@ def rows_of_boxes(boxes: Recorded3d, rotation: Floats, shift: Floats, where: str
         warn(f"{where}: {lying:,} {text}")
     centre[~has_z, 2], heading[~boxes.has_heading] = np.nan, np.nan
     size = [boxes.size[here, axis] for axis in (along, across, up)]
-    columns = dict(zip(COLUMNS, [*centre.T, *size, heading], strict=True))
+    columns = dict(zip(ORIENTED_COLUMNS, [*centre.T, *size, heading], strict=True))
     columns |= {"vx_m_per_s": velocity[:, 0], "vy_m_per_s": velocity[:, 1]}
     return DETECTIONS.rows(score=boxes.score, class_id=boxes.class_id, source_id=boxes.source_id, **columns)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import Schema
-from mcaptrack.sources.own_schemas import ColumnOfUser, facts_of
+from mcaptrack.sources.own_rows import ColumnOfUser, facts_of
 from mcaptrack.tables.fields import RECORDING, TABLES, Table, of_rows
 
 #: Whole numbers up to this are exact as float64.

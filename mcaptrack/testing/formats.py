@@ -20,7 +20,7 @@ from mcaptrack import log as logs
 from mcaptrack.api.exporting import exporter_for, write_by
 from mcaptrack.api.options import PathLike
 from mcaptrack.api.reading import LogReader
-from mcaptrack.api.recording import open as open_log
+from mcaptrack.api.reading import open as open_log
 from mcaptrack.choices import Role
 from mcaptrack.contracts import (
     Exporter,

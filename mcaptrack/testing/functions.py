@@ -33,8 +33,7 @@ from mcaptrack.registry import Entry, Kind, blamed, of_type
 from mcaptrack.schema.provenance import FUSE
 from mcaptrack.sources.cameras import cameras, detections_topic, provenance_of, scenes_of
 from mcaptrack.testing.transforms import LawError, law, present, same_process
-from mcaptrack.viewing.formatting import plain
-from mcaptrack.viewing.sections import section_of
+from mcaptrack.viewing.formatting import plain, section_of
 
 #: What a command may return, beside nothing and dataclasses.
 _PRINTED: Final = (str, int, float, dict, list, tuple, np.ndarray, np.generic)

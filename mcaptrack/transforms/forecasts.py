@@ -17,12 +17,11 @@ from mcaptrack.geometry.ragged import run_starts
 from mcaptrack.predictors import Forecast, PeopleSeen, Predictor, make, predict_among, predict_together, uses_people
 from mcaptrack.predictors.linear import LinearPredictor
 from mcaptrack.predictors.position_noise import PAST
-from mcaptrack.predictors.tail_calibration import TailCalibration
-from mcaptrack.predictors.vehicle_tails import calibrated
+from mcaptrack.predictors.tail_calibration import TailCalibration, calibrated_vehicles
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
+from mcaptrack.schema.as_rows import forecast_to_rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
 from mcaptrack.schema.framing import JoinedFrames, join_frames, spans_of
-from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.motion_limits import ClassNames, limits_by_class, units_m
 
 #: The help of the option by which ellipses follow the log.
@@ -205,7 +204,7 @@ class Forecaster:
         stay = forecasts.is_vehicle * _standing(past, forecasts.unit_m, step_s)
         forecast = _with_rest(forecasts.forecast, past[:, -1], stay, forecasts.noise_m, forecasts.unit_m, step_s)
         speed = np.hypot(*(rows[name].astype(float) for name in ("vx_m_per_s", "vy_m_per_s")))
-        return calibrated(self._name, forecast, step_s, forecasts.kinds.tolist(), speed)
+        return calibrated_vehicles(self._name, forecast, step_s, forecasts.kinds.tolist(), speed)
 
     def _people(self, rows: Rows, past: Floats, is_known: Bools, ready: Bools) -> PeopleSeen:
         """The people who are observed in a frame, for the tracks of it that are ``ready`` (N,).

@@ -13,12 +13,11 @@ from typing import ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 
-from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
 from mcaptrack.geometry.assignment import max_weight_matching
+from mcaptrack.geometry.boxes import bev_iou_of_pairs, wrapped
 from mcaptrack.geometry.clocks import JUMP_S, NS_PER_S
 from mcaptrack.geometry.neighbours import Pairing
-from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.notices import warn
 from mcaptrack.schema import COVARIANCE_M2, DETECTIONS, TRACKS, Frame, Rows, Schema

@@ -12,7 +12,7 @@ from mcaptrack.geometry.camera_path import MotionEstimator, SecondMotion, Verdic
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.notices import warn
 from mcaptrack.schema import CAMERA_MOTION, VIDEO, Frame, Schema
-from mcaptrack.schema.camera_motion import pose_to_rows
+from mcaptrack.schema.as_rows import pose_to_rows
 from mcaptrack.transforms.protocol import context, option, parameters
 
 #: Warn from this share of lost pictures on.

@@ -46,8 +46,8 @@ from typing import (
     get_type_hints,
 )
 
+from mcaptrack.choices import limits
 from mcaptrack.errors import McaptrackError
-from mcaptrack.ranges import limits
 from mcaptrack.registry import KINDS, Kind
 from mcaptrack.schema import Frame, Schema
 

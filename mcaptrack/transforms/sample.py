@@ -15,9 +15,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.geometry.clocks import NS_PER_S, RegularClock, seconds_to_ns
 from mcaptrack.geometry.plane import Planes, plane_at
-from mcaptrack.geometry.ticks import RegularClock
 from mcaptrack.notices import warn
 from mcaptrack.schema import TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.frame_columns import FrameCollector

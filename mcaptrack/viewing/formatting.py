@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import math
 from collections.abc import Mapping
 from functools import cache, partial
@@ -14,15 +15,18 @@ import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from mcaptrack import log
+from mcaptrack.contracts import ReportSection
 from mcaptrack.evaluation.metrics.displacement import TAU_M2, Displacement
+from mcaptrack.registry import Entry, blamed, of_type
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.transforms import STAGES
 from mcaptrack.viewing.charts import WIDTH, Axis, Line, line_chart, round_most, thinned, time_ticks
 
 __all__ = [
-    "NONE", "clock", "counted", "number", "percent", "plain", "policy", "render", "short", "tick_marks", "times",
-    "tracker_name",
+    "NONE", "clock", "counted", "number", "percent", "plain", "policy", "render", "section_of", "short",
+    "tick_marks", "times", "tracker_name",
 ]  # fmt: skip
 
 #: Printed in place of a number that is missing.
@@ -223,3 +227,34 @@ def _chart(forecasts: Mapping[str, Displacement], squared: bool, title: str) -> 
     most = round_most(np.quantile(line.y, [0.9]) if len(line.y) else line.y for line in lines)
     unit = "m²" if squared else "m"
     return line_chart(title, lines, Axis("recall: share of people with a forecast", 1.0), Axis(f"ADE, {unit}", most))
+
+
+def section_of(entry: Entry, opened: log.Log, prefix: str, names: Mapping[str, str]) -> ReportSection | None:
+    """Return what the function of a section gives of a camera; None if it has nothing to say.
+
+    Raises McaptrackError, with the entry, if it fails, or gives what can't stand in a page or in its data.
+
+    ``prefix`` is the camera, and ``names`` are those of tracks for people, by their role.
+    """
+    with blamed(entry, "failed"):
+        given = entry.cls(opened, prefix, names)
+    if given is None:
+        return None
+    section = of_type(entry, given, ReportSection, "its function")
+    with blamed(entry, "gave what is no ReportSection"):
+        _check(section)
+    return section
+
+
+def _check(section: ReportSection) -> None:
+    """Raise an error for a section that can't stand in a page, or in its data."""
+    texts = [section.short, section.title, section.note]
+    for caption, columns, groups in section.tables:
+        texts += [caption, *columns]
+        for heading, rows in groups:
+            texts += [heading, *(text for role, name, topic, cells in rows for text in (role, name, topic, *cells))]
+    for figure in section.figures:
+        texts += [figure["title"], figure["caption"], figure["chart"]["kind"]]
+    json.dumps(plain(section.data))
+    if wrong := [text for text in texts if not isinstance(text, str)]:
+        raise TypeError(f"{wrong[0]!r:.40} is no text")

@@ -1,4 +1,4 @@
-"""Cases for ``test_option_effects``: a scene in words, a number read off the output, and what it is for some values.
+"""Cases for ``test_effects``: a scene in words, a number read off the output, and what it is for some values.
 
 The numbers are counted by hand.
 """

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import linear_sum_assignment
 
-from mcaptrack.geometry.oriented_boxes import bev_iou_of_pairs
+from mcaptrack.geometry.boxes import bev_iou_of_pairs
 from mcaptrack.transforms.motion_limits import MotionLimits
 
 FADES_S = 2.0

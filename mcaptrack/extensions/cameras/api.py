@@ -24,7 +24,7 @@ from mcaptrack.api.options import (
 )
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.cameras.feet import FootFuser
-from mcaptrack.extensions.cameras.fusers import FUSION
+from mcaptrack.extensions.cameras.scenes import FUSION
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
 from mcaptrack.transforms import Transform

@@ -39,7 +39,7 @@ from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replac
 from mcaptrack.pipeline.staleness import digest_of
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import GROUND_PLANE, Frame
-from mcaptrack.schema.ground_plane import plane_to_rows
+from mcaptrack.schema.as_rows import plane_to_rows
 from mcaptrack.schema.provenance import REFINE, Provenance, frame_id_of
 from mcaptrack.sources.camera_motion import planes_in
 from mcaptrack.sources.cameras import Camera, camera_at, corrected_plane, given_plane, provenance_of, scenes_of

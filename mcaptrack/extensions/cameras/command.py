@@ -8,9 +8,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 from mcaptrack.cli import common
-from mcaptrack.cli.flags import with_flags
 from mcaptrack.cli.many import EachLog
 from mcaptrack.cli.running import RunsStages
+from mcaptrack.cli.text import with_flags
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.location import Location
 

@@ -15,7 +15,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.extensions.cameras.feet import LEAST_COMPARED, CameraView, FootFuser, Joined, Offset, Shared, compare
-from mcaptrack.extensions.cameras.fusers import FUSION, fuser_of
+from mcaptrack.extensions.cameras.scenes import FUSION, fuser_of
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S

@@ -1,17 +1,66 @@
-"""The scenes of runs: cameras with measured ground planes are fused."""
+"""Fusers, transforms from the boxes of several cameras to the detections of one scene, and how they are found; and the
+scenes of runs: cameras with measured ground planes are fused.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Final
 
 from mcaptrack import log
+from mcaptrack.api.declared import Option, declared
+from mcaptrack.api.options import chooser
 from mcaptrack.api.running import transform_of
-from mcaptrack.extensions.cameras.fusers import FUSION, fuser_of
+from mcaptrack.errors import McaptrackError
+from mcaptrack.pipeline.rebuild import rebuild
 from mcaptrack.pipeline.scenes import Member, Progress, Say, SceneMaker
 from mcaptrack.pipeline.write import Made, RunState
+from mcaptrack.registry import Entry
+from mcaptrack.schema import DETECTIONS, SIGHTINGS
 from mcaptrack.schema.provenance import Provenance
 from mcaptrack.sources.cameras import detections_topic
 from mcaptrack.transforms import Stage, Transform
+
+#: Entries of the provenance of a scene beside the parameters of its fuser.
+_FINDINGS: Final = ("cameras", "clock_offset_s", "clock_offsets_given", "cameras_given", "detects", "false_share")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fusion(Stage):
+    """Finds fusers, and checks those of other packages, as a stage does with its transforms."""
+
+    def check(self, entry: Entry) -> None:
+        """Raise McaptrackError if a class of another package can't be a fuser, which needs all outputs."""
+        super().check(entry)
+        for suffix in self.writes.keys() - entry.cls.writes.keys():
+            raise McaptrackError(f"{entry} has no output {suffix!r}; a fuser also writes which boxes it joined")
+
+
+FUSION: Final = Fusion(
+    name="fuse",
+    kind="fuser",
+    reads=SIGHTINGS,
+    writes={"": DETECTIONS, "sightings": SIGHTINGS},
+    input_topic="detections/sightings",
+    output_topic="detections",
+    rows="detections",
+)
+
+
+def fuser_of(
+    provenance: Provenance, named_by_user: Transform | None = None
+) -> tuple[Transform | None, McaptrackError | None]:
+    """Return the fuser that made a scene, with the same parameters; or None, and the reason why not.
+
+    ``named_by_user`` is the one that the user names, if any.
+    """
+    parameters = {name: value for name, value in provenance.parameters.items() if name not in _FINDINGS}
+    named: Mapping[str, Transform] = {} if named_by_user is None else {FUSION.name: named_by_user}
+    try:
+        return rebuild(FUSION, replace(provenance, parameters=parameters), named), None
+    except McaptrackError as error:
+        return None, error
 
 
 class FusedScenes(SceneMaker):
@@ -53,3 +102,28 @@ class FusedScenes(SceneMaker):
 
         how = state.provenance(detections_topic(state.prefix))
         return members_of(state, how) if how is not None and FUSION.kind in how.parameters else ()
+
+
+#: The heading in the help of ``run``.
+_SEVERAL: Final = "Several cameras"
+_FUSER: Final = chooser(
+    "fuser", "The {kind}, also where another one was used before", _SEVERAL, shown="as before, or feet"
+)
+
+
+@declared()
+def scenes(
+    *,
+    fuse: Annotated[
+        bool,
+        Option(
+            _SEVERAL,
+            tuning=True,
+            help="Fuse several cameras with measured ground planes to a scene, as `mcaptrack fuse` does.\n\n"
+            "Scenes that were made before are brought up to date.",
+        ),
+    ] = True,
+    fuser: Annotated[str | Transform | None, _FUSER] = None,
+) -> SceneMaker:
+    """Make scenes of the cameras of a run, or none."""
+    return FusedScenes(fuse, fuser)

@@ -17,8 +17,7 @@ from uuid import uuid4
 from mcaptrack import __version__
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import Running
-from mcaptrack.fleet.child import Child, WorkerLimits
-from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.fleet.worker import Child, Reply, Request, WorkerLimits
 from mcaptrack.location import Location
 from mcaptrack.notices import warn
 

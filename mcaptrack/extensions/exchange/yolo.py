@@ -1,4 +1,5 @@
-"""Folders of YOLO labels: one text file for each picture, with boxes in shares of its size.
+"""Folders of YOLO labels: one text file for each picture, with boxes in shares of its size; and JSON that darknet, its
+first program, writes (`detector test ... -out`).
 
 A row is: class, centre x, centre y, width, height[, confidence][, track id].
 
@@ -7,6 +8,7 @@ Letters: N rows.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -15,12 +17,11 @@ import numpy as np
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange.gathered import frame_numbers
-from mcaptrack.extensions.exchange.pictures import files_in
+from mcaptrack.extensions.exchange.pictures import LabelledPicture, LabelledShape, PictureFormat, files_in
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.names import LISTS, name_classes
 from mcaptrack.sources.ingest.labels.table import NO_ID, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import MAX_ROWS, lines_of, read_numbers, states_number
+from mcaptrack.sources.ingest.labels.text import LISTS, MAX_ROWS, lines_of, name_classes, read_numbers, states_number
 
 _READMES: Final = ("readme.txt", "readme.roboflow.txt", "readme.dataset.txt")
 _NOT_LABELS: Final = (*LISTS, *_READMES, "train.txt", "val.txt", "test.txt")
@@ -104,3 +105,25 @@ def _score_and_id(frame: Floats, rows: Floats, role: Role | None) -> tuple[Float
         if (sixth > 1).any() or (role != "detections" and is_unique):
             return np.full(len(rows), np.nan), sixth
     return sixth, np.nan_to_num(seventh, nan=NO_ID)
+
+
+class Darknet(PictureFormat):
+    """Detections with scores."""
+
+    title, is_normalised = "JSON of darknet", True
+    row = "a list of pictures: `frame_id`, `filename` and `objects` with `relative_coordinates`"
+
+    def recognises(self, file: LabelFile) -> bool:
+        """Whether JSON is a list of pictures with objects."""
+        return {"frame_id", "objects"} <= set(file.keys) and isinstance(file.json, list)
+
+    def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
+        """The pictures of a file."""
+        for entry in file.json:
+            picture = LabelledPicture(str(entry.get("filename") or entry["frame_id"]), [])
+            for each in entry["objects"]:
+                place = each["relative_coordinates"]
+                x, y, width, height = (float(place[key]) for key in ("center_x", "center_y", "width", "height"))
+                box, label = (x - width / 2, y - height / 2, width, height), each.get("name") or each["class_id"]
+                picture.shapes.append(LabelledShape(box, label, each["confidence"]))
+            yield picture

@@ -1,11 +1,16 @@
 """Logs in notebooks: players and stills that Jupyter and its relatives show, without widgets.
 
 HTML with a script needs no package and no server, and stays in the notebook when it is converted or sent to someone; a
-widget needs both, and is blank there.
+widget needs both, and is blank there. A player is a page of its own in a frame, so that its style and script and those
+of the notebook don't meet. Below the frame lies a still with a caption: it is what remains where frames are taken out,
+as in notebooks that are not trusted.
 """
 
 from __future__ import annotations
 
+import json
+import zlib
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,14 +24,15 @@ from mcaptrack.api.common import as_path, warn_unused, warnings_about
 from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.notebook.page import Still, player_html, player_page, still_html
-from mcaptrack.extensions.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
+from mcaptrack.extensions.notebook.pictures import PLAYER_PX, Clip, PictureSource, still_jpeg
 from mcaptrack.files import publish_bytes, refuse_overwrite
-from mcaptrack.foxglove.views import SCENE_SUFFIX
+from mcaptrack.foxglove.views import SCENE_SUFFIX, SUFFIXES
 from mcaptrack.location import Location
 from mcaptrack.notices import Notice
-from mcaptrack.viewing.formatting import policy
+from mcaptrack.transforms import FULL
+from mcaptrack.viewing.formatting import policy, render
 from mcaptrack.viewing.links import find_moments, opening_moment
+from mcaptrack.viewing.painting import BACKGROUND
 from mcaptrack.viewing.serving import AS_MANY_AS_FIT, Choice, LogPage
 
 _MB: Final = 1e6
@@ -186,7 +192,7 @@ def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int |
         opened.path, source.topic, source.is_above, source.views, 1, 1, 1, seconds, seconds, html="", still=jpeg
     )
     title = f"{opened.path.name}: {player.caption}"
-    return replace(player, html=still_html(jpeg, image.shape[1], title))
+    return replace(player, html=_in_notebook(jpeg, image.shape[1], title))
 
 
 def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: float, progress: Progress) -> Player:
@@ -200,16 +206,16 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
         seconds = [source.seconds(t_ns) for t_ns in taken.t_ns]
         opens_at = max(0, int(np.searchsorted(taken.t_ns, at_ns, "right")) - 1) if at_ns <= taken.t_ns[-1] else 0
         image = source.still(taken.numbers[opens_at], choice.width_px or min(PLAYER_PX, taken.sizes[0][0]))
-        still = Still(still_jpeg(image), image.shape[1])
+        jpeg = still_jpeg(image)
         span = seconds[0], seconds[-1]
         player = Player(
             opened.path, source.topic, source.is_above, source.views,
-            len(seconds), len(numbers), every, *span, html="", still=still.jpeg,
+            len(seconds), len(numbers), every, *span, html="", still=jpeg,
         )  # fmt: skip
         inside = [event for event in events if span[0] <= event[0] <= span[1]]
         caption = f"{opened.path.name}: {player.caption}"
-        page = player_page(taken, seconds, inside, opens_at, caption)
-        html = player_html(page, still, caption)
+        page = _player_page(taken, seconds, inside, opens_at, caption)
+        html = _in_notebook(jpeg, max(image.shape[1], _LEAST_PX), caption, page)
         if len(html) <= max_mb * _MB or len(seconds) == 1:
             return replace(player, html=html, page=page)
         if choice.every is not None:
@@ -223,3 +229,61 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
 def _ordinal(number: int) -> str:
     end = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
     return f"{number}{end}"
+
+
+#: The least width of a player in pixels: there is room for what it is controlled with.
+_LEAST_PX: Final = 420
+
+
+def _in_notebook(jpeg: bytes, width_px: int, caption: str, page: str = "") -> str:
+    """Return a still with a caption, below the frame of a player if there is one."""
+    return str(render("in_notebook.html", __package__ or "", width=width_px, jpeg=jpeg, caption=caption, page=page))
+
+
+def _player_page(
+    taken: Clip, seconds: Sequence[float], events: Sequence[tuple[float, str, str]], opens_at: int, caption: str
+) -> str:
+    """Return the page of a player. ``events`` have a time in seconds, a text, and the topic of their tracks; those of
+    tracks that have no layer are left out.
+    """
+    tracks = {topic: at for at, layer in enumerate(taken.layers) if (topic := _tracks_of(layer))}
+    data = {
+        "seconds": [round(second, 3) for second in seconds],
+        "numbers": taken.numbers,
+        "sizes": taken.sizes,
+        "layers": taken.layers,
+        "names": {topic: _name(topic) for topic in taken.layers if topic},
+        "colours": taken.strokes.colours,
+        "drawn": taken.drawn,
+        "tracks": tracks,
+        "hidden": [taken.layers.index(layer) for layer in taken.hidden],
+        "events": [[round(at, 3), text, tracks[topic]] for at, text, topic in events if topic in tracks],
+        "open": opens_at,
+        "ground": "#" + bytes(BACKGROUND[::-1]).hex(),
+    }
+    pictures = " ".join(_base64(jpeg) for jpeg in taken.jpegs)
+    return str(
+        render("player.html", __package__ or "", caption=caption, pictures=pictures, data=_base64(_packed(data)))
+    )
+
+
+def _tracks_of(layer: str) -> str:
+    """The channel of tracks that a layer draws; "" for predictions and the ground."""
+    for suffix in SUFFIXES:
+        layer = layer.partition(suffix)[0]
+    return "" if layer.endswith("/predictions") else layer.removesuffix(FULL)
+
+
+def _name(topic: str) -> str:
+    """The name of a view: the channel that it draws, without the camera."""
+    for suffix in SUFFIXES:
+        topic = topic.partition(suffix)[0]
+    return topic.lstrip("/").partition("/")[2] or topic
+
+
+def _packed(data: Any) -> bytes:
+    return zlib.compress(json.dumps(data, allow_nan=False, separators=(",", ":")).encode(), 9)
+
+
+def _base64(data: bytes) -> str:
+    return b64encode(data).decode()

@@ -43,9 +43,8 @@ from mcaptrack.sources.camera_motion import read_ground_truth
 from mcaptrack.sources.cameras import provenance_of, repaired_tracks
 from mcaptrack.sources.corrections import CORRECTED
 from mcaptrack.sources.pictures import Pictures
-from mcaptrack.viewing.background import SceneBackground, background_picture, moment_picture
-from mcaptrack.viewing.formatting import clock, plain, short, tracker_name
-from mcaptrack.viewing.sections import section_of
+from mcaptrack.viewing.formatting import clock, plain, section_of, short, tracker_name
+from mcaptrack.viewing.painting import SceneBackground, background_picture, moment_picture
 
 #: The channels of a camera in a report, and the role of each, which gives its colour.
 ROLES: Final = {

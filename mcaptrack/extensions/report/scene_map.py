@@ -20,9 +20,9 @@ from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.ragged import run_ends, run_starts
 from mcaptrack.schema import Frame, Rows
-from mcaptrack.viewing.background import SceneBackground
 from mcaptrack.viewing.charts import round_step
 from mcaptrack.viewing.formatting import number
+from mcaptrack.viewing.painting import SceneBackground
 
 #: The largest number of points of a map, so that the page stays small.
 _MAX_POINTS: Final = 6000

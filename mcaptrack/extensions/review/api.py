@@ -18,8 +18,7 @@ from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.options import Camera, PathLike, Reports, no_progress
 from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.extensions.review import questions as asking
-from mcaptrack.extensions.review.crops import crops
-from mcaptrack.extensions.review.page import Answer, ReviewServer
+from mcaptrack.extensions.review.page import Answer, ReviewServer, crops
 from mcaptrack.extensions.review.questions import Key, Question
 from mcaptrack.files import read_json
 from mcaptrack.geometry.ragged import find_rows

@@ -18,8 +18,8 @@ from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, print_table, printable, show
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.sql.answers import write_answer
 from mcaptrack.extensions.sql.api import QUERY
+from mcaptrack.extensions.sql.database import write_answer
 from mcaptrack.files import is_same_file, refuse_overwrite, unreadable
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
+from mcaptrack.extensions.training.api import TrainResult
 from mcaptrack.extensions.training.recipe import Recipe
-from mcaptrack.extensions.training.result import TrainResult
 from mcaptrack.extensions.training.windows import Windows, ar1
 from mcaptrack.files import publish_bytes
 from mcaptrack.geometry.mixtures import mahalanobis_squared

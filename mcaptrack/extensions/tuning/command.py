@@ -14,8 +14,8 @@ from mcaptrack.cli import common
 from mcaptrack.cli.chosen import has_flag, options_of
 from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
-from mcaptrack.cli.config import BOM, NAME, read_toml
 from mcaptrack.cli.declared import Once
+from mcaptrack.cli.settings import BOM, NAME, read_toml
 from mcaptrack.cli.text import console, show
 from mcaptrack.errors import McaptrackError
 from mcaptrack.files import publish_bytes

@@ -22,8 +22,8 @@ from mcaptrack.schema import TRACKS
 from mcaptrack.schema.framing import join_frames, thinned
 from mcaptrack.sources.pictures import Pictures
 from mcaptrack.transforms import FULL
-from mcaptrack.viewing.background import background_picture
 from mcaptrack.viewing.formatting import render
+from mcaptrack.viewing.painting import background_picture
 
 #: The channels of tracks with the places that are shown without pictures.
 _PLACES: Final = (f"retracks{FULL}", "retracks", "tracks", "truth")

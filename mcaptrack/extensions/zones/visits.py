@@ -14,8 +14,7 @@ import numpy as np
 
 from mcaptrack import foxglove
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
-from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
+from mcaptrack.evaluation.world_tracks import WorldInterval, WorldTracks, lacks_intervals, tracks_in_worlds
 from mcaptrack.extensions.zones.shapes import Paths, Shape, Units, Zone, crossings, visits
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes

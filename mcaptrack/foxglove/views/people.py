@@ -21,10 +21,9 @@ from mcaptrack.geometry.mixtures import squared_radius
 from mcaptrack.geometry.plane import GroundPlane, Planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, run_starts
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame, Rows
-from mcaptrack.schema.camera_motion import to_scene
+from mcaptrack.schema.as_rows import tails_of, to_scene
 from mcaptrack.schema.classes import class_name
 from mcaptrack.schema.framing import frame_times, has_any, join_frames, row_ends, unique_values
-from mcaptrack.schema.predictions import tails_of
 from mcaptrack.schema.resampling import interval_ns, resample
 
 #: The duration of trails, and their number of lines.

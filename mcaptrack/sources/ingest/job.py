@@ -22,10 +22,9 @@ from mcaptrack.geometry.camera_path import Verdict, poses_of
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.schema import CAMERA_MOTION, DETECTIONS, GROUND_PLANE, TRACKS, Frame, Schema
-from mcaptrack.schema.camera_motion import is_motion, pose_to_rows
+from mcaptrack.schema.as_rows import is_motion, plane_to_rows, pose_to_rows
 from mcaptrack.schema.classes import ClassMap, classes_beside_rows, only_class, without_class
 from mcaptrack.schema.encodings import PROTOBUF, Encoding, encoded, record_of
-from mcaptrack.schema.ground_plane import plane_to_rows
 from mcaptrack.schema.provenance import CLOCK, INGEST, Provenance, digest
 from mcaptrack.sources.calibrations import is_rectified_topic
 from mcaptrack.sources.cameras import corrected_plane

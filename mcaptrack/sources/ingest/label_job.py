@@ -18,8 +18,8 @@ from mcaptrack import log
 from mcaptrack.choices import Role
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.arrays import Floats, Ints
+from mcaptrack.geometry.boxes import ORIENTED_COLUMNS
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
-from mcaptrack.geometry.oriented_boxes import COLUMNS
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.geometry.transform_tree import plain_frame
 from mcaptrack.notices import collected, warn
@@ -541,7 +541,7 @@ class Boxes3DJob(IngestJob):
 def label_rows_3d(labels: BoxTable, role: Role) -> Rows:
     """Convert the N rows of labels to rows of detections or tracks."""
     assert labels.boxes_m is not None
-    columns = dict(zip(COLUMNS, labels.boxes_m.T, strict=True))
+    columns = dict(zip(ORIENTED_COLUMNS, labels.boxes_m.T, strict=True))
     if labels.velocity is not None:
         columns |= dict(zip(("vx_m_per_s", "vy_m_per_s"), labels.velocity.T, strict=True))
     columns |= {"score": labels.score, "class_id": labels.class_id, "source_id": np.full(len(labels.frame), -1)}

@@ -20,8 +20,8 @@ from mcaptrack.geometry.histories import Histories, Holt, SmoothedHistory
 from mcaptrack.geometry.mixtures import mahalanobis_squared
 from mcaptrack.predictors import Forecast, Predictor, make, predict_together
 from mcaptrack.schema import PREDICTIONS, TRACKS, Frame
+from mcaptrack.schema.as_rows import forecast_to_rows
 from mcaptrack.schema.frame_columns import FrameCollector, FrameColumns
-from mcaptrack.schema.predictions import forecast_to_rows
 from mcaptrack.transforms.retrack.motion_model import DEFAULT_NOISE_M
 from mcaptrack.transforms.retrack.options import ConsistencyOptions
 from mcaptrack.transforms.retrack.passes import Movers, OnlinePass

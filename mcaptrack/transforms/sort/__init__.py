@@ -5,8 +5,7 @@ They share their parameters, and the state and the lifecycle of tracks (``tracke
 
 from __future__ import annotations
 
-from mcaptrack.transforms.sort.bytetrack import ByteTrack
 from mcaptrack.transforms.sort.ocsort import OcSort
-from mcaptrack.transforms.sort.tracker import Sort
+from mcaptrack.transforms.sort.tracker import ByteTrack, Sort
 
 __all__ = ["ByteTrack", "OcSort", "Sort"]

@@ -28,7 +28,7 @@ from mcaptrack.extensions.bags.sqlite_tables import SqliteTables
 from mcaptrack.extensions.bags.unpacking import decompress_steps
 from mcaptrack.notices import collected
 from mcaptrack.schema import GROUND_PLANE, TRACKS
-from mcaptrack.schema.ground_plane import rows_to_plane
+from mcaptrack.schema.as_rows import rows_to_plane
 from mcaptrack.sources.foreign import definitions
 from mcaptrack.sources.ingest import IngestOptions, decompression, ingest, recording
 from mcaptrack.testing import check_recording_format

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import io
 import json
 import os
 import shutil
@@ -11,7 +12,7 @@ import socket
 import sqlite3
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from mcaptrack.extensions.bags.metadata_yaml import read_metadata
 from mcaptrack.sources.ingest import IngestOptions, ingest, plain_yaml
 from tests import bounded
 from tests.commands import start
+from tests.extensions.bags import bag_mutants
 from tests.extensions.bags.bags import ROS2, STRING1, database
 from tests.tiers import one_in, thorough
 
@@ -549,3 +551,50 @@ def test_a_signal_ends_ingesting_and_leaves_nothing(folder, tmp_path, make, sent
     assert err == ""
     assert list(tmp_path.iterdir()) == [folder]
     assert bounded.on_disk(folder) == before
+
+
+# Bags with something wrong in them: read or refused in a line, soon, in little memory. See tests/test_damage.py.
+
+
+MUTANTS = int(os.environ.get("MUTANTS", "0"))
+FIRST = int(os.environ.get("FIRST_MUTANT", "0"))
+
+
+def is_sound(path: Path) -> bool:
+    """Whether the stock reader finds all messages of a log. An MCAP file alone is passed on as it is."""
+    data = path.read_bytes()
+    try:
+        if path.suffix == ".zstd":
+            data = zstandard.decompress(data)
+        reader = make_reader(io.BytesIO(data), validate_crcs=True)
+        return reader.get_summary().statistics.message_count == sum(1 for _ in reader.iter_messages())
+    except Exception:
+        return False
+
+
+def recordings(seed: int, inside: Path, out: Path) -> Iterator[bounded.Work]:
+    source, made = bag_mutants.mutant(seed, inside), out / "out.mcap"
+
+    def holds(code: int) -> bool:
+        is_written = [entry.name for entry in out.iterdir()] == ["out.mcap"]
+        may_be_odd = not all(map(is_sound, source.glob("*.mcap*")))
+        return is_written and (may_be_odd or is_sound(made)) if code in (0, 3) else not any(out.iterdir())
+
+    yield ["ingest", source, "-o", made], holds
+
+
+@thorough
+def test_mutants_are_read_or_refused(commands, tmp_path):
+    faults = bounded.faults(commands, range(FIRST, FIRST + (MUTANTS or 27)), tmp_path, recordings)
+    assert not faults, "\n".join(faults)
+
+
+@thorough
+def test_the_same_seed_makes_the_same(tmp_path):
+    for seed in range(len(bag_mutants.KINDS)):
+        names = []
+        for folder in (tmp_path / f"{seed} one", tmp_path / f"{seed} two"):
+            folder.mkdir()
+            bag_mutants.mutant(seed, folder)
+            names.append({entry.relative_to(folder) for entry in folder.rglob("*")})
+        assert names[0] == names[1]

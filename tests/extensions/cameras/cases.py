@@ -77,9 +77,9 @@ PROPOSALS = {
 DEEP = {
     "cameras": (
         "it writes a scene as the channels of a stage are written, and finds fusers as transforms are found",
-        "api.running cli.flags cli.many cli.running foxglove.views.people geometry.assignment geometry.neighbours "
+        "api.running cli.many cli.running foxglove.views.people geometry.assignment geometry.neighbours "
         "geometry.pinhole pipeline.checks pipeline.pictures pipeline.rebuild "
-        "pipeline.several pipeline.staleness pipeline.write schema.frame_columns schema.ground_plane "
+        "pipeline.several pipeline.staleness pipeline.write schema.frame_columns schema.as_rows "
         "sources.fixed_frame transforms.guarded",
     )
 }

@@ -20,7 +20,7 @@ from mcaptrack import McaptrackError
 from mcaptrack.extensions.cameras import feet as fuse
 from mcaptrack.extensions.cameras import fusing
 from mcaptrack.extensions.cameras.feet import CameraView, FootFuser, Offset, Shared, group, places_of
-from mcaptrack.extensions.cameras.fusers import FUSION
+from mcaptrack.extensions.cameras.scenes import FUSION
 from mcaptrack.geometry.plane import GroundPlane
 from mcaptrack.notices import collected
 from mcaptrack.registry import names

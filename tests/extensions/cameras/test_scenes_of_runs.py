@@ -10,7 +10,7 @@ import pytest
 
 import mcaptrack
 from mcaptrack import RunResult, log
-from mcaptrack.extensions.cameras.run import scenes
+from mcaptrack.extensions.cameras.scenes import scenes
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS
 from mcaptrack.testing import check_scene_maker

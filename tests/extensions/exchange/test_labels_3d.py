@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import mcaptrack
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.oriented_boxes import COLUMNS, bev_corners, columns_to_oriented_boxes
+from mcaptrack.geometry.boxes import ORIENTED_COLUMNS, bev_corners, columns_to_oriented_boxes
 from mcaptrack.sources.ingest.labels.reading import is_3d, read_labels
 from tests.test_label_bounds_3d import turned
 from tests.test_labels_3d import T0, ingested
@@ -131,7 +131,7 @@ def test_a_scene_of_nuscenes(tmp_path):
     assert "3 of 6 boxes have no points of lidar or radar" in " ".join(result.notes)
     wanted = [one for one in annotations if one["instance_token"] != "i2"]
     for row, one in zip(found.rows, wanted, strict=True):
-        assert [row[name] for name in COLUMNS[:3]] == one["translation"]
+        assert [row[name] for name in ORIENTED_COLUMNS[:3]] == one["translation"]
         assert [row["width_m"], row["length_m"], row["height_m"]] == one["size"]
         forward = Rotation.from_quat(np.array(one["rotation"])[[1, 2, 3, 0]]).apply([1, 0, 0])
         assert row["heading_rad"] == pytest.approx(math.atan2(forward[1], forward[0]))

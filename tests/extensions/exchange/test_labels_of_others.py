@@ -16,7 +16,7 @@ from mcaptrack.registry import own
 from mcaptrack.sources.ingest.labels import of_packages
 from mcaptrack.sources.ingest.labels.reading import label_file, read_labels
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
-from tests.extensions.exchange.test_youtube_vis import youtube_vis
+from tests.extensions.exchange.test_masks import youtube_vis
 from tests.label_cases import WALK, Row, writers
 from tests.test_label_classes import assert_kept, assert_numbered
 from tests.test_labels_of_others import (

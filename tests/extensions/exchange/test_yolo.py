@@ -1,9 +1,10 @@
-"""Files of yolo."""
+"""Files of yolo and darknet."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.exchange import pictures, yolo
 from mcaptrack.sources.ingest.labels.reading import read_labels
 from mcaptrack.sources.ingest.labels.timeline import Timeline
-from tests.label_cases import Row, Writer, by_frame, number, shares
+from tests.label_cases import Row, Writer, as_json, by_frame, number, shares
 
 
 def labels(folder: Path, rows: Sequence[Row]) -> Path:
@@ -31,7 +32,22 @@ def labels(folder: Path, rows: Sequence[Row]) -> Path:
     return folder / "labels"
 
 
+def darknet(rows: Sequence[Row]) -> Any:
+    """Shares of 640x480 of boxes in pixels; those that are shares are far too large then."""
+    out = []
+    for frame, mine in by_frame(rows).items():
+        objects = []
+        for row in mine:
+            place = dict(zip(("center_x", "center_y", "width", "height"), shares(row), strict=True))
+            objects.append(
+                {"name": row.kind or "", "class_id": "", "confidence": row.score, "relative_coordinates": place}
+            )
+        out.append({"frame_id": frame, "objects": objects})
+    return out
+
+
 WRITERS = {
+    "darknet": Writer(as_json(darknet), "id numbered", tracks=False, first="listed", shares=True),
     "yolo": Writer(labels, names=False, shares=True),
 }
 

@@ -214,8 +214,8 @@ def test_a_network_can_open_no_file_even_if_nothing_was_checked(monkeypatch):
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     assert session.run(None, {"x": np.zeros(1, "f")})[0].tolist() == SECRET.tolist()
     code = (
-        "import sys; from mcaptrack.extensions.networks import graph, serving; graph.reach = lambda model: ''; "
-        "serving.session.graph.reach = graph.reach; serving.serve(*given)"
+        "import sys; from mcaptrack.extensions.networks import child, graph; graph.reach = lambda model: ''; "
+        "child.session.graph.reach = graph.reach; child.serve(*given)"
     )
     from mcaptrack.extensions.networks import child
 
@@ -360,7 +360,7 @@ def test_the_outputs_of_predictors_are_those_of_this_process_to_the_bit(monkeypa
 
 def strange_processes(pid: int) -> list[int]:
     children = [Path(f"{thread}/children").read_text().split() for thread in Path(f"/proc/{pid}/task").iterdir()]
-    return [int(one) for some in children for one in some if "networks.serving" in _command(int(one))]
+    return [int(one) for some in children for one in some if "networks.child" in _command(int(one))]
 
 
 def _command(pid: int) -> str:

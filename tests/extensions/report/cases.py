@@ -53,6 +53,6 @@ DEEP = {
         "it shows all that is evaluated",
         "evaluation.aligned evaluation.events evaluation.forecasts evaluation.people "
         "foxglove.views.people schema.resampling tables.catalogue tables.export.contents "
-        "viewing.background viewing.charts",
+        "viewing.charts",
     )
 }

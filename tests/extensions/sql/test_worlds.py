@@ -10,7 +10,7 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import WIDER
+from mcaptrack.evaluation.world_tracks import WIDER
 from mcaptrack.notices import collected
 from mcaptrack.schema import TRACKS, WORLDS
 

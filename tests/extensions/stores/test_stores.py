@@ -387,7 +387,7 @@ class TestDoctor:
 
     def test_a_store_that_ignores_conditions_is_found_out(self, store, monkeypatch):
         real = objects.put_if_unchanged
-        monkeypatch.setattr(trial, "put_if_unchanged", lambda url, data, _: real(url, data, objects.find(url)))
+        monkeypatch.setattr(objects, "put_if_unchanged", lambda url, data, _: real(url, data, objects.find(url)))
         code, access, err = self.access(str(NIGHT))
         assert code == 1
         assert [name for name, why in access.items() if why] == ["put-if-absent", "replace"]

@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from mcaptrack.cli.flags import with_flags
+from mcaptrack.cli.text import with_flags
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.training.sources import SourceOptions, read_scenes
 

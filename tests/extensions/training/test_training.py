@@ -20,8 +20,8 @@ from mcaptrack.cli import app
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
 from mcaptrack.extensions.training import api as training
+from mcaptrack.extensions.training.api import TrainResult
 from mcaptrack.extensions.training.recipe import RECIPES, Recipe
-from mcaptrack.extensions.training.result import TrainResult
 from mcaptrack.extensions.training.sources import Scene, SourceOptions, read_scenes, split, synthetic, windows_of
 from mcaptrack.extensions.training.windows import Corruption, Windows, ar1
 from mcaptrack.predictors import PeopleSeen, make

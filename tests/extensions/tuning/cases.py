@@ -101,6 +101,6 @@ PRINTED = {"tuning": _printed}
 DEEP = {
     "tuning": (
         "it makes transforms with other settings, and writes these",
-        "api.running cli.chosen cli.config tables.compared transforms.guarded",
+        "api.running cli.chosen cli.settings tables.compared transforms.guarded",
     )
 }

@@ -6,7 +6,7 @@ from typing import Any
 
 import mcaptrack
 from mcaptrack import log
-from mcaptrack.evaluation.intervals import WorldInterval
+from mcaptrack.evaluation.world_tracks import WorldInterval
 from mcaptrack.extensions.zones.counting import finished
 from mcaptrack.extensions.zones.visits import ZoneInWorlds, ZoneTotals
 from mcaptrack.pipeline import Summary
@@ -105,6 +105,6 @@ DEEP = {
         "its counts are written, drawn and reported as those of the core are",
         "api.running cli.many foxglove.annotations foxglove.views.ground "
         "foxglove.views.image foxglove.views.people geometry.camera_path pipeline.checks pipeline.motion "
-        "pipeline.pictures pipeline.staleness pipeline.write schema.frame_columns viewing.background viewing.charts",
+        "pipeline.pictures pipeline.staleness pipeline.write schema.frame_columns viewing.charts",
     )
 }

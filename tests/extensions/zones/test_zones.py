@@ -15,7 +15,7 @@ import pytest
 import mcaptrack
 from mcaptrack import log, notices, testing
 from mcaptrack.errors import McaptrackError
-from mcaptrack.evaluation.intervals import WIDER, WIDER_MEAN
+from mcaptrack.evaluation.world_tracks import WIDER, WIDER_MEAN
 from mcaptrack.extensions.zones import api
 from mcaptrack.extensions.zones.geojson import parse_zones, read_zones, zones_from_json, zones_to_json
 from mcaptrack.extensions.zones.section import section

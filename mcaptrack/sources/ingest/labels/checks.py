@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.geometry.angles import wrapped
 from mcaptrack.geometry.arrays import Floats, Ints
-from mcaptrack.geometry.boxes import outside
+from mcaptrack.geometry.boxes import ORIENTED_COLUMNS as COLUMNS_3D
+from mcaptrack.geometry.boxes import outside, wrapped
 from mcaptrack.geometry.clocks import LAST_NS, NS_PER_S
-from mcaptrack.geometry.oriented_boxes import COLUMNS as COLUMNS_3D
 from mcaptrack.sources.ingest.labels.table import MAX_FRAME, NO_CLASS, NO_ID, Asked, BoxTable
 
 Check = Callable[[BoxTable, Asked], None]

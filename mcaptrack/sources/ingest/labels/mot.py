@@ -16,9 +16,8 @@ from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.schema.classes import PERSON, is_person
 from mcaptrack.sources.ingest.labels.delimited import is_table
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
-from mcaptrack.sources.ingest.labels.names import name_classes
 from mcaptrack.sources.ingest.labels.table import FORGIVEN, NO_CLASS, OCCUPIED, REGION, Asked, BoxTable, LabelFacts
-from mcaptrack.sources.ingest.labels.text import check_columns, read_numbers, states_number
+from mcaptrack.sources.ingest.labels.text import check_columns, name_classes, read_numbers, states_number
 
 #: The classes of MOT16, 17 and 20, and of VisDrone.
 _NAMES: Final = (
