@@ -46,8 +46,7 @@ from mcaptrack.contracts import (
 )
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import Processes
-from mcaptrack.fleet.child import WorkerLimits
-from mcaptrack.fleet.worker import Reply, Request, do
+from mcaptrack.fleet.worker import Reply, Request, WorkerLimits, do
 from mcaptrack.location import Url
 from mcaptrack.notices import collected
 from mcaptrack.objects import AbsentError, StoreCheck, Version, replaced

@@ -15,8 +15,7 @@ from typing import Final
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.fleet import Crew, task_of
-from mcaptrack.fleet.child import StoppedError
-from mcaptrack.fleet.worker import Reply, Request
+from mcaptrack.fleet.worker import Reply, Request, StoppedError
 from mcaptrack.registry import blamed, of_type
 from mcaptrack.testing.formats import object_entry
 from mcaptrack.testing.transforms import LawError, law, same_process

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from mcaptrack.extensions.stores import objects
-from mcaptrack.extensions.stores.trial import check_store
 from mcaptrack.location import Url
 from mcaptrack.objects import Version
 
@@ -19,7 +18,7 @@ class ObjectStore:
     replace = staticmethod(objects.replace)
     delete = staticmethod(objects.delete)
     why_absent = staticmethod(objects.why_absent)
-    check = staticmethod(check_store)
+    check = staticmethod(objects.check_store)
 
     def __init__(self, url: Url) -> None:
         objects.library(url)

@@ -12,7 +12,7 @@ import pytest
 from mcaptrack import fleet
 from mcaptrack.errors import McaptrackError
 from mcaptrack.extensions.dask import cluster
-from mcaptrack.fleet.child import WorkerLimits
+from mcaptrack.fleet.worker import WorkerLimits
 from mcaptrack.testing import check_crew
 from tests import fleet_tasks
 from tests.extensions.dask import fleet_cluster

@@ -18,7 +18,7 @@ import pytest
 import mcaptrack
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.stores import objects, trial
+from mcaptrack.extensions.stores import objects
 from mcaptrack.extensions.stores.store import ObjectStore
 from mcaptrack.fleet import find_logs
 from mcaptrack.location import parse
