@@ -30,8 +30,6 @@ SCENE_SUFFIX: Final = "/view/scene"
 WRITTEN_BY: Final = "written_by"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
-#: Beginnings of older versions: their results are read, but not made again with the same parameters.
-_OLDER: Final = ("0.1.", "0.2.")
 
 
 class Plugin(NamedTuple):
@@ -91,11 +89,6 @@ class Provenance:
     def written_by(self) -> str:
         """The program of a user that wrote the channel with ``Recording.write``; "" for others."""
         return str(self.parameters.get(WRITTEN_BY, "")) if self.transform == INGEST else ""
-
-    @property
-    def is_of_older_version(self) -> bool:
-        """Whether it was made by a version with other parameters than this one."""
-        return self.version.startswith(_OLDER)
 
     def warn_again(self) -> None:
         """Repeat the warnings when it was made."""
