@@ -10,11 +10,13 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
-from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.errors import McaptrackError, offer
+from mcaptrack.files import missing
 from mcaptrack.registry import Entry, Kind, blamed, entry_of, find, names, others, own, split_file
 from mcaptrack.schema import (
     APPEARANCE,
@@ -212,6 +214,8 @@ class Stage:
         for name in parameters:
             if name not in names:
                 what = entry if self.kind else self.name
+        if file and not Path(file).exists():
+            raise McaptrackError(f"{entry}: {missing(Path(file))}")
                 raise McaptrackError(
                     f"{what} has no parameter {name}; {did_you_mean(name, names)}there are {', '.join(names) or 'none'}"
                 )
