@@ -162,6 +162,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "api/ingesting.py:_changes:run": lambda s: s.says("ingest", "truth.txt", "--as", "corrections", "--into", "LOG"),
     "api/running.py:products:export": lambda s: s.says("run", "s3://bucket/a.mcap"),
     "evaluation/__init__.py:sequence_of_log:run": lambda s: s.untracked().says("evaluate", "LOG"),
+    "evaluation/__init__.py:sequence_of_log:ingest": lambda s: s.untracked().says("evaluate", "LOG"),
     "evaluation/__init__.py:ground_truth_of_log:ingest": lambda s: s.without("/camera/truth*").says("evaluate", "LOG"),
     "api/viewing.py:_note_trouble:ingest": lambda s: s.says("view", "LOG", "--links"),
     "api/viewing.py:view:run": lambda s: s.ingested("clip.mp4", "--truth", "truth.txt").says("view", "LOG", "--links"),

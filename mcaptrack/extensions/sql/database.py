@@ -213,11 +213,11 @@ class Database:
             raise McaptrackError(f"tables come in when a query names them; {call('list_tables', 'LOG')} lists them")
         statements = self._connection.extract_statements(query)
         _refuse_writing([statement.type.name for statement in statements])
-        answer = None
-        for statement in statements:
-            result = self._run(statement)
-            answer = result if statement.type.name in _ANSWERING else answer
-        return answer
+        answers = [self._run(each) for each in statements]
+        answers = [answer for answer, each in zip(answers, statements, strict=True) if each.type.name in _ANSWERING]
+        if len(answers) > 1:
+            warn(f"the query asks {len(answers)} questions; only the last is answered", "left-out")
+        return answers[-1] if answers else None
 
     def _worlds_answer(self, query: str) -> Any:
         """As ``ask_worlds``."""

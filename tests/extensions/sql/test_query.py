@@ -539,6 +539,13 @@ def test_answers_as_a_table(known):
     assert lines[4].split()[1] == "0.133333"
 
 
+def test_only_the_last_of_several_questions_is_answered_and_that_is_said(known):
+    outcome = run(known, "select 1 as a; create temp table t as select 5 as c; select c from t", "--format", "csv")
+    assert outcome.out.split() == ['"c"', "5"]
+    assert "warning: the query asks 2 questions; only the last is answered" in outcome.err
+    assert "questions" not in run(known, "create temp table t as select 5 as c; select c from t").err
+
+
 def test_the_tables_are_listed_with_columns_units_and_meanings(known):
     words = run("--tables").out
     listed = json.loads(run(known, "--tables", "--json").out)
