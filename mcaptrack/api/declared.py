@@ -19,7 +19,7 @@ import textwrap
 import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from numbers import Integral, Real
 from pathlib import Path
 from typing import (
@@ -292,7 +292,8 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         for name in () if has_more else kwargs:
             if name not in signature.parameters:
-                raise TypeError(f"{function.__name__}() has no parameter {name}; {_others(name, signature.parameters)}")
+                others = missing_extension(name) or offer(name, signature.parameters, "there are")
+                raise TypeError(f"{function.__name__}() has no parameter {name}; {others}")
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if value is signature.parameters[name].default:
                 continue
@@ -321,13 +322,14 @@ def done_by(*command_line: str, **options: bool) -> Callable[[Callable[P, T]], C
 
     Messages that name a call of it name that command on the command line.
     """
+    return partial(_checked_with, done_by=(command_line, options))
 
-    def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        call = checked(function)
-        vars(call).update(done_by=(command_line, options))
-        return call
 
-    return decorate
+def _checked_with(function: Callable[P, T], **facts: Any) -> Callable[P, T]:
+    """A function that is ``checked``, with facts that the command line asks for."""
+    call = checked(function)
+    vars(call).update(facts)
+    return call
 
 
 def declared(
@@ -355,10 +357,10 @@ def declared(
             _take_more(function, more)
         if function.__doc__:  # there is none with python -OO
             function.__doc__ = _completed(function)
-        call = checked(function)
-        vars(call).update(most_used=most_used, settable=settable, python_only=python_only)
-        vars(call).update(heading=heading, printed_by=printed_by)
-        return call
+        return _checked_with(
+            function, most_used=most_used, settable=settable, python_only=python_only, heading=heading,
+            printed_by=printed_by,
+        )  # fmt: skip
 
     return decorate
 
@@ -453,11 +455,6 @@ def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     return {name: pair for name, pair in ends.items() if pair != (-math.inf, math.inf)}
 
 
-def _others(name: str, every: Iterable[str]) -> str:
-    """The advice about a parameter that doesn't exist."""
-    return missing_extension(name) or offer(name, every, "there are")
-
-
 def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
     """The paths among the value of a parameter of these types: itself, members of a sequence, values of a mapping."""
     if isinstance(value, Mapping):
@@ -469,16 +466,12 @@ def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
 
 def _has_empty_name(value: Any, kinds: Iterable[Any]) -> bool:
     """Whether a path among a value is empty; arrays, which can't be compared, are none."""
-    return any(isinstance(path, str) and not path for path in map(_name_of, _paths_in(value, kinds)))
+    return any(isinstance(path, str | os.PathLike) and not os.fspath(path) for path in _paths_in(value, kinds))
 
 
 def _holds_paths(kind: Any) -> bool:
     whole = get_origin(kind) or kind
     return (isinstance(whole, type) and issubclass(whole, os.PathLike)) or any(map(_holds_paths, get_args(kind)))
-
-
-def _name_of(path: Any) -> Any:
-    return os.fspath(path) if isinstance(path, os.PathLike) else path
 
 
 def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:

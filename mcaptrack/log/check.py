@@ -5,7 +5,7 @@ Letters: M messages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -44,11 +44,10 @@ from mcaptrack.log.index import (
 )
 from mcaptrack.log.journal import changed, find_journal, journal_of, load_old_content
 from mcaptrack.log.records import MAGIC, Bytes, Damaged, Reader, Record, walk
+from mcaptrack.notices import Progress
 
 if TYPE_CHECKING:
     from mcaptrack.log.reader import Log
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass

@@ -424,6 +424,10 @@ class Log:
             raise McaptrackError(f"{self.path} has no channel {topic}; {offer(topic, topics)}. {more} shows more")
         return self.channels[topic]
 
+    def holds(self, topic: str, schema: Schema) -> bool:
+        """Whether there is a channel of a topic, and it has rows of a schema."""
+        return topic in self.channels and self.channels[topic].holds(schema)
+
     def _channel(self, record: ChannelRecord) -> Channel:
         schema = self.index.schemas.get(record.schema_id)
         name = schema_name_of(schema.name, schema.encoding, record.message_encoding, record.metadata) if schema else ""

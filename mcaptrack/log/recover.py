@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_right
 from collections import ChainMap, Counter
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,8 +33,8 @@ from mcaptrack.log.chunks import Entries, contents_of, message_head, open_chunk,
 from mcaptrack.log.index import Index, read_intact_summary, starts_with_magic, summary_start
 from mcaptrack.log.records import BLOCK, DATA_OPCODES, MAGIC, Bytes, Damaged, Reader, Record, walk
 from mcaptrack.log.writer import LogWriter, create
+from mcaptrack.notices import Progress
 
-Progress = Callable[[str, int, int], None]
 Described = TypeVar("Described", SchemaRecord, ChannelRecord)
 
 #: The first bytes of a chunk: its opcode; sizes below 2^48; times; a checksum; a known compression.

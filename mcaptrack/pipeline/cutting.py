@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.log.records import Damaged
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.pipeline.staleness import planes_to_json, read_planes
 from mcaptrack.schema import GROUND_PLANE
 from mcaptrack.schema.names import plain_name
@@ -35,8 +35,6 @@ from mcaptrack.sources.fixed_frame import LATCHED, TRANSFORMS_READ, edges_of
 from mcaptrack.sources.foreign.decoding import decoder_with_errors
 from mcaptrack.sources.foreign.flatten import message_type_of
 from mcaptrack.sources.pictures import Pictures
-
-Progress = Callable[[str, int, int], None]
 
 #: The metadata record of a log that was cut out of a longer one: ``start_ns`` and ``end_ns``, as far as it is shorter.
 CUT: Final = "mcaptrack.cut"

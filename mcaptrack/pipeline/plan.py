@@ -15,7 +15,7 @@ import numpy as np
 from mcaptrack import log
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import is_assumed
-from mcaptrack.notices import warn
+from mcaptrack.notices import Say, warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, warn_unused
@@ -33,8 +33,6 @@ from mcaptrack.sources.foreign import holds_boxes, reading_of, uncertain_boxes
 from mcaptrack.sources.foreign.boxes import is_chosen_otherwise
 from mcaptrack.transforms import STAGES, Stage, Transform
 from mcaptrack.transforms.protocol import Space, traits_of
-
-Say = Callable[[str], None]
 
 
 def plan_stage(

@@ -17,7 +17,7 @@ from mcaptrack import log
 from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated
-from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.notices import Notice, Progress, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, may_replace, read_named_frames, superseded
 from mcaptrack.pipeline.following import Before
 from mcaptrack.pipeline.pictures import pictures_of
@@ -31,7 +31,7 @@ from mcaptrack.pipeline.staleness import (
     read_planes,
     warn_clock_jumps,
 )
-from mcaptrack.pipeline.steps import BEFORE, LATE_BEGINNING, Input, Progress, Work
+from mcaptrack.pipeline.steps import BEFORE, LATE_BEGINNING, Input, Work
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import EVENT_KINDS, EVENTS, TRACKS, VIDEO, Frame

@@ -15,7 +15,7 @@ from typing import Any, Final
 from uuid import uuid4
 
 from mcaptrack import __version__
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, needing
 from mcaptrack.fleet import Running
 from mcaptrack.fleet.child import Child, WorkerLimits
 from mcaptrack.fleet.worker import Reply, Request
@@ -33,10 +33,8 @@ class Cluster:
     """Processes logs on a cluster. ``places`` is how many it can be busy with: one for each thread of its workers."""
 
     def __init__(self, address: str, limits: WorkerLimits, most: int | None) -> None:
-        try:
+        with needing("`scheduler=`", "Dask", "fleet"):
             from distributed import Client
-        except ImportError:
-            raise McaptrackError("`scheduler=` needs Dask: `pip install 'mcaptrack[fleet]'` installs it") from None
         self._address, self._most = address, most
         loggers = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in _LOGGERS]
         self._levels = {name: logging.getLogger(name).level for name in (*_LOGGERS, *loggers)}

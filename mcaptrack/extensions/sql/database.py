@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, tables
-from mcaptrack.errors import McaptrackError, call, did_you_mean
+from mcaptrack.errors import McaptrackError, call, did_you_mean, needing
 from mcaptrack.evaluation.intervals import WorldInterval, lacks_intervals
 from mcaptrack.evaluation.world_tracks import WorldTracks, tracks_in_worlds
 from mcaptrack.extensions.sql.answers import tidy
@@ -464,12 +464,8 @@ def _of_world(samples: Any, frames: Any, xy_m: Floats, world: WorldTracks) -> An
 
 def _duckdb() -> Any:
     """DuckDB, if it is installed."""
-    try:
+    with needing("SQL", "DuckDB", "sql"):
         import duckdb
-    except ImportError:
-        raise McaptrackError(
-            'SQL needs DuckDB, which is not installed; install it with: pip install "mcaptrack[sql]"'
-        ) from None
     return duckdb
 
 

@@ -107,8 +107,7 @@ def _places(opened: log.Log, prefix: str) -> Floats:
     """Places of tracks on the ground (N, 2) in m, some of them."""
     for name in _PLACES:
         topic = f"{prefix}/{name}"
-        channel = opened.channels.get(topic)
-        if channel is None or not channel.holds(TRACKS):
+        if not opened.holds(topic, TRACKS):
             continue
         rows = join_frames(TRACKS, thinned(opened.frame_columns(topic, TRACKS), _MOST_PLACES)).rows
         xy = np.stack([rows["x_m"], rows["y_m"]], axis=1)

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from mcaptrack import environment, log
 from mcaptrack.errors import McaptrackError
+from mcaptrack.files import writing
 from mcaptrack.log.messages import Payloads, Span
 from mcaptrack.tables import ParquetTable, TypedMessages
 from mcaptrack.tables.build import PendingRows
@@ -49,10 +50,8 @@ class ChannelFile:
         return self._writing
 
     def _add(self, piece: Any) -> None:
-        try:
+        with writing(self.file.path):
             self.file.add(piece)
-        except OSError as error:
-            raise McaptrackError(f"{self.file.path} can't be written: {error.strerror or error}") from error
 
     def _finish_writing(self) -> None:
         if self._writing is not None:
