@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 __all__ = [
-    "DamagedError", "McaptrackError", "call", "command", "did_you_mean", "lacks", "list_names", "needing", "offer",
+    "DamagedError", "McaptrackError", "call", "command", "did_you_mean", "in_one_line", "lacks", "list_names",
+    "needing", "offer",
 ]  # fmt: skip
 
 
@@ -29,6 +30,11 @@ class McaptrackError(Exception):
 
 class DamagedError(McaptrackError):
     """A damaged log; `mcaptrack.recover` saves what is intact."""
+
+
+def in_one_line(error: Exception, most: int | None = None) -> str:
+    """The message of an error in one line, of ``most`` characters at most; without one, the name of its type."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
 
 
 def lacks(what: str, package: str, extra: str) -> str:

@@ -15,7 +15,7 @@ from typing import Any, Final
 from uuid import uuid4
 
 from mcaptrack import __version__
-from mcaptrack.errors import McaptrackError, needing
+from mcaptrack.errors import McaptrackError, in_one_line, needing
 from mcaptrack.fleet import Running
 from mcaptrack.fleet.child import Child, WorkerLimits
 from mcaptrack.fleet.worker import Reply, Request
@@ -45,8 +45,7 @@ class Cluster:
             self._client = make(address, timeout=_ANSWER_S, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError) as error:
             self._restore_logging()
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise McaptrackError(f"no Dask scheduler answers at {address}: {text:.200}") from error
+            raise McaptrackError(f"no Dask scheduler answers at {address}: {in_one_line(error, 200)}") from error
         self._futures: dict[Location, tuple[Any, float]] = {}
         self._places, self._looked = 0, 0.0
         self._limits = limits
@@ -68,10 +67,8 @@ class Cluster:
         try:
             theirs = self._client.run(versions)
         except Exception as error:
-            text = " ".join(str(error).split())
-            raise McaptrackError(
-                f"workers of {self._address} can't use this version of mcaptrack: {text:.200}"
-            ) from error
+            text = f"workers of {self._address} can't use this version of mcaptrack"
+            raise McaptrackError(f"{text}: {in_one_line(error, 200)}") from error
         for name, version in own.items():
             others = sorted({worker_versions[name] for worker_versions in theirs.values()} - {version})
             if others:
@@ -112,8 +109,7 @@ class Cluster:
         except CancelledError:
             out.cancel()
         except Exception as error:
-            text = " ".join(str(error).split()) or type(error).__name__
-            out.set_result(Reply(request.log, "failed", error=f"{request.log}: {text:.500}"))
+            out.set_result(Reply(request.log, "failed", error=f"{request.log}: {in_one_line(error, 500)}"))
         self._futures.pop(request.log, None)
         return out
 
