@@ -19,7 +19,7 @@ from mcaptrack.api.common import as_path, warn_unused, warnings_about
 from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, no_progress
 from mcaptrack.errors import McaptrackError
-from mcaptrack.extensions.notebook.page import Still, player_html, player_page, still_html
+from mcaptrack.extensions.notebook.page import Still, in_notebook, player_page
 from mcaptrack.extensions.notebook.pictures import PLAYER_PX, PictureSource, still_jpeg
 from mcaptrack.files import publish_bytes, refuse_overwrite
 from mcaptrack.foxglove.views import SCENE_SUFFIX
@@ -186,7 +186,7 @@ def _still(opened: logs.Log, source: PictureSource, number: int, width_px: int |
         opened.path, source.topic, source.is_above, source.views, 1, 1, 1, seconds, seconds, html="", still=jpeg
     )
     title = f"{opened.path.name}: {player.caption}"
-    return replace(player, html=still_html(jpeg, image.shape[1], title))
+    return replace(player, html=in_notebook(Still(jpeg, image.shape[1]), title))
 
 
 def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: float, progress: Progress) -> Player:
@@ -209,7 +209,7 @@ def _player(opened: logs.Log, source: PictureSource, choice: Choice, max_mb: flo
         inside = [event for event in events if span[0] <= event[0] <= span[1]]
         caption = f"{opened.path.name}: {player.caption}"
         page = player_page(taken, seconds, inside, opens_at, caption)
-        html = player_html(page, still, caption)
+        html = in_notebook(still, caption, page)
         if len(html) <= max_mb * _MB or len(seconds) == 1:
             return replace(player, html=html, page=page)
         if choice.every is not None:

@@ -10,7 +10,7 @@ import json
 import zlib
 from base64 import b64encode
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from mcaptrack.extensions.notebook.pictures import Clip
 from mcaptrack.foxglove.views import SUFFIXES
@@ -29,14 +29,9 @@ class Still(NamedTuple):
     width_px: int
 
 
-def still_html(jpeg: bytes, width_px: int, caption: str) -> str:
-    """Return a picture with a caption."""
-    return str(render("in_notebook.html", __package__ or "", width=width_px, jpeg=jpeg, caption=caption, page=""))
-
-
-def player_html(page: str, still: Still, caption: str) -> str:
-    """Return a player in a frame, for a notebook, with the still below it."""
-    width = max(still.width_px, _LEAST_PX)
+def in_notebook(still: Still, caption: str, page: str = "") -> str:
+    """Return a picture with a caption, for a notebook; with the ``page`` of a player that in a frame above it."""
+    width = max(still.width_px, _LEAST_PX) if page else still.width_px
     return str(render("in_notebook.html", __package__ or "", width=width, jpeg=still.jpeg, caption=caption, page=page))
 
 
@@ -62,9 +57,8 @@ def player_page(
         "ground": "#" + bytes(BACKGROUND[::-1]).hex(),
     }
     pictures = " ".join(_base64(jpeg) for jpeg in taken.jpegs)
-    return str(
-        render("player.html", __package__ or "", caption=caption, pictures=pictures, data=_base64(_packed(data)))
-    )
+    packed = zlib.compress(json.dumps(data, allow_nan=False, separators=(",", ":")).encode(), 9)
+    return str(render("player.html", __package__ or "", caption=caption, pictures=pictures, data=_base64(packed)))
 
 
 def _tracks_of(layer: str) -> str:
@@ -79,10 +73,6 @@ def _name(topic: str) -> str:
     for suffix in SUFFIXES:
         topic = topic.partition(suffix)[0]
     return topic.lstrip("/").partition("/")[2] or topic
-
-
-def _packed(data: Any) -> bytes:
-    return zlib.compress(json.dumps(data, allow_nan=False, separators=(",", ":")).encode(), 9)
 
 
 def _base64(data: bytes) -> str:

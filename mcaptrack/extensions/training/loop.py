@@ -116,7 +116,9 @@ def train(
     run.publish(validation, card)
     predictor = f"{recipe.network}:{run.weights}"
     scores = compare(make(predictor, recipe.steps, recipe.step_s), validation, recipe)
-    run.publish(validation, card | {f"scores_{k}": _to_text(part[recipe.network]) for k, part in scores.items()})
+    for kind, part in scores.items():
+        card[f"scores_{kind}"] = " ".join(f"{name}={value:.3f}" for name, value in part[recipe.network].items())
+    run.publish(validation, card)
     return TrainResult(
         weights=run.weights,
         predictor=predictor,
@@ -142,10 +144,6 @@ def _noisy(windows: Windows) -> Windows:
     """The same windows with noise in their past positions."""
     noise = _NOISE_M * ar1(np.random.default_rng(0), *windows.known.shape)
     return Windows(windows.past + noise, windows.known, windows.future, windows.scene)
-
-
-def _to_text(scores: dict[str, float]) -> str:
-    return " ".join(f"{name}={value:.3f}" for name, value in scores.items())
 
 
 def _torch() -> Any:

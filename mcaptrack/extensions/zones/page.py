@@ -63,7 +63,7 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
         low = (float(middle[0] - extent[0] / 2), float(middle[1] + extent[1] / 2))
     counted = counted_zones(opened, prefix)
     before = counted[0].zones if counted else ()
-    zones = [zone for zone in before if zone.units == units and _is_simple(zone)]
+    zones = [zone for zone in before if zone.units == units and [*map(len, zone.parts)] == [1]]  # of one outline
     left_out = [zone.name for zone in before if zone not in zones]
     if left_out:
         names = ", ".join(left_out)
@@ -89,11 +89,6 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
         left_out=left_out,
         nonce=b64encode(sha256(os.fsencode(opened.path.name)).digest()[:12]).decode(),
     )
-
-
-def _is_simple(zone: Zone) -> bool:
-    """Whether the page can change a zone: it has one outline."""
-    return len(zone.parts) == 1 and len(zone.parts[0]) == 1
 
 
 def _drawn(zones: Sequence[Zone]) -> list[dict[str, Any]]:
