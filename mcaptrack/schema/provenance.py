@@ -90,6 +90,15 @@ class Provenance:
         """The program of a user that wrote the channel with ``Recording.write``; "" for others."""
         return str(self.parameters.get(WRITTEN_BY, "")) if self.transform == INGEST else ""
 
+    @property
+    def held_back(self) -> str:
+        """The treatment of tracks that weren't re-tracked, since the camera looks along the ground; "" for others."""
+        if not self.parameters.get("poor_scale") or self.parameters.get("side_view"):
+            return ""
+        by_likelihood = self.parameters.get("retracker", "likelihood") == "likelihood"
+        is_linked = by_likelihood and self.parameters.get("link_s") != 0
+        return "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
+
     def warn_again(self) -> None:
         """Repeat the warnings when it was made."""
         for code, message in self.warnings:
