@@ -10,13 +10,11 @@ import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
 from mcaptrack.errors import McaptrackError, offer
-from mcaptrack.files import missing
 from mcaptrack.registry import Entry, Kind, blamed, entry_of, find, names, others, own, split_file
 from mcaptrack.schema import (
     APPEARANCE,
@@ -214,11 +212,11 @@ class Stage:
         refuse_unknown(str(entry if self.kind else self.name), parameters, names)
         if (file := self.split(chosen)[1]) is not None and parameters.setdefault(_FILE, file) != file:
             raise McaptrackError(f"{chosen} and `{_FILE}={parameters[_FILE]}` are two files; give one")
-        if file and not Path(file).exists():
-            raise McaptrackError(f"{entry}: {missing(Path(file))}")
         with blamed(entry, "could not be made"):
             transform: Transform = cls(**parameters)
             check_options(transform)
+        if entry.is_built_in and (weights := getattr(transform, "weights", None)):
+            weights()  # refuses a file of a network that isn't there, before a plan is made and said
         return transform
 
     def check(self, entry: Entry) -> None:

@@ -423,6 +423,7 @@ class TestInLogs:
         err = call("run", log, "--detector", f"onnx:{tmp_path / 'none.onnx'}").err
         assert err.startswith(f"mcaptrack: detector onnx: {tmp_path / 'none.onnx'} does not exist")
         assert err.count("\n") == 1
+        assert call("run", log, "--detector", "onnx").err == "mcaptrack: detector onnx needs a file, as in onnx:FILE\n"
 
     def test_names_and_files_that_do_not_go_together_are_refused(self, log):
         assert "detector knn takes no file" in call("detect", log, "--detector", "knn:file").err
