@@ -182,7 +182,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/events.py:make:run": lambda s: s.untracked().says("events", "LOG"),
     "pipeline/drawing.py:find_views:run": Scene.without_views,
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
-    "pipeline/runner.py:warn_findings:retrack": Scene.side_view,
+    "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,

@@ -298,12 +298,9 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
             if value is signature.parameters[name].default:
                 continue
             kinds = _kinds(function).get(name, ())
-            choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
-            choices = [] if str in kinds else choices
             if _has_empty_name(value, kinds):
                 raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
-            if choices:
-                _check_choice(name, value, choices)
+            _check_choice(name, value, kinds)
             _check_type(name, value, kinds)
             _check_members(name, value, kinds)
             if ends := _ranges(function).get(name):
@@ -497,8 +494,9 @@ def _begin_of(value: object) -> str:
     return f"{' '.join(repr(value).split()):.40}"
 
 
-def _check_choice(name: str, value: object, choices: list[Any]) -> None:
-    if not isinstance(value, str) or value not in choices:
+def _check_choice(name: str, value: object, kinds: Sequence[Any]) -> None:
+    choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+    if choices and str not in kinds and (not isinstance(value, str) or value not in choices):
         names = list(map(str, choices))
         raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {offer(str(value), names, 'there are')}")
 

@@ -192,6 +192,10 @@ def warn_findings(state: RunState, results: Mapping[str, Provenance], planes: Pl
     if is_assumed(planes) and {how.transform for how in covered} & _IN_METRES:
         plane = plane_in_words(planes, provenances.get(camera.ground_plane))
         warn(plane, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
+    _warn_held_back(opened, covered)
+
+
+def _warn_held_back(opened: log.Log, covered: Sequence[Provenance]) -> None:
     if done := max((how.held_back for how in covered), default=""):  # of those that were linked, if there are any
         warn(
             f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
