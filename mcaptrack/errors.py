@@ -9,11 +9,15 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["DamagedError", "McaptrackError", "call", "command", "did_you_mean", "list_names", "offer"]
+__all__ = [
+    "DamagedError", "McaptrackError", "call", "command", "did_you_mean", "in_one_line", "lacks", "list_names",
+    "needing", "offer",
+]  # fmt: skip
 
 
 class McaptrackError(Exception):
@@ -26,6 +30,25 @@ class McaptrackError(Exception):
 
 class DamagedError(McaptrackError):
     """A damaged log; `mcaptrack.recover` saves what is intact."""
+
+
+def in_one_line(error: Exception, most: int | None = None) -> str:
+    """The message of an error in one line, of ``most`` characters at most; without one, the name of its type."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
+def lacks(what: str, package: str, extra: str) -> str:
+    """Say that ``what`` needs a package that isn't installed, and which extra of mcaptrack brings it."""
+    return f"{what} needs {package}, which is not installed; `pip install 'mcaptrack[{extra}]'` installs it"
+
+
+@contextmanager
+def needing(what: str, package: str, extra: str) -> Iterator[None]:
+    """A block that imports a package, for ``what``. Raises McaptrackError, with its ``extra``, if it isn't there."""
+    try:
+        yield
+    except ImportError:
+        raise McaptrackError(lacks(what, package, extra)) from None
 
 
 #: From this share of letters on, names are nearly the same.

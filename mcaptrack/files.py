@@ -10,6 +10,7 @@ import secrets
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from io import BufferedReader
 from itertools import islice
 from pathlib import Path
 from shutil import rmtree
@@ -23,8 +24,9 @@ from mcaptrack.location import SCHEMES, Location, Url, hide_secrets, shortened
 from mcaptrack.processes import MARK_DIGITS, has_ended, mark_of
 
 __all__ = [
-    "follow_links", "is_same_file", "missing", "place_of", "publish", "publish_bytes", "read_beginning", "read_json",
-    "refuse_overwrite", "refuse_special", "temporary_folder", "unreadable", "visible",
+    "follow_links", "is_same_file", "make_folder", "missing", "place_of", "publish", "publish_bytes", "read_beginning",
+    "read_json", "reading", "refuse_overwrite", "refuse_special", "temporary_folder", "unreadable", "visible",
+    "writing",
 ]  # fmt: skip
 
 
@@ -80,15 +82,39 @@ def publish_folder(folder: Path) -> Iterator[Path]:
     part = folder.with_name(shortened(f".{folder.name}", _NAME_BYTES) + ".part")
     rmtree(part, ignore_errors=True)
     try:
-        part.mkdir(parents=True)
-        yield part / folder.name
-        if folder.exists():
-            folder.rename(part / "before")  # removed in one step: half of it would be taken for another one
-        (part / folder.name).rename(folder)
-    except OSError as error:
-        raise McaptrackError(f"{folder} can't be written: {error.strerror or error}") from error
+        with writing(folder):
+            part.mkdir(parents=True)
+            yield part / folder.name
+            if folder.exists():
+                folder.rename(part / "before")  # removed in one step: half of it would be taken for another one
+            (part / folder.name).rename(folder)
     finally:
         rmtree(part, ignore_errors=True)
+
+
+@contextmanager
+def writing(what: object) -> Iterator[None]:
+    """A block that writes ``what``. Raises McaptrackError, which names it, for an error of the system in the block."""
+    try:
+        yield
+    except OSError as error:
+        raise McaptrackError(f"{what} can't be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[BufferedReader]:
+    """The bytes of a file. Raises McaptrackError if it can't be opened, or read in the block."""
+    try:
+        with path.open("rb") as stream:
+            yield stream
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder, and those above it, unless it exists. Raises McaptrackError if it can't be made."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
 
 
 def publish_bytes(path: Path, data: bytes) -> None:
@@ -243,11 +269,8 @@ def is_same_file(path: Location, other: Location) -> bool:
 def read_beginning(path: Path, count: int) -> bytes:
     """Return the first bytes of a file, at most ``count``. Raises McaptrackError if it can't be read."""
     refuse_special(path)
-    try:
-        with path.open("rb") as stream:
-            return stream.read(count)
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with reading(path) as stream:
+        return stream.read(count)
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -18,7 +18,12 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Final, Literal, NamedTuple, get_args
 
-__all__ = ["Notice", "collected", "warn"]
+__all__ = ["Notice", "Progress", "Say", "collected", "warn"]
+
+#: Called with the name of a stage, the amount that is done, and the total.
+Progress = Callable[[str, int, int], None]
+#: Called with a note: a line that says what is done.
+Say = Callable[[str], None]
 
 #: The codes of warnings, for programs. docs/warnings.md explains them.
 Code = Literal[

@@ -86,7 +86,7 @@ class TestErrors:
         "ingest clip.mp4 -o clip.mp4 --force": "clip.mp4 is both input and output",
         "run a.mcap -o a.mcap --force": "a.mcap is both input and output",
         "run text.mp4": "text.mp4 can't be read as an MCAP file",
-        "detect a.mcap --detector mog2": "no detector is called mog2; knn took its place;",
+        "detect a.mcap --detector mog2": "no detector is called mog2;",
         "info link.mcap": "link.mcap is a link to gone.mcap, which does not exist",
         "info folder": "the folder folder has no log, which is a file that ends with .mcap and no part of a recording",
         "run clip.mp4": "clip.mp4 is a video, not an MCAP file; `mcaptrack ingest clip.mp4`",

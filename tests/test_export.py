@@ -81,6 +81,7 @@ def test_unusable_ground_truth_leaves_no_scores_and_a_note(tmp_path):
     done = exported(tmp_path / "a.mcap", tmp_path / "tables")
     assert done.rows["metrics"] == 0
     assert "has no tracks to score" in done.notes[0]
+    assert done.notes[0].endswith(f"role='tracks', into='{tmp_path / 'a.mcap'}')` takes them from a file")
 
 
 def test_recordings_say_what_the_log_is(tmp_path):

@@ -107,7 +107,8 @@ def test_the_median_length_tells_whether_sizes_are_metres(lengths, refused, tmp_
         return
     with pytest.raises(McaptrackError) as error:
         read_labels(path, role="truth")
-    assert str(error.value) == f"{path}: the median length of its boxes is {refused}; sizes have to be in metres"
+    why = f"the median length of its boxes is {refused}; sizes have to be in metres"
+    assert str(error.value) == f"{path}: {why}, as positions have, not in centimetres or millimetres"
 
 
 def test_rows_without_sizes_or_heights_are_boxes_too(tmp_path):
@@ -117,6 +118,14 @@ def test_rows_without_sizes_or_heights_are_boxes_too(tmp_path):
     assert np.isnan(found.boxes_m[:, 2:]).all()
     assert found.frame.tolist() == [0, 250_000_000, 500_000_000]
     assert not found.doubts
+
+
+@pytest.mark.parametrize("per_metre", [1, 1000])
+def test_positions_in_millimetres_are_said_to_be_no_metres(per_metre, tmp_path):
+    rows = [{"t": n / 4, "id": 5, "x_m": 5.5 * n * per_metre, "y_m": 0} for n in range(3)]
+    path = table(tmp_path, *rows)
+    text = f"{path}: positions spread over 9900 m, as millimetres do; they have to be metres"
+    assert read_labels(path, role="truth").doubts == [(text, "units")] * (per_metre > 1)
 
 
 @pytest.mark.parametrize(

@@ -193,7 +193,7 @@ class TestDisplacement:
             assert found.false_forecasts == 0
             assert found.ade_m.tolist() == []
 
-    def test_errors_by_step_are_of_pairs_below_the_threshold(self):
+    def test_errors_by_step_are_of_pairs_below_the_threshold(self, monkeypatch):
         """Two people; one track is 1 m off and so d_obs is 1 m^2, the other 2 m off, which is 4 m^2."""
         truth = positions(straight(1, range(10)) | straight(2, range(10), lane=30.0))
         tracks = positions(straight(5, range(10), lane=1.0) | straight(6, range(10), lane=32.0))
@@ -203,8 +203,10 @@ class TestDisplacement:
         result = displacement(truth, tracks, made)
         assert sorted(result.d_obs_m2.tolist()) == pytest.approx([1.0, 4.0])
         assert result.errors_by_step().tolist() == [[0.5, 1.5, 2.5]]  # tau is 2 m^2
-        assert sorted(result.errors_by_step(5.0).tolist()) == [[0.5, 1.5, 2.5], [7.0, 8.0, 9.0]]
-        assert result.errors_by_step(1.0).tolist() == []  # less than the threshold, not equal to it
+        for tau_m2, wanted in ((5.0, [[0.5, 1.5, 2.5], [7.0, 8.0, 9.0]]), (1.0, [])):  # less than it, not equal to it
+            with monkeypatch.context() as patch:
+                patch.setattr("mcaptrack.evaluation.metrics.displacement.TAU_M2", tau_m2)
+                assert sorted(result.errors_by_step().tolist()) == wanted
         assert result.summary()["recall"] == 0.5
 
     def test_consistency_of_consecutive_forecasts_by_hand(self):

@@ -112,7 +112,7 @@ def of_a_log(to: Transcript) -> None:
     to.run("evaluate a.mcap b.mcap --similarity metres --gate-m 1")
     to.run("evaluate a.mcap b.mcap --csv --similarity iou")
     to.run("evaluate a.mcap --json --similarity iou --topic /camera/tracks")
-    to.run("evaluate a.mcap --fail-under IDF1=1.5 --fail-under mota=-1 --similarity iou --topic /camera/tracks")
+    to.run("evaluate a.mcap --fail-under IDF1=1 --fail-under mota=-1 --similarity iou --topic /camera/tracks")
     to.took()
 
 
@@ -278,7 +278,7 @@ def of_mistakes(to: Transcript) -> None:
         to.run(f"{command} x.mcap y.mcap -o z.mcap")
     for gates in ("0", "1,-1", "inf", "nan", "1,", "''"):
         to.run(f"evaluate x.mcap --gate-m {gates}")
-    for limit in ("idf1", "idf1=", "luck=1"):
+    for limit in ("idf1", "idf1=", "luck=1", "idf1=70", "idf1=nan"):
         to.run(f"evaluate x.mcap --fail-under {limit}")
     for words in ("alpha", "alhpa=1", "alpha=x", "min_hits=1.5", "trim_ends=maybe", "alpha=1 --set alpha=2",
                   "max_age_s=1 --max-age-s 2", "alpha=2 --profile paper"):  # fmt: skip

@@ -19,7 +19,7 @@ import textwrap
 import types
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from numbers import Integral, Real
 from pathlib import Path
 from typing import (
@@ -292,17 +292,15 @@ def checked(function: Callable[P, T]) -> Callable[P, T]:
     def call(*args: P.args, **kwargs: P.kwargs) -> T:
         for name in () if has_more else kwargs:
             if name not in signature.parameters:
-                raise TypeError(f"{function.__name__}() has no parameter {name}; {_others(name, signature.parameters)}")
+                others = missing_extension(name) or offer(name, signature.parameters, "there are")
+                raise TypeError(f"{function.__name__}() has no parameter {name}; {others}")
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if value is signature.parameters[name].default:
                 continue
             kinds = _kinds(function).get(name, ())
-            choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
-            choices = [] if str in kinds else choices
             if _has_empty_name(value, kinds):
                 raise McaptrackError(f"`{name}=` is an empty name; give the name of a file or folder")
-            if choices:
-                _check_choice(name, value, choices)
+            _check_choice(name, value, kinds)
             _check_type(name, value, kinds)
             _check_members(name, value, kinds)
             if ends := _ranges(function).get(name):
@@ -321,13 +319,14 @@ def done_by(*command_line: str, **options: bool) -> Callable[[Callable[P, T]], C
 
     Messages that name a call of it name that command on the command line.
     """
+    return partial(_checked_with, done_by=(command_line, options))
 
-    def decorate(function: Callable[P, T]) -> Callable[P, T]:
-        call = checked(function)
-        vars(call).update(done_by=(command_line, options))
-        return call
 
-    return decorate
+def _checked_with(function: Callable[P, T], **facts: Any) -> Callable[P, T]:
+    """A function that is ``checked``, with facts that the command line asks for."""
+    call = checked(function)
+    vars(call).update(facts)
+    return call
 
 
 def declared(
@@ -355,10 +354,10 @@ def declared(
             _take_more(function, more)
         if function.__doc__:  # there is none with python -OO
             function.__doc__ = _completed(function)
-        call = checked(function)
-        vars(call).update(most_used=most_used, settable=settable, python_only=python_only)
-        vars(call).update(heading=heading, printed_by=printed_by)
-        return call
+        return _checked_with(
+            function, most_used=most_used, settable=settable, python_only=python_only, heading=heading,
+            printed_by=printed_by,
+        )  # fmt: skip
 
     return decorate
 
@@ -453,11 +452,6 @@ def _ranges(function: Callable[..., object]) -> dict[str, tuple[float, float]]:
     return {name: pair for name, pair in ends.items() if pair != (-math.inf, math.inf)}
 
 
-def _others(name: str, every: Iterable[str]) -> str:
-    """The advice about a parameter that doesn't exist."""
-    return missing_extension(name) or offer(name, every, "there are")
-
-
 def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
     """The paths among the value of a parameter of these types: itself, members of a sequence, values of a mapping."""
     if isinstance(value, Mapping):
@@ -469,16 +463,12 @@ def _paths_in(value: Any, kinds: Iterable[Any]) -> Iterable[Any]:
 
 def _has_empty_name(value: Any, kinds: Iterable[Any]) -> bool:
     """Whether a path among a value is empty; arrays, which can't be compared, are none."""
-    return any(isinstance(path, str) and not path for path in map(_name_of, _paths_in(value, kinds)))
+    return any(isinstance(path, str | os.PathLike) and not os.fspath(path) for path in _paths_in(value, kinds))
 
 
 def _holds_paths(kind: Any) -> bool:
     whole = get_origin(kind) or kind
     return (isinstance(whole, type) and issubclass(whole, os.PathLike)) or any(map(_holds_paths, get_args(kind)))
-
-
-def _name_of(path: Any) -> Any:
-    return os.fspath(path) if isinstance(path, os.PathLike) else path
 
 
 def _check_type(name: str, value: object, kinds: Sequence[Any]) -> None:
@@ -504,8 +494,9 @@ def _begin_of(value: object) -> str:
     return f"{' '.join(repr(value).split()):.40}"
 
 
-def _check_choice(name: str, value: object, choices: list[Any]) -> None:
-    if not isinstance(value, str) or value not in choices:
+def _check_choice(name: str, value: object, kinds: Sequence[Any]) -> None:
+    choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+    if choices and str not in kinds and (not isinstance(value, str) or value not in choices):
         names = list(map(str, choices))
         raise McaptrackError(f"`{name}=` can't be {value!r:.40}; {offer(str(value), names, 'there are')}")
 

@@ -34,7 +34,9 @@ _COMPARED: Final[Mapping[str, Callable[[Any, Any], bool]]] = {
 _LITTLE_BYTES: Final = 1_000_000_000
 #: The line of a module in the list of files that pip keeps of a package.
 _MODULES: Final = re.compile(r"^([^/,\n]+)/__init__\.py,", re.MULTILINE)
-_REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*(?:[^;]*?>=\s*([\d.]+))?[^;]*(?:;(.*))?")
+#: A requirement of a package: its name, the limits of its version, and its marker; and one of these limits.
+_REQUIREMENT: Final = re.compile(r"([\w.-]+)\s*(?:\[[^]]*\])?\s*([^;]*?)\s*(?:;(.*))?")
+_LIMIT: Final = re.compile(r"(>=|<=|~=|==|!=|>|<)\s*([\d.]+)(?![\d.]|\*)")
 
 
 def temporary_folder() -> tuple[Path | None, str]:
@@ -302,17 +304,13 @@ def _packages() -> tuple[dict[str, str], dict[str, tuple[str, ...]], list[str]]:
     packages: dict[str, str] = {}
     lacking: dict[str, list[str]] = {}
     faults = []
-    for match, have in _requirements("mcaptrack"):
-        name, least, marker = match.groups(default="")
+    for name, limits, marker, lack in _requirements("mcaptrack"):
         extra = re.search(r"extra\s*==\s*['\"]([\w-]+)['\"]", marker)
-        is_enough = bool(have) and _numbers(have) >= _numbers(least)
         if extra is None:
-            packages[name] = have
-            if not is_enough:
-                lack = f"only version {have} is installed" if have else "it is not installed"
-                faults.append(f"{name}: {lack}; `pip install '{name}>={least}'` installs what is needed")
+            packages[name] = _version_of(name)
+            faults += [f"{name}: {lack}; `pip install '{name}{limits}'` installs what is needed"] if lack else []
         elif extra[1] not in _NOT_SHOWN:
-            lacking.setdefault(extra[1], []).extend([] if is_enough else [name])
+            lacking.setdefault(extra[1], []).extend([name] if lack else [])
     return packages, {name: tuple(names) for name, names in lacking.items()}, faults
 
 
@@ -334,14 +332,19 @@ def _overwritten(packages: Collection[str]) -> Iterator[str]:
             )
 
 
-def _requirements(package: str) -> Iterator[tuple[re.Match[str], str]]:
-    """Yield what a package needs, and which version of it is installed; "" for none."""
+def _requirements(package: str) -> Iterator[tuple[str, str, str, str]]:
+    """Yield what a package needs: its name, limits of its version, the marker, and what is lacking; "" if nothing."""
     try:
         texts = metadata.requires(package) or []
     except metadata.PackageNotFoundError:
         warn(f"{package} is not installed as a package: which versions of others it needs is unknown")
         return
-    yield from ((match, _version_of(match[1])) for text in texts if (match := _REQUIREMENT.match(text)))
+    for match in filter(None, map(_REQUIREMENT.fullmatch, texts)):
+        name, limits, marker = match.groups(default="")
+        have = _version_of(name)
+        fits = all(_COMPARED[sign](_numbers(have), _numbers(limit)) for sign, limit in _LIMIT.findall(limits))
+        lack = f"version {have} is installed" if have else "it is not installed"
+        yield name, limits, marker, "" if have and fits else lack
 
 
 def _version_of(name: str) -> str:
@@ -390,20 +393,11 @@ def _plugins() -> dict[str, str]:
     for reason in filter(None, reasons.values()):
         warn(reason, "other")
     for package in packages:
-        for conflict in _conflicts(package):
-            warn(conflict, "other-version")
+        for name, limits, marker, lack in _requirements(package):
+            if lack and not marker:  # with a marker it isn't needed everywhere
+                needs = f"{package} {_version_of(package)} needs {name}{limits}"
+                warn(f"{needs}, and {lack}; install another version of one", "other-version")
     return reasons
-
-
-def _conflicts(package: str) -> Iterator[str]:
-    """Yield a sentence for each requirement of a package that what is installed doesn't meet."""
-    for match, have in _requirements(package):
-        limits = re.findall(r"(>=|<=|~=|==|!=|>|<)\s*([\d.]+)(?![\d.]|\*)", match[0])
-        is_met = bool(have) and all(_COMPARED[sign](_numbers(have), _numbers(limit)) for sign, limit in limits)
-        if not match[3] and not is_met:  # with a marker it isn't needed everywhere
-            needs = f"{package} {_version_of(package)} needs {match[0].strip()}"
-            lack = f"version {have} is installed" if have else "it is not installed"
-            yield f"{needs}, and {lack}; install another version of one"
 
 
 def _parts() -> dict[str, str]:

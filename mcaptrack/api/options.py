@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Final
 
 from mcaptrack.api.declared import OneOfMany, Option, PythonOnly
 from mcaptrack.choices import Point
+from mcaptrack.notices import Progress
 
 if TYPE_CHECKING:
     from mcaptrack.registry import Kind
@@ -19,8 +20,6 @@ __all__ = [
 ]  # fmt: skip
 
 PathLike = str | os.PathLike[str]
-#: Called with the name of a stage, the amount that is done, and the total.
-Progress = Callable[[str, int, int], None]
 
 #: Headings of options in the help.
 FILES: Final = "Input and output"

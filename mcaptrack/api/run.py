@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Annotated, Final, Unpack
 
 import mcaptrack
@@ -30,6 +30,7 @@ from mcaptrack.api.stages import Stages
 from mcaptrack.choices import CameraMotionUse
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation.events import EventOptions
+from mcaptrack.notices import Say
 from mcaptrack.transforms import STAGES, Transform
 from mcaptrack.transforms.motion_limits import LIMITS_PATTERN
 
@@ -191,9 +192,7 @@ def run(
     settings = {"camera_motion": camera_motion, "across_classes": across_classes, "class_limits": class_limits}
     shared = {name: value for name, value in settings.items() if value is not None}
 
-    def plan(
-        opened: logs.Log, prefix: str, say: Callable[[str], None], changed: Collection[str], renewed: Collection[str]
-    ) -> list[Job]:
+    def plan(opened: logs.Log, prefix: str, say: Say, changed: Collection[str], renewed: Collection[str]) -> list[Job]:
         others = unfitting(opened, prefix, transforms, say) if len(names) != 1 and topic is None else set()
         kept = {stage: transform for stage, transform in transforms.items() if stage not in others}
         options = chosen.keys() - {STAGES[stage].option for stage in others}

@@ -18,11 +18,11 @@ from mcaptrack.api.common import Notes, as_location, log_output, warnings_about
 from mcaptrack.api.declared import checked
 from mcaptrack.api.options import PathLike, Progress, Value, no_progress
 from mcaptrack.choices import Mode
-from mcaptrack.errors import McaptrackError, call, did_you_mean
+from mcaptrack.errors import McaptrackError, call
 from mcaptrack.files import publish, publish_bytes, refuse_overwrite, sweep
 from mcaptrack.installed import missing_extension
 from mcaptrack.location import Location
-from mcaptrack.notices import Notice, warn
+from mcaptrack.notices import Notice, Say, warn
 from mcaptrack.pipeline import AS_BEFORE, Job, PlaneChoice
 from mcaptrack.pipeline.several import (
     Act,
@@ -40,13 +40,14 @@ from mcaptrack.sources.foreign.boxes import choosing
 from mcaptrack.sources.foreign.definitions import definitions_of
 from mcaptrack.sources.sidecar import SidecarChoice
 from mcaptrack.transforms import STAGES, Stage, Transform
+from mcaptrack.transforms.stages import refuse_unknown
 
 if TYPE_CHECKING:
     from mcaptrack import _OfFinishers
     from mcaptrack.contracts import Finished
     from mcaptrack.pipeline import Summary
     from mcaptrack.pipeline.runner import Finish
-    from mcaptrack.pipeline.scenes import Say, Scenes
+    from mcaptrack.pipeline.scenes import Scenes
     from mcaptrack.pipeline.write import Made
 else:
     _OfFinishers = object
@@ -241,7 +242,7 @@ class RunResult(_OfFinishers):
 OF_JSON: Final = ("next", "written_there_because")
 #: Plans the jobs for a log; takes the open log, the prefix of its camera, a function that takes notes, and the topics
 #: that were made again already, and those that are to be made again.
-Plan = Callable[[logs.Log, str, Callable[[str], None], Collection[str], Collection[str]], list[Job]]
+Plan = Callable[[logs.Log, str, Say, Collection[str], Collection[str]], list[Job]]
 
 
 @dataclass(frozen=True)
@@ -492,12 +493,7 @@ def _with_options(base: Transform, options: Mapping[str, Value]) -> Transform:
             f"{base!r:.80} is no transform: it is no dataclass; give a name, or an object of a transform"
         )
     own = [f.name for f in fields(base) if not f.metadata.get("context")]
-    for name in options:
-        if name not in own:
-            raise McaptrackError(
-                f"{type(base).__name__} has no parameter {name}; {did_you_mean(name, own)}"
-                f"there are {', '.join(own) or 'none'}"
-            )
+    refuse_unknown(type(base).__name__, options, own)
     return replace(base, **options)
 
 
@@ -531,7 +527,7 @@ def run_stage(
     keep = modes[mode or "both"] or None if modes else None
     before = transforms_of(stages)
 
-    def plan(opened: logs.Log, prefix: str, say: Callable[[str], None], *_: Collection[str]) -> list[Job]:
+    def plan(opened: logs.Log, prefix: str, say: Say, *_: Collection[str]) -> list[Job]:
         return pipeline.plan_stage(opened, prefix, stage, transform, topic, to, keep, say, before, frame or "", make)
 
     where = Where(log, camera, topic, output, sidecar, force)

@@ -485,13 +485,9 @@ def _around(opened: Log, number: int, margin_s: float) -> tuple[float, float]:
     """Return the seconds of a log around an event: from before the track was lost. Raises McaptrackError if there is
     none.
     """
-    from mcaptrack.viewing.links import find_moments, seconds_of
+    from mcaptrack.viewing.links import event_of, find_moments, seconds_of
 
-    events = find_moments(opened)
-    if number > len(events):
-        what_there_is = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
-        raise McaptrackError(f"{opened.path} has {what_there_is}, not event {number}")
-    event = events[number - 1]
+    event = event_of(opened, find_moments(opened), number)
     at_s = seconds_of(opened, event.t_ns)
     return max(0.0, at_s - event.unseen_s - margin_s), at_s + margin_s
 

@@ -20,7 +20,7 @@ from mcaptrack.api.common import as_path, log_file
 from mcaptrack.api.declared import Argument, Option, declared
 from mcaptrack.api.options import PathLike
 from mcaptrack.errors import McaptrackError, call, offer
-from mcaptrack.files import unreadable
+from mcaptrack.files import read_json
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import Notice, collected, warn
@@ -44,6 +44,8 @@ _FOLDER: Final = "page"
 _GIVEN: Final[Mapping[str, type[Any]]] = {"make": bytes, "link": str, "why_not": str}
 #: The time in the text of an event.
 _WHEN: Final = re.compile(r",? at [0-9]+\.[0-9] s\b")
+#: A larger file is no layout.
+_MOST_BYTES: Final = 2**26
 
 
 @dataclass(frozen=True)
@@ -434,10 +436,7 @@ def _opening(opened: logs.Log, events: Sequence[LinkedEvent], at_s: float | None
             raise McaptrackError(f"{opened.path} lasts {length_s:.1f} s, so viewers can't open it at {at_s:g} s")
         return opened.start_ns + round(at_s * NS_PER_S), "as asked"
     if event is not None:
-        if event > len(events):
-            what_there_is = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
-            raise McaptrackError(f"{opened.path} has {what_there_is}, so viewers can't open at event {event}")
-        chosen = events[event - 1]
+        chosen = links.event_of(opened, events, event)
         return chosen.opens_ns(opened.start_ns), f"before event {event} ({chosen.text})"
     return links.opening_moment(opened, events)
 
@@ -467,12 +466,7 @@ def _chosen_layouts(
     """Return the layouts to serve by name: the name of each file, and its content or path."""
     if chosen is not None and str(chosen) not in LAYOUTS and _is_file_name(chosen):
         file = as_path(chosen)
-        try:
-            json.loads(file.read_bytes())
-        except OSError as error:
-            raise unreadable(file, error) from None
-        except (ValueError, RecursionError):
-            raise McaptrackError(f"{file} is no layout: it is not JSON") from None
+        read_json(file, "a layout", _MOST_BYTES)
         return {file.stem.removesuffix(".layout"): (f"{file.stem}.json", file)}
     layouts = _layouts(path, opened, made_layouts, notes)
     if chosen is not None and str(chosen) not in layouts:

@@ -29,8 +29,6 @@ from mcaptrack.errors import list_names, similar
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import warn
 
-__all__ = ["warn_unused"]
-
 #: The exception of Typer for a command line that it can't parse.
 _UsageError: Final[Any] = typer.BadParameter.__bases__[0]
 
@@ -279,20 +277,11 @@ def is_option_given(parameter: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-def is_stronger(parameter: str, other: str) -> bool:
-    """Whether a stronger source gave a parameter of the running command than another parameter."""
+def is_stronger(parameter: str) -> bool:
+    """Whether a stronger source gave a parameter of the running command than ``--set``."""
     context: Any = RUNNING.get()
     set_values = found_of(context.info_name)
-    return _rank(context, parameter, set_values)[0] < _rank(context, other, set_values)[0]
-
-
-def warn_unused(reason: str, *parameters: str) -> None:
-    """Warn of options on the command line that have no effect in this call; ``reason`` says why.
-
-    ``parameters`` are the names of the options in Python.
-    """
-    for parameter in filter(is_on_command_line, parameters):
-        warn(f"`{parameter}=` changes nothing here: {reason}", "option-not-used")
+    return _rank(context, parameter, set_values)[0] < _rank(context, "set", set_values)[0]
 
 
 # Parameters without an option of their own.

@@ -129,10 +129,14 @@ def _limit(text: str) -> tuple[str, float]:
     names = {name.lower(): name for name in LIMITS}
     name, _, value = text.partition("=")
     try:
-        return names[name.strip().lower()], float(value)
+        limit = float(value)
+        if not limit <= 1:
+            raise ValueError(value)
+        return names[name.strip().lower()], limit
     except (KeyError, ValueError):
         raise McaptrackError(
-            f"--fail-under needs a score and a number, as in idf1=0.7, not {text!r}; {offer(name, names, 'there are')}"
+            f"--fail-under needs a score and a share, 1 at most, as in idf1=0.7, not {text!r}; "
+            f"{offer(name, names, 'there are')}"
         ) from None
 
 

@@ -76,7 +76,7 @@ class StageCommand(RunsStages):
         for option, value in self.values["set"].items():
             if option in wanted and is_option_given(option) and is_option_given("set"):
                 raise McaptrackError(f"--set {option} and the option of this name are both given; give one of them")
-            if option not in wanted or not is_stronger(option, "set"):
+            if option not in wanted or not is_stronger(option):
                 wanted[option] = value
         make = Maker.of(stage, self.values, wanted, owners)
         with stdout_to_stderr():

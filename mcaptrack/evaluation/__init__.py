@@ -250,7 +250,9 @@ def sequence_of_log(opened: log.Log, prefix: str, topics: Sequence[str]) -> Eval
         topic for topic in usual if topic in opened.channels
     ]
     if not chosen:
-        raise McaptrackError(f"{opened.path} has no tracks to score; {call('run', opened.path)} makes them")
+        makes = f"{call('run', opened.path)} makes them of pictures or detections"
+        adds = call("ingest", "LABELS", role="tracks", into=opened.path)
+        raise McaptrackError(f"{opened.path} has no tracks to score; {makes}, {adds} takes them from a file")
     forecasts_of = {f"{prefix}/{tracks}": f"{prefix}/{name}" for name, tracks in FORECAST_INPUTS.items()}
     candidates = []
     for topic in chosen:

@@ -99,7 +99,7 @@ def candidates_of_log(opened: log.Log, prefix: str, against: str, topics: Sequen
     chosen = [opened.find(topic, prefix) for topic in topics] or [
         topic
         for topic in sorted(camera_at(opened, prefix).topics)
-        if opened.channels[topic].holds(TRACKS) and topic not in (reference, truth)
+        if opened.holds(topic, TRACKS) and topic not in (reference, truth)
     ]
     rule = MatchRule("metres", GATE_3D_M if are_3d(frames, frames) else GATE_M)
     names = class_names(opened.channel(reference).metadata)
@@ -119,8 +119,7 @@ def candidates_of_log(opened: log.Log, prefix: str, against: str, topics: Sequen
 def _relation(opened: log.Log, topic: str, reference: str) -> str:
     """The tracks that a channel and the reference both come from, as a reason; "" if there are none."""
     own, other = (
-        [name for name, _ in lineage(opened, end) if name in opened.channels and opened.channels[name].holds(TRACKS)]
-        for end in (topic, reference)
+        [name for name, _ in lineage(opened, end) if opened.holds(name, TRACKS)] for end in (topic, reference)
     )
     shared = next((name for name in own if name in other), "")
     if shared in ("", topic, reference):

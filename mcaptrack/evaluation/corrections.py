@@ -87,8 +87,7 @@ def changes_in(opened: log.Log, topic: str) -> Changes | None:
     They are of the re-tracked boxes of their camera, or of its tracks if the ids fit those better.
     """
     prefix = topic.removesuffix(f"/{CORRECTED}")
-    names = [f"{prefix}/{name}" for name in CORRECTED_FROM]
-    present = [name for name in names if name in opened.channels and opened.channels[name].holds(TRACKS)]
+    present = [name for below in CORRECTED_FROM if opened.holds(name := f"{prefix}/{below}", TRACKS)]
     corrected = opened.frame_columns(topic, TRACKS)
     classes = {name: class_names(opened.channel(name).metadata) for name in (*present, topic)}
     compared = [

@@ -23,13 +23,14 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 from mcaptrack import __version__
 from mcaptrack.api.declared import checked
 from mcaptrack.errors import McaptrackError, did_you_mean, list_names
-from mcaptrack.files import place_of
+from mcaptrack.files import make_folder, place_of
 from mcaptrack.fleet import ledger
 from mcaptrack.fleet.expansion import NamedLog, find_logs, outputs_in
 from mcaptrack.fleet.ledger import Claims, Ledger, digest_of_log, digest_of_settings
 from mcaptrack.fleet.results import AGAIN, GOOD, FleetResult, FleetStatus, LogOutcome, Running, Watch
 from mcaptrack.fleet.worker import Child, Reply, Request, StoppedError, WorkerLimits, memory_in_bytes
 from mcaptrack.location import Location, Url
+from mcaptrack.notices import Progress, Say
 from mcaptrack.registry import find
 
 T = TypeVar("T")
@@ -94,7 +95,7 @@ class Fleet(Generic[T]):
         keep_going: bool,
         hear: Callable[[LogOutcome[T]], None],
         watch: Watch,
-        say: Callable[[str], None],
+        say: Say,
     ) -> None:
         self._task = task_of(function, options)
         self._crew, self._ledger, self._claims = crew, ledger, Claims()
@@ -278,7 +279,7 @@ def run(
     on_outcome: Callable[[LogOutcome[T]], None] | None = None,
     on_status: Watch | None = None,
     on_note: Callable[[str], None] | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> FleetResult[T]:
     """Run a function on many logs, each in a worker process that stays warm for the next one.
 
@@ -366,7 +367,7 @@ def run(
         location = str(place_of(named_log.path))  # its name in ledgers and claims: without links
         work.append(QueuedLog(number, named_log.path, location, own, place))
     for output in outputs:
-        _make_folder(output.parent)
+        make_folder(output.parent)
     limits = WorkerLimits(min(jobs or 1, len(named_logs)), os.getcwd(), timeout_s, memory_in_bytes(memory_limit))
 
     def watch(status: FleetStatus) -> None:
@@ -471,10 +472,3 @@ def _check_options(function: Callable[..., Any], options: Mapping[str, Any], nam
 def _name_of(function: Any) -> str:
     """Return the name of a function, also of one with some arguments given."""
     return str(getattr(getattr(function, "func", function), "__name__", type(function).__name__))
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise McaptrackError(f"the folder {folder} can't be made: {error.strerror or error}") from error

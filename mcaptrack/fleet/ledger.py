@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import refuse_special
+from mcaptrack.files import refuse_special, writing
 from mcaptrack.location import Location, Url
 from mcaptrack.log import results_path
 from mcaptrack.notices import warn
@@ -52,11 +52,8 @@ class Ledger:
         self._last: dict[str, Mapping[str, Any]] = {}
         self._bad = 0
         self._can_append = True
-        try:
-            with _opened(path, os.O_RDWR | os.O_CREAT) as handle:
-                start = os.pread(handle, 4096, 0).lstrip()
-        except OSError as error:
-            raise McaptrackError(f"the ledger {path} can't be written: {error.strerror or error}") from error
+        with writing(f"the ledger {path}"), _opened(path, os.O_RDWR | os.O_CREAT) as handle:
+            start = os.pread(handle, 4096, 0).lstrip()
         if start and not start.startswith(b"{"):
             raise McaptrackError(f"{path} is not a ledger: it does not begin with a line of JSON; give another name")
         self.refresh()

@@ -31,7 +31,7 @@ from types import FrameType
 from typing import IO, Any, Final, NoReturn
 
 from mcaptrack.environment import THREADS, cores, set_up_libraries
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, in_one_line
 from mcaptrack.fleet.ledger import digest_of_log
 from mcaptrack.fleet.results import LogOutcome, State
 from mcaptrack.location import Location
@@ -78,7 +78,7 @@ def do(request: Request, progress: Callable[[str, float, float | None], None]) -
         files = tuple(os.path.abspath(file) for file in getattr(result, "files", ()) if isinstance(file, Path))
         reply = Reply(request.log, state, answer, digest=digest, files=files)
     except McaptrackError as error:
-        reply = Reply(request.log, "failed", error=" ".join(str(error).split()))
+        reply = Reply(request.log, "failed", error=in_one_line(error))
     except MemoryError:
         reply = Reply(request.log, "out-of-memory", error=f"{request.log}: the memory of this machine is not enough")
     except Exception as error:

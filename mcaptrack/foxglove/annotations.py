@@ -237,6 +237,11 @@ def paint(front: str = "") -> dict[str, Slot]:
     return {name: Slot(front + name) for name in "rgba"}
 
 
+def shades(front: str, rgb: Floats) -> dict[str, Floats]:
+    """The columns of colours (N, 3) for such slots."""
+    return {front + name: rgb[:, place] for place, name in enumerate("rgb")}
+
+
 class Annotations(StampedMessages):
     """The annotations of F pictures with these stamps. Objects name their picture by its index (N,), rising."""
 
@@ -254,11 +259,10 @@ class Annotations(StampedMessages):
 
         With ``dashes`` each side is so many dashes, of which two are at its ends.
         """
-        shades = {name: rgb[:, place] for place, name in enumerate("rgb")}
-        more = {f"fill_{name}": values for name, values in (*shades.items(), ("a", alpha * fill))} if fill else {}
+        more = shades("fill_", rgb) | {"fill_a": alpha * fill} if fill else {}
         xy = short(_dashed(xy_px, dashes) if dashes else xy_px, PER_PX)
         template = _loop(xy.shape[1], thickness, bool(fill), LINE_LIST if dashes else LINE_LOOP)
-        self._add(frame, template, points__x=xy[..., 0], points__y=xy[..., 1], a=alpha, **shades, **more)
+        self._add(frame, template, points__x=xy[..., 0], points__y=xy[..., 1], a=alpha, **shades("", rgb), **more)
         self._drawn[frame] = True
 
     def pairs(self, frame: Ints, xy_px: Floats, rgb: Floats, alpha: Floats, thickness: float) -> None:
@@ -267,10 +271,13 @@ class Annotations(StampedMessages):
         Lines of one thickness become one annotation of a picture, because a stamp takes more bytes than a line.
         """
         xy = short(xy_px, PER_PX)
-        shades = {f"colours__{name}": rgb[:, place, None] for place, name in enumerate("rgb")}
         template = _some_lines(xy.shape[1])
         parts = template.filled(
-            len(frame), points__x=xy[..., 0], points__y=xy[..., 1], colours__a=short(alpha, 64), **shades
+            len(frame),
+            points__x=xy[..., 0],
+            points__y=xy[..., 1],
+            colours__a=short(alpha, 64),
+            **shades("colours__", rgb[..., None]),
         )
         self._lines.setdefault(thickness, []).append(group(parts, frame, self._count))
         self._drawn[frame] = True
@@ -279,13 +286,9 @@ class Annotations(StampedMessages):
         """Write labels (N,), numbers or texts, from positions (N, 2) on, on backgrounds of colours (N, 3)."""
         xy, dark = short(xy_px, PER_PX), ink(rgb)
         for length, chosen, texts in by_length(labels):
-            shades = {
-                f"{front}_{name}": values[chosen, place]
-                for front, values in (("text", dark), ("ground", rgb))
-                for place, name in enumerate("rgb")
-            }
-            at = {"x": xy[chosen, 0], "y": xy[chosen, 1]}
-            self._add(frame[chosen], _text(length, size_px), text=texts, **at, **shades)
+            more = shades("text_", dark[chosen]) | shades("ground_", rgb[chosen])
+            more |= {"x": xy[chosen, 0], "y": xy[chosen, 1]}
+            self._add(frame[chosen], _text(length, size_px), text=texts, **more)
 
     def messages(self) -> Iterator[bytes]:
         """The message of each picture, in order."""

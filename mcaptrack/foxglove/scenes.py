@@ -26,6 +26,7 @@ from mcaptrack.foxglove.annotations import (
     by_length,
     joined,
     paint,
+    shades,
     short,
 )
 from mcaptrack.foxglove.messages import SCENE, message_class
@@ -110,7 +111,7 @@ class SceneMessages(StampedMessages):
                 frame[chosen], template, entity_id=texts, label=np.char.add(sign.encode(), texts),
                 x=xy[chosen, 0], y=xy[chosen, 1], a=alpha[chosen],
                 text_x=xy[chosen, 0], text_y=xy[chosen, 1], text_z=text_z[chosen],
-                **_shades("", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
+                **shades("", rgb[chosen]), **shades("text_", legible(rgb[chosen])),
                 **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
@@ -139,8 +140,8 @@ class SceneMessages(StampedMessages):
             self._add(
                 frame[chosen], template, entity_id=texts, label=np.char.add(sign.encode(), texts), a=alpha[chosen],
                 **place, **above, **extent,
-                **front, **_turned(boxes.heading_rad[chosen]), **_shades("", rgb[chosen]),
-                **_shades("ahead_", rgb[chosen]), **_shades("text_", legible(rgb[chosen])),
+                **front, **_turned(boxes.heading_rad[chosen]), **shades("", rgb[chosen]),
+                **shades("ahead_", rgb[chosen]), **shades("text_", legible(rgb[chosen])),
                 **_line(trail[chosen], rgb[chosen], fade),
             )  # fmt: skip
 
@@ -161,10 +162,10 @@ class SceneMessages(StampedMessages):
             )
             more = {}
             if ellipses:
-                (at, half, turn), shades = (part[chosen] for part in ellipses), _shades("", rgb[chosen])
+                at, half, turn = (part[chosen] for part in ellipses)
                 size = np.maximum(_short(2 * half), 1 / PER_M)
-                more = {"x": _short(at[:, 0]), "y": _short(at[:, 1]), "wide": size[:, 0], "deep": size[:, 1], **shades}
-                more |= _turned(turn)
+                more = {"x": _short(at[:, 0]), "y": _short(at[:, 1]), "wide": size[:, 0], "deep": size[:, 1]}
+                more |= shades("", rgb[chosen]) | _turned(turn)
                 more |= {"z": _short(at[:, 2] + _DISC_M)} if is_high else {}
             line = _line(path[chosen], rgb[chosen], fade)
             self._add(frame[chosen], template, entity_id=texts, **more, **line)
@@ -185,8 +186,8 @@ class SceneMessages(StampedMessages):
         for length, chosen, texts in by_length(np.array(labels, object)):
             template = _zone(self._frame_id, self._lifetime_ns, name, points, is_closed, length, rgba, height_m)
             at = {f"text_{axis}": np.full(len(chosen), _short(label_m)[place]) for place, axis in enumerate("xy")}
-            shades = _shades("text_", np.broadcast_to(rgba[:3], (len(chosen), 3)))
-            self._add(frame[chosen], template, label=texts, **at, **shades)
+            colours = shades("text_", np.broadcast_to(rgba[:3], (len(chosen), 3)))
+            self._add(frame[chosen], template, label=texts, **at, **colours)
 
     def messages(self) -> Iterator[bytes]:
         """The message of each instant, in order."""
@@ -198,10 +199,6 @@ def _short(values: Floats, parts: int = PER_M) -> Floats:
     return short(values, parts)
 
 
-def _shades(front: str, rgb: Floats) -> dict[str, Floats]:
-    return {front + name: rgb[:, place] for place, name in enumerate("rgb")}
-
-
 def _turned(heading_rad: Floats) -> dict[str, Floats]:
     """The columns of a rotation about the vertical."""
     return {"turn_z": _short(np.sin(heading_rad / 2), 4096), "turn_w": _short(np.cos(heading_rad / 2), 4096)}
@@ -211,9 +208,8 @@ def _line(points_m: Floats, rgb: Floats, fade: Floats) -> dict[str, Floats]:
     """The columns of a line; none for a line of one point."""
     if points_m.shape[1] < 2:
         return {}
-    shades = {f"colours__{name}": rgb[:, place, None] for place, name in enumerate("rgb")}
     axes = {f"points__{name}": points_m[..., axis] for axis, name in enumerate("xyz"[: points_m.shape[2]])}
-    return {**axes, "colours__a": _short(fade), **shades}
+    return {**axes, "colours__a": _short(fade), **shades("colours__", rgb[..., None])}
 
 
 def _template(content: dict[str, Any]) -> Template:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
@@ -48,11 +48,10 @@ from mcaptrack.log.index import (
 )
 from mcaptrack.log.journal import changed, find_journal, journal_of, load_old_content
 from mcaptrack.log.records import FOOTER_BODY, MAGIC, Bytes, Damaged, Reader, Record, attachment_is_whole, walk
+from mcaptrack.notices import Progress
 
 if TYPE_CHECKING:
     from mcaptrack.log.reader import Log
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass

@@ -6,7 +6,7 @@ chunk is opened, so that damage is found here and not by those who read the copy
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -30,8 +30,8 @@ from mcaptrack.log.chunks import (
 from mcaptrack.log.reader import Log
 from mcaptrack.log.records import MAGIC, Bytes, Damaged, walk
 from mcaptrack.log.writer import ChunkKind, LogWriter
+from mcaptrack.notices import Progress
 
-Progress = Callable[[str, int, int], None]
 #: Messages outside of chunks become chunks of so many.
 _TOGETHER: Final = 4096
 _IDS: Final = 2**16

@@ -424,6 +424,10 @@ class Log:
             raise McaptrackError(f"{self.path} has no channel {topic}; {offer(topic, topics)}. {more} shows more")
         return self.channels[topic]
 
+    def holds(self, topic: str, schema: Schema) -> bool:
+        """Whether there is a channel of a topic, and it has rows of a schema."""
+        return topic in self.channels and self.channels[topic].holds(schema)
+
     def _channel(self, record: ChannelRecord) -> Channel:
         schema = self.index.schemas.get(record.schema_id)
         name = schema_name_of(schema.name, schema.encoding, record.message_encoding, record.metadata) if schema else ""
@@ -490,13 +494,11 @@ class Log:
 
         Chunks outside of this interval are not read. Raises McaptrackError where the file is damaged.
         """
-        if (part := self.part(topic)) is not self:
-            yield from part.messages(topic, start_ns, end_ns)
-            return
-        channels = self._ids(topic)
-        with self.snapshot.reporting_damage():
-            yield from self._messages.by_time(channels, (start_ns, end_ns))
-            self.snapshot.confirm_unchanged(channels)
+        part = self.part(topic)
+        channels = part._ids(topic)
+        with part.snapshot.reporting_damage():
+            yield from part._messages.by_time(channels, (start_ns, end_ns))
+            part.snapshot.confirm_unchanged(channels)
 
     def payloads(self, topic: str, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Payloads]:
         """The bytes of the messages that ``messages`` gives, in batches, without an object for each.
@@ -588,10 +590,9 @@ class Log:
 
         Where all rows are of one class, which its metadata name, they get that class.
         """
-        if (part := self.part(topic)) is not self:
-            return part.rows(topic, schema)
-        channel = self._row_channel(topic, schema)
-        columns = self._rows(topic, schema)
+        part = self.part(topic)
+        channel = part._row_channel(topic, schema)
+        columns = part._rows(topic, schema)
         return columns._replace(rows=with_only_class(schema, columns.rows, channel.metadata))
 
     def _row_channel(self, topic: str, schema: Schema) -> Channel:
@@ -634,44 +635,40 @@ class Log:
 
     def frame_columns(self, topic: str, schema: Schema) -> FrameColumns:
         """All rows of a channel as ``frames`` gives them, in blocks, most of which are not in memory."""
-        if (part := self.part(topic)) is not self:
-            return part.frame_columns(topic, schema)
-        metadata = self._row_channel(topic, schema).metadata
-        channels, reader, out = self._ids(topic), self._reader(topic, schema), FrameCollector(schema)
-        with self.snapshot.reporting_bad_times(topic):
-            for columns in self._messages.parts(channels, schema, reader):
+        part = self.part(topic)
+        metadata = part._row_channel(topic, schema).metadata
+        channels, reader, out = part._ids(topic), part._reader(topic, schema), FrameCollector(schema)
+        with part.snapshot.reporting_bad_times(topic):
+            for columns in part._messages.parts(channels, schema, reader):
                 if columns is None:
-                    whole = self.rows(topic, schema)
+                    whole = part.rows(topic, schema)
                     out = FrameCollector(schema)
                     out.extend(whole.t_ns, whole.sequence, np.append(0, np.cumsum(whole.counts)), whole.rows)
                     break
                 rows = with_only_class(schema, columns.rows, metadata)
                 out.extend(columns.t_ns, columns.sequence, np.append(0, np.cumsum(columns.counts)), rows)
-            self.snapshot.confirm_unchanged(channels)
+            part.snapshot.confirm_unchanged(channels)
         return out.done()
 
     def times(self, topic: str) -> Ints:
         """The sorted times of a channel's messages, (M,) ns, without reading the messages."""
-        if (part := self.part(topic)) is not self:
-            return part.times(topic)
-        channels = self._ids(topic)
-        with self.snapshot.reporting_bad_times(topic):
-            return self.snapshot.consistent(lambda messages: messages.times(channels), np.array_equal)
+        part = self.part(topic)
+        channels = part._ids(topic)
+        with part.snapshot.reporting_bad_times(topic):
+            return part.snapshot.consistent(lambda messages: messages.times(channels), np.array_equal)
 
     def places(self, topic: str) -> MessageLocations:
         """The locations of a channel's messages in time order, without reading the messages."""
-        if (part := self.part(topic)) is not self:
-            return part.places(topic)
-        channels = self._ids(topic)
-        with self.snapshot.reporting_bad_times(topic):
-            return self.snapshot.consistent(lambda messages: messages.places(channels), _are_equal)
+        part = self.part(topic)
+        channels = part._ids(topic)
+        with part.snapshot.reporting_bad_times(topic):
+            return part.snapshot.consistent(lambda messages: messages.places(channels), _are_equal)
 
     def chunk_offsets(self, topic: str) -> NDArray[np.uint64]:
         """Where the chunks with messages of a channel begin in the file (C,), and messages of it outside of chunks."""
-        if (part := self.part(topic)) is not self:
-            return part.chunk_offsets(topic)
-        channels, chunks = self._ids(topic), self.index.chunks
-        loose = [self.index.loose[number][:, 1].astype(np.uint64) for number in channels if number in self.index.loose]
+        part = self.part(topic)
+        channels, chunks, every = part._ids(topic), part.index.chunks, part.index.loose
+        loose = [every[number][:, 1].astype(np.uint64) for number in channels if number in every]
         return np.concatenate([chunks.offsets[chunks.rows_with(channels)], *loose])
 
     def message_at(self, chunk_offset: int | None, offset: int) -> tuple[str, Message]:

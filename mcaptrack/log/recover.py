@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_right
 from collections import ChainMap, Counter
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,8 +42,8 @@ from mcaptrack.log.records import (
     walk,
 )
 from mcaptrack.log.writer import LogWriter, create
+from mcaptrack.notices import Progress
 
-Progress = Callable[[str, int, int], None]
 Described = TypeVar("Described", SchemaRecord, ChannelRecord)
 
 #: The first bytes of a chunk: its opcode; sizes below 2^48; times; a checksum; a known compression.

@@ -23,7 +23,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.geometry.clocks import parse_ns
 from mcaptrack.log.records import Damaged
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.pipeline.staleness import planes_to_json, read_planes
 from mcaptrack.schema import GROUND_PLANE
 from mcaptrack.schema.names import plain_name
@@ -80,8 +80,6 @@ def _part_digest(whole: str, span: _Span) -> str:
     """The digest of a part of a channel; "" if that of the whole isn't known."""
     return f"{whole}@{'-'.join(_limits_of(span))}" if whole and span != _ALL else whole
 
-
-Progress = Callable[[str, int, int], None]
 
 #: The metadata record of a log that was cut out of a longer one: ``start_ns`` and ``end_ns``, as far as it is shorter.
 CUT: Final = "mcaptrack.cut"

@@ -163,9 +163,8 @@ class Before:
         later = ticks[ticks >= wanted]
         return int(later[0]) if len(later) else wanted
 
-    def _has(self, topic: str, schema: Schema) -> bool:
-        channel = self._log.channels.get(topic)
-        return channel is not None and channel.schema_name == schema.name and channel.messages > 0
+    def _has_tracks(self, topic: str) -> bool:
+        return self._log.holds(topic, TRACKS) and self._log.channels[topic].messages > 0
 
     def renewed(self, opened: log.Log) -> set[str]:
         """Return the channels with ids that don't continue those of the log before, and have to be made again."""
@@ -196,7 +195,7 @@ class Before:
         if not _is_led(job):
             return [*outputs], {}
         schemas, topics = list(job.transform.writes.values()), list(job.outputs())
-        if not _gives_ids(job) or not self._has(job.target, TRACKS):
+        if not _gives_ids(job) or not self._has_tracks(job.target):
             return [self._kept(schema, output, None) for schema, output in zip(schemas, outputs, strict=True)], {}
         last_id = self._last_id(job)
         maps: dict[str, dict[int, int]] = {}
@@ -224,14 +223,14 @@ class Before:
         last_id = provenance.continued.get(LAST_ID, "") if provenance else ""
         largest = int(last_id) if last_id.isascii() and last_id.isdigit() and len(last_id) < 19 else 0
         for topic, schema in job.outputs().items():
-            if schema is TRACKS and self._has(topic, TRACKS):
+            if schema is TRACKS and self._has_tracks(topic):
                 ids = unique_values(TRACKS, self._log.frame_columns(topic, TRACKS), "track_id")
                 largest = max(largest, int(ids.max(initial=0)))
         return largest
 
     def _same(self, topic: str, frames: Sequence[Frame]) -> dict[int, int]:
         """Return the ids of tracks in the log before, by the ids of the same tracks in this log."""
-        if not self.is_bridged or not self._has(topic, TRACKS):
+        if not self.is_bridged or not self._has_tracks(topic):
             return {}
         before = self._log.frame_columns(topic, TRACKS)
         low = int(np.searchsorted(frame_times(before), self.lead_ns))

@@ -22,7 +22,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.schema import TRACKS, Frame
 from mcaptrack.schema.framing import frame_times, has_any, nearest_times
@@ -208,7 +208,7 @@ def with_descriptors(
     opened: log.Log,
     prefix: str,
     frames: Sequence[Frame],
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
     keep: Collection[str] | None = None,
 ) -> Transform:
     """Return a transform of tracks that compares what these look like, or writes it, with descriptors of ``frames``,
@@ -244,7 +244,7 @@ def _why_not(transform: Transform, frames: Sequence[Frame], keep: Collection[str
 
 
 def _descriptors(
-    opened: log.Log, topic: str, frames: Sequence[Frame], progress: Callable[[str, int, int], None]
+    opened: log.Log, topic: str, frames: Sequence[Frame], progress: Progress
 ) -> tuple[Descriptors | None, str]:
     """Return the descriptors of ``frames`` in the pictures of a channel; or None, and the reason."""
     damaged: list[McaptrackError] = []

@@ -17,7 +17,7 @@ from mcaptrack import log
 from mcaptrack.environment import release_memory
 from mcaptrack.errors import McaptrackError, call
 from mcaptrack.geometry.plane import Planes, is_assumed, is_estimated
-from mcaptrack.notices import Notice, collected, warn
+from mcaptrack.notices import Notice, Progress, collected, warn
 from mcaptrack.pipeline.checks import Job, check_inputs, may_replace, read_named_frames, superseded
 from mcaptrack.pipeline.following import Before
 from mcaptrack.pipeline.pictures import pictures_of
@@ -31,7 +31,7 @@ from mcaptrack.pipeline.staleness import (
     read_planes,
     warn_clock_jumps,
 )
-from mcaptrack.pipeline.steps import BEFORE, LATE_BEGINNING, Input, Progress, Work
+from mcaptrack.pipeline.steps import BEFORE, LATE_BEGINNING, Input, Work
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.predictors import weights_sha256
 from mcaptrack.schema import EVENT_KINDS, EVENTS, TRACKS, VIDEO, Frame
@@ -192,22 +192,16 @@ def warn_findings(state: RunState, results: Mapping[str, Provenance], planes: Pl
     if is_assumed(planes) and {how.transform for how in covered} & _IN_METRES:
         plane = plane_in_words(planes, provenances.get(camera.ground_plane))
         warn(plane, "estimated-ground-plane" if is_estimated(planes) else "assumed-ground-plane")
-    _warn_held_back(opened, [how.parameters for how in covered])
+    _warn_held_back(opened, covered)
 
 
-def _warn_held_back(opened: log.Log, parameters: Sequence[Mapping[str, Any]]) -> None:
-    """Warn of tracks that were not re-tracked, because the camera looks along the ground; by parameters of stages."""
-    held_back = [values for values in parameters if values.get("poor_scale") and not values.get("side_view")]
-    if not held_back:
-        return
-    by_likelihood = [values for values in held_back if values.get("retracker", "likelihood") == "likelihood"]
-    is_linked = any(values.get("link_s") != 0 for values in by_likelihood)
-    done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
-    warn(
-        f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
-        f"looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
-        "held-back",
-    )
+def _warn_held_back(opened: log.Log, covered: Sequence[Provenance]) -> None:
+    if done := max((how.held_back for how in covered), default=""):  # of those that were linked, if there are any
+        warn(
+            f"tracks were {done}: without a measured ground plane, more needs a camera that looks down, and this one "
+            f"looks along the ground. To insist: {call('retrack', opened.path, side_view=True)}",
+            "held-back",
+        )
 
 
 class Finish(Protocol):

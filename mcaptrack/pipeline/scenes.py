@@ -14,7 +14,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.plane import Planes
 from mcaptrack.installed import missing_extension
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, Say, warn
 from mcaptrack.pipeline.pictures import PictureClock
 from mcaptrack.pipeline.staleness import is_stale
 from mcaptrack.pipeline.write import Made, RunState
@@ -27,8 +27,6 @@ from mcaptrack.transforms import Stage, Transform
 __all__ = ["Member", "Progress", "Say", "SceneMaker"]
 
 T = TypeVar("T")
-Say = Callable[[str], None]
-Progress = Callable[[str, int, int], None]
 
 
 class Member(NamedTuple):
@@ -109,6 +107,14 @@ class Scenes:
                 answer = question(maker)
             yield answer
 
+    def _first(self, make: Callable[[SceneMaker], Mapping[str, Made] | None]) -> Mapping[str, Made]:
+        """Return the channels of the first maker that doesn't give None, and note that it was used; {} if all do."""
+        for (_, maker), channels in zip(self._makers, self._answers(make), strict=False):
+            if channels is not None:
+                self._used.append(maker)
+                return channels
+        return {}
+
     @property
     def unused(self) -> list[Entry]:
         """The makers of other packages that have made no scene so far, and don't say why (``off``)."""
@@ -131,13 +137,11 @@ class Scenes:
 
     def join(self, opened: log.Log, cameras: Sequence[str], prefix: str, progress: Progress) -> Mapping[str, Made]:
         """Return the channels of a scene of cameras that can be joined, by topic."""
-
-        def join(maker: SceneMaker) -> Mapping[str, Made]:
-            channels = maker.join(opened, cameras, prefix, progress) if _joinable(maker, opened, cameras)[0] else {}
-            self._used += [maker] if channels else []
-            return channels
-
-        return next(filter(None, self._answers(join)))
+        return self._first(
+            lambda maker: (
+                maker.join(opened, cameras, prefix, progress) if _joinable(maker, opened, cameras)[0] else None
+            )
+        )
 
     def join_again(
         self, opened: log.Log, prefix: str, force: bool, adds: bool, say: Say, progress: Progress
@@ -149,17 +153,11 @@ class Scenes:
         how = provenance_of(opened, topic := detections_topic(prefix))
         if how is None or how.transform != FUSE:
             return {}
-
-        def join(maker: SceneMaker) -> Mapping[str, Made] | None:
-            channels = maker.join_again(opened, prefix, force, adds, say, progress)
-            self._used += [] if channels is None else [maker]
-            return channels
-
-        answers = self._answers(join)
-        channels = next((answer for answer in answers if answer is not None), None)
-        if channels is None and is_stale(opened, topic):
+        count = len(self._used)
+        channels = self._first(lambda maker: maker.join_again(opened, prefix, force, adds, say, progress))
+        if len(self._used) == count and is_stale(opened, topic):
             warn(f"{topic} is out of date, and stays as it is: {_nothing()}", "out-of-date")
-        return channels or {}
+        return channels
 
     def maker_of(self, how: Provenance) -> tuple[Stage, Transform] | None:
         """Return the transform that made a scene, and what finds it; None if it isn't known."""

@@ -255,7 +255,7 @@ def _curve(score: Floats, steady: Ints, steady_false: float) -> Curve:
 
     order = np.argsort(score, kind="stable")[:: -(-len(score) // _FITTED)]
     score, steady = score[order], steady[order]
-    _, is_real, by_score = max((_fitted(score, steady, *kind) for kind in _kinds(score)), key=lambda fit: fit[0])
+    _, is_real, by_score = max((_fitted(steady, *kind) for kind in _kinds(score)), key=lambda fit: fit[0])
     lowest = int(by_score[: max(1, len(score) // 2)].argmin())
     rising = np.maximum.accumulate(np.concatenate([np.full(lowest, by_score[lowest]), by_score[lowest:]]))
     likelihood = (rising + isotonic_regression(is_real).x) / 2
@@ -280,7 +280,7 @@ def _kinds(score: Floats) -> list[tuple[Floats, float, bool]]:
     return [(*scale, has_mean) for scale in scales for has_mean in (False, True)]
 
 
-def _fitted(score: Floats, steady: Ints, u: Floats, slope: float, has_mean: bool) -> tuple[float, Floats, Floats]:
+def _fitted(steady: Ints, u: Floats, slope: float, has_mean: bool) -> tuple[float, Floats, Floats]:
     """Fit a mixture of real and false detections to scores ``u`` (N,), rising, and to how often they go on steadily.
 
     Returns the logarithm of its likelihood, and for each detection how likely it is real: by both, and by its score.

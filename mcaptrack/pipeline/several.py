@@ -12,10 +12,10 @@ from mcaptrack import log as logs
 from mcaptrack import notices, pipeline
 from mcaptrack.errors import McaptrackError, list_names
 from mcaptrack.location import Location
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, Say, warn
 from mcaptrack.pipeline.checks import cameras_named
 from mcaptrack.pipeline.runner import Report
-from mcaptrack.pipeline.scenes import Progress, Say, Scenes
+from mcaptrack.pipeline.scenes import Scenes
 from mcaptrack.pipeline.write import Made, RunState, write
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.sources import foreign
@@ -329,9 +329,7 @@ class Steps:
         return True
 
 
-def unfitting(
-    opened: logs.Log, prefix: str, transforms: Mapping[str, Transform], say: Callable[[str], None]
-) -> set[str]:
+def unfitting(opened: logs.Log, prefix: str, transforms: Mapping[str, Transform], say: Say) -> set[str]:
     """Return the stages with a transform that can't take the boxes of this camera or scene.
 
     A tracker that is named is for the cameras, or for the scene: of boxes in pictures, or of positions in metres.

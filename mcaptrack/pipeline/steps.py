@@ -21,7 +21,7 @@ from mcaptrack.geometry.camera_path import CameraPath
 from mcaptrack.geometry.clocks import NS_PER_S, parse_ns
 from mcaptrack.geometry.plane import Planes, is_assumed, scene_planes
 from mcaptrack.geometry.ragged import find_rows
-from mcaptrack.notices import Code, Notice, warn
+from mcaptrack.notices import Code, Notice, Progress, warn
 from mcaptrack.pipeline.checks import Job
 from mcaptrack.pipeline.following import Before, warn_unfollowed
 from mcaptrack.pipeline.motion import SideInput, boxes_input, motion_input, path_with
@@ -52,8 +52,6 @@ LATE_BEGINNING: Final = "a video has to begin with a key picture that has its pa
 _BASE, _A_PERSON_SECOND = 400_000_000, 3_000
 #: Classes that a warning names.
 _LISTED: Final = 8
-#: Called with the name of a stage, the steps that are done, and their total.
-Progress = Callable[[str, int, int], None]
 
 
 class Input(NamedTuple):

@@ -157,10 +157,10 @@ def _appearance(provenance: Provenance | None) -> Looks | None:
 
 def _frame_id(opened: log.Log, tracks: str) -> str | None:
     """Return the frame that tracks are in, if they have no place in pictures; None if none is named."""
-    channel, frames = opened.channels.get(tracks), _frames(opened, tracks, TRACKS)
-    if channel is None or frames is None or has_any(TRACKS, frames, lambda rows: ~np.isnan(rows["x_px"])):
+    frames = _frames(opened, tracks, TRACKS)
+    if frames is None or has_any(TRACKS, frames, lambda rows: ~np.isnan(rows["x_px"])):
         return None
-    return frame_id_of(channel.metadata) or None
+    return frame_id_of(opened.channels[tracks].metadata) or None
 
 
 def _corrected(opened: log.Log, prefix: str, tracks: str, samples: str) -> Corrected | None:
@@ -174,8 +174,7 @@ def _corrected(opened: log.Log, prefix: str, tracks: str, samples: str) -> Corre
 
 def _frames(opened: log.Log, topic: str, schema: Schema) -> FrameColumns | None:
     """Return all rows of a channel; None if it is missing or has another schema."""
-    channel = opened.channels.get(topic)
-    return opened.frame_columns(topic, schema) if channel and channel.schema_name == schema.name else None
+    return opened.frame_columns(topic, schema) if opened.holds(topic, schema) else None
 
 
 def _sources(opened: log.Log, topic: str) -> Ints | None:
@@ -231,8 +230,7 @@ def _repair(tracked: Ints, repaired: Ints) -> Repair:
 
 def _scores(opened: log.Log, prefix: str, truth: str, topics: tuple[str, str]) -> SummaryScores | None:
     """Score tracks before and after re-tracking, at their common sample times; None if they can't be compared."""
-    channels = [opened.channels.get(topic) for topic in (truth, *topics)]
-    if not all(channel and channel.schema_name == TRACKS.name for channel in channels):
+    if not all(opened.holds(topic, TRACKS) for topic in (truth, *topics)):
         return None
     names = {topic: class_names(opened.channel(topic).metadata) for topic in (truth, *topics)}
     candidates = [Candidate(topic, None, opened.frames(topic, TRACKS), classes=names[topic]) for topic in topics]

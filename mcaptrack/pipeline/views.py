@@ -646,9 +646,8 @@ class _Current:
         """Return the frames of a channel; empty if there is none with such rows."""
         if topic in self.shown:
             return self.shown[topic].frames if self.shown[topic].schema is schema else ()
-        channel = self.state.opened.channels.get(topic)
-        of_log = channel and channel.schema_name == schema.name
-        return self.state.opened.frame_columns(topic, schema) if of_log else ()
+        opened = self.state.opened
+        return opened.frame_columns(topic, schema) if opened.holds(topic, schema) else ()
 
     def _each(self, schema: Schema, *names: str) -> Iterator[Sequence[Frame]]:
         """Yield the frames of channels, by the ends of their topics."""

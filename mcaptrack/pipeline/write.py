@@ -118,8 +118,7 @@ class RunState(NamedTuple):
         """Return whether a channel has rows of a schema."""
         if topic in self.results:
             return self.results[topic].schema is schema
-        channel = self.opened.channels.get(topic)
-        return channel is not None and topic not in self.gone and channel.holds(schema)
+        return topic not in self.gone and self.opened.holds(topic, schema)
 
     def frames(self, topic: str, schema: Schema = TRACKS) -> Sequence[Frame]:
         """Return the frames of a channel; none if it has no rows of the schema."""

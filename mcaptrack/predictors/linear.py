@@ -59,11 +59,6 @@ def _holt_weights(count: int, times: Floats, ahead: Floats) -> Floats:
     return weights
 
 
-def _kalman_weights(count: int, times: Floats, ahead: Floats) -> Floats:
-    """A Kalman filter with the motion model of ``linear_variance``: the weights with the least error."""
-    return _kalman(count, times, ahead)[0]
-
-
 def _kalman(count: int, times: Floats, ahead: Floats) -> tuple[Floats, Floats]:
     """Weights (T, n) of the filter's forecasts, and (n - 1, n) of its normalised innovations: each of variance 1."""
     innovations = np.zeros((count - 1, count))
@@ -105,7 +100,8 @@ def linear_variance(weights: Floats, times: Floats, ahead: Floats) -> Floats:
     return variance
 
 
-_WEIGHTS: Final = {"cv": _cv_weights, "holt-cv": _holt_weights, "kalman": _kalman_weights}
+#: A Kalman filter with the motion model of ``linear_variance`` has the weights with the least error.
+_WEIGHTS: Final = {"cv": _cv_weights, "holt-cv": _holt_weights, "kalman": lambda *past: _kalman(*past)[0]}
 #: Number of past positions that each one uses.
 _PAST: Final = {"cv": 4, "holt-cv": 8, "kalman": 8}
 #: Number of past positions for the innovations that scale the uncertainty.

@@ -472,16 +472,11 @@ def _working_folder() -> Iterator[None]:
         sys.path.reverse()
 
 
-#: Names that there were, and what is used now.
-_REPLACED: Final = {"mog2": "knn", "frame-difference": "median"}
-
-
 def _unknown(kind: Kind, name: str) -> str:
     all_names, unreadable, what = names(kind), declared().unreadable, in_words(kind)
     choices = f"there are {', '.join(all_names)}" if all_names else f"no {what} is built in or installed"
-    hint = f"{_REPLACED[name]} took its place; " if name in _REPLACED else did_you_mean(name, all_names)
     return (
-        f"no {what} is called {name:.80}; {hint}{choices}; an installed package gives more by "
+        f"no {what} is called {name:.80}; {did_you_mean(name, all_names)}{choices}; an installed package gives more by "
         f"its entry points in {_OWN}.{kind}s, and module:Class names any class"
         + (f". The entry points of {', '.join(unreadable)} can't be read" if unreadable else "")
     )

@@ -5,7 +5,7 @@ Letters: N rows, F frames.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,7 @@ from mcaptrack import log
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.schema import DETECTIONS, SCHEMAS, TRACKS
 from mcaptrack.schema.classes import PERSON, class_name, class_names, is_person
 from mcaptrack.schema.framing import joined_parts
@@ -194,7 +194,7 @@ class BoxFile:
         recording: Any,
         path: Path,
         topic: str | None = None,
-        progress: Callable[[str, int, int], None] = lambda *_: None,
+        progress: Progress = lambda *_: None,
     ) -> dict[str, int]:
         """Write one channel of a log: by default the best tracks of the only camera, or its detections.
 

@@ -60,8 +60,7 @@ def path_of(
 
 
 def _read_path(opened: log.Log, topic: str, frames: Mapping[str, Sequence[Frame]]) -> CameraPath | None:
-    channel = opened.channels.get(topic)
-    if topic not in frames and (channel is None or channel.schema_name != CAMERA_MOTION.name):
+    if topic not in frames and not opened.holds(topic, CAMERA_MOTION):
         return None
     try:
         return frames_to_path(frames[topic] if topic in frames else opened.frames(topic, CAMERA_MOTION))

@@ -40,9 +40,8 @@ def corrections_of(opened: log.Log, prefix: str, topic: str) -> str | None:
     if topic != f"{prefix}/{_TRACKS}":
         return None
     for name in (prefix, *camera_at(opened, prefix).names):
-        channel = opened.channels.get(f"{name}/{CORRECTED}")
-        if channel is not None and channel.holds(TRACKS):
-            return channel.topic
+        if opened.holds(f"{name}/{CORRECTED}", TRACKS):
+            return f"{name}/{CORRECTED}"
     return None
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import resources
@@ -14,10 +13,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError
-from mcaptrack.files import publish
+from mcaptrack.files import make_folder, publish, writing
 from mcaptrack.geometry.arrays import Floats, Image
 from mcaptrack.geometry.plane import GroundPlane
+from mcaptrack.notices import Progress
 from mcaptrack.sources.video import write_mp4
 
 #: The files that the demonstration writes.
@@ -329,7 +328,7 @@ def _point(xy: Floats) -> Sequence[int]:
 
 
 def draw_place(
-    cameras: Mapping[str, SyntheticScene], folder: Path, progress: Callable[[str, int, int], None] = lambda *_: None
+    cameras: Mapping[str, SyntheticScene], folder: Path, progress: Progress = lambda *_: None
 ) -> tuple[dict[str, Footage], Path]:
     """Write a scene that several cameras see to a folder: the footage of each camera, and where people truly are.
 
@@ -341,24 +340,15 @@ def draw_place(
     for shots in zip(*seen.values(), strict=True):
         places = {walker: at for shot in shots for walker, at in zip(shot.ids, shot.places_m.tolist(), strict=True)}
         rows += [f"{shots[0].seconds:.6f},{walker},person,{x:.4f},{y:.4f}" for walker, (x, y) in sorted(places.items())]
-    with writing_to(folder):
+    with writing(folder):
         _write_text(folder / POSITIONS, "\n".join(rows) + "\n")
     return footage, folder / POSITIONS
-
-
-@contextmanager
-def writing_to(folder: Path) -> Iterator[None]:
-    """Report errors of writing to a folder. Raises McaptrackError."""
-    try:
-        yield
-    except OSError as error:
-        raise McaptrackError(f"{folder} can't be written to: {error.strerror or error}") from error
 
 
 def draw(
     scene: SyntheticScene,
     folder: Path,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
     *,
     video: bool = True,
 ) -> Footage:
@@ -377,8 +367,8 @@ def draw(
             progress("draw", number, total)
             yield shot.image
 
-    with writing_to(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
+    with writing(folder):
         if video:
             write_mp4(footage.video, images(), scene.fps)
         else:

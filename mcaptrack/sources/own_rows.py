@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, Union, get_args, 
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, in_one_line
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.notices import warn
@@ -243,7 +243,7 @@ def frame_of(
         try:
             array = _floats(values) if name == "score" else np.asarray(_unmasked(values))
         except (TypeError, ValueError) as error:
-            raise McaptrackError(f"{_named(name)} needs numbers of shape (N,): {_line(error)}") from None
+            raise McaptrackError(f"{_named(name)} needs numbers of shape (N,): {in_one_line(error)}") from None
         if array.shape != (count,):
             raise McaptrackError(f"{count} boxes need {_named(name)} of shape ({count},), not {array.shape}")
         columns[name] = array
@@ -271,7 +271,7 @@ def columns_in_space(arrays: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
         try:
             array = np.asarray(values) if names == ("source_id",) else _floats(values)
         except (TypeError, ValueError) as error:
-            raise McaptrackError(f"`{own}=` needs numbers: {_line(error)}") from None
+            raise McaptrackError(f"`{own}=` needs numbers: {in_one_line(error)}") from None
         widths = (2, 3) if names == ("x_m", "y_m", "z_m") else (len(names),)
         array = array.reshape(0, widths[-1]) if not array.size else array
         table = array[:, None] if len(names) == 1 and array.ndim == 1 else array
@@ -460,7 +460,7 @@ def boxes_of(boxes: Any, box_format: BoxFormat) -> Floats:
     try:
         array = _floats(boxes)
     except (TypeError, ValueError) as error:
-        raise McaptrackError(f"boxes are numbers of shape (N, 4): {_line(error)}") from None
+        raise McaptrackError(f"boxes are numbers of shape (N, 4): {in_one_line(error)}") from None
     array = array.reshape(0, 4) if array.shape in ((0,), (0, 0)) else array
     if array.ndim != 2 or array.shape[1] != 4:
         raise McaptrackError(f"boxes are an array of shape (N, 4), not {array.shape}")
@@ -507,10 +507,6 @@ def kind_of(value: Any) -> str:
     text = repr(value)
     name = type(value).__name__
     return f"{text} ({name})" if len(text) <= 40 and text.isprintable() else name
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 # Names of classes.

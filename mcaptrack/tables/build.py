@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, in_one_line
 from mcaptrack.geometry.arrays import Ints
 from mcaptrack.schema import Schema
 from mcaptrack.sources.own_rows import ColumnOfUser, facts_of
@@ -120,7 +120,7 @@ def as_arrow(rows: Any) -> Any:
     try:
         table = pa.table(rows)
     except (pa.ArrowException, TypeError, ValueError) as error:
-        raise McaptrackError(f"the table cannot be read as Arrow: {' '.join(str(error).split())}") from None
+        raise McaptrackError(f"the table cannot be read as Arrow: {in_one_line(error)}") from None
     if len(set(table.column_names)) < len(table.column_names):
         raise McaptrackError(f"the table has columns of the same name: {', '.join(table.column_names)}")
     return table

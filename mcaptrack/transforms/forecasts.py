@@ -140,7 +140,8 @@ class Forecaster:
         histories = self._histories if isinstance(self._predictor, LinearPredictor) else None
         for low, high in spans_of(frames.ends, _PART_ROWS):
             joined = join_frames(TRACKS, frames, low, high)
-            if isinstance(histories, Histories) and _have_velocities(joined) and not _are_twice(joined):
+            has_velocities = bool(np.isfinite(joined.rows["vx_m_per_s"]).all())
+            if isinstance(histories, Histories) and has_velocities and not _are_twice(joined):
                 rows, ends = self._together(joined, histories)
             else:
                 parts = [self.predict(frame) for frame in frames[low:high]]
@@ -217,11 +218,6 @@ class Forecaster:
         _, moment = np.unique(unit_m, return_inverse=True)
         row = np.searchsorted(seen, np.flatnonzero(ready))
         return PeopleSeen(past[seen] / unit_m[:, None, None], is_known[seen], moment, row)
-
-
-def _have_velocities(joined: JoinedFrames) -> bool:
-    """Whether all rows have a velocity."""
-    return bool(np.isfinite(joined.rows["vx_m_per_s"]).all())
 
 
 def _are_twice(joined: JoinedFrames) -> bool:

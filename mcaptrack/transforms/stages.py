@@ -7,14 +7,14 @@ To add a stage: its transform, and a ``Stage`` in ``STAGES``. To add a transform
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
 
-from mcaptrack.errors import McaptrackError, did_you_mean
+from mcaptrack.errors import McaptrackError, offer
 from mcaptrack.registry import Entry, Kind, blamed, entry_of, find, names, others, own, split_file
 from mcaptrack.schema import (
     APPEARANCE,
@@ -209,38 +209,31 @@ class Stage:
         entry = self.find(chosen) if chosen else self.entry(self.default)
         cls = self.with_part(entry.cls, parameters.get(self.parameter))
         names = [f.name for f in fields(cls) if f.init]
-        for name in parameters:
-            if name not in names:
-                what = entry if self.kind else self.name
-                raise McaptrackError(
-                    f"{what} has no parameter {name}; {did_you_mean(name, names)}there are {', '.join(names) or 'none'}"
-                )
+        refuse_unknown(str(entry if self.kind else self.name), parameters, names)
         if (file := self.split(chosen)[1]) is not None and parameters.setdefault(_FILE, file) != file:
             raise McaptrackError(f"{chosen} and `{_FILE}={parameters[_FILE]}` are two files; give one")
         with blamed(entry, "could not be made"):
             transform: Transform = cls(**parameters)
             check_options(transform)
+        if entry.is_built_in and (weights := getattr(transform, "weights", None)):
+            weights()  # refuses a file of a network that isn't there, before a plan is made and said
         return transform
 
     def check(self, entry: Entry) -> None:
         """Raise McaptrackError if a class of another package can't be a transform of this stage."""
-        cls, wanted = entry.cls, self
-        check_class(entry)
-        reads, writes = getattr(cls, "reads", None), getattr(cls, "writes", None)
+        cls, wanted, (reads, outputs) = entry.cls, self, _interface(entry)
         if reads is not wanted.reads:
             is_schema = getattr(reads, "name", "")
             raise McaptrackError(
                 f"{entry} reads {is_schema or 'no schema (the class attribute reads)'}; a {entry.kind} reads "
                 f"{wanted.reads.name}"
             )
-        outputs = dict(writes) if isinstance(writes, Mapping) else {}
         main = outputs.get("")
         if main is not wanted.writes[""]:
             raise McaptrackError(
                 f"{entry} writes {getattr(main, 'name', '') or 'nothing (the class attribute writes)'}; a {entry.kind} "
                 f"writes {wanted.writes[''].name} as its main output, as in writes = {{'': ...}}"
             )
-        _check_suffixes(entry, outputs)
         for suffix, schema in outputs.items():
             if schema not in SCHEMAS.values():
                 raise _unusual_output(entry, suffix, schema)
@@ -253,8 +246,15 @@ class Stage:
             raise McaptrackError(f"{entry}: a parameter can't have the name of the option `{self.kind}=`")
 
 
-def check_class(entry: Entry) -> None:
-    """Raise McaptrackError if a class of another package can't be a transform."""
+def refuse_unknown(owner: str, names: Iterable[str], parameters: Sequence[str]) -> None:
+    """Raise McaptrackError for the name of a parameter that a transform, ``owner``, doesn't have."""
+    for name in names:
+        if name not in parameters:
+            raise McaptrackError(f"{owner} has no parameter {name}; {offer(name, parameters, 'there are')}")
+
+
+def _interface(entry: Entry) -> tuple[object, dict[Any, Any]]:
+    """The schemas that a class of another package has. Raises McaptrackError if it can't be a transform."""
     cls = entry.cls
     if not inspect.isclass(cls) or not is_dataclass(cls):
         raise McaptrackError(
@@ -272,15 +272,14 @@ def check_class(entry: Entry) -> None:
         )
     if problem := option_problem(cls):
         raise McaptrackError(f"{entry}: {problem}")
-
-
-def _check_suffixes(entry: Entry, outputs: Mapping[Any, object]) -> None:
-    """Raise McaptrackError if an output can't have its name, the last part of its topic."""
+    writes = getattr(cls, "writes", None)
+    outputs = dict(writes) if isinstance(writes, Mapping) else {}
     for suffix, schema in outputs.items():
         if not isinstance(suffix, str) or not (not suffix or suffix.isidentifier()):
             raise _unusual_output(entry, suffix, schema)
         if suffix in RESERVED or suffix in names("finisher"):
             raise McaptrackError(f"{entry} has an output {suffix!r}, which is a name of what is made of results")
+    return getattr(cls, "reads", None), outputs
 
 
 def _unusual_output(entry: Entry, suffix: object, schema: object) -> McaptrackError:
@@ -412,16 +411,10 @@ class Stages(Mapping[str, Stage]):
 
 def declared_stage(entry: Entry) -> Stage:
     """The stage of an installed package, which a class of transforms declares. Raises McaptrackError if it can't."""
-    cls = entry.cls
-    check_class(entry)
+    cls, (reads, outputs) = entry.cls, _interface(entry)
     declared = {name: getattr(cls, name) for name in _DECLARED if hasattr(cls, name)}
-    reads, outputs = (
-        getattr(cls, "reads", None),
-        dict(cls.writes) if isinstance(getattr(cls, "writes", 0), Mapping) else {},
-    )
     if not isinstance(reads, Schema) or not isinstance(outputs.get(""), Schema):
         raise McaptrackError(f"{entry} needs the schemas that it reads and writes, as in writes = {{'': TRACKS}}")
-    _check_suffixes(entry, outputs)
     topics = {name: declared.pop(name, None) for name in ("input_topic", "output_topic")}
     for name, topic in topics.items():
         if not isinstance(topic, str) or not all(topic.split("/")) or not topic.isprintable():

@@ -141,6 +141,14 @@ def find_moments(opened: log.Log) -> list[LinkedEvent]:
     return [moment._replace(event=number) for number, moment in enumerate(moments, 1)]
 
 
+def event_of(opened: log.Log, events: Sequence[LinkedEvent], number: int) -> LinkedEvent:
+    """Return an event of a log by its number, from 1. Raises McaptrackError if there is none."""
+    if number > len(events):
+        all_events = f"the events 1 to {len(events)}" if events else "no identity switches and repairs"
+        raise McaptrackError(f"{opened.path} has {all_events}, not event {number}")
+    return events[number - 1]
+
+
 def best_tracks(moments: Sequence[LinkedEvent]) -> str:
     """Return the tracks with events that viewers show first; "" without any."""
     topics = sorted({moment.topic for moment in moments})
@@ -149,10 +157,9 @@ def best_tracks(moments: Sequence[LinkedEvent]) -> str:
 
 def _nouns(opened: log.Log, topic: str) -> Nouns:
     """Return the nouns for tracked objects; their rows are read only if a class is no person."""
-    channel = opened.channels.get(topic)
-    if channel is None or not channel.holds(TRACKS):
+    if not opened.holds(topic, TRACKS):
         return PEOPLE
-    names = class_names(channel.metadata)
+    names = class_names(opened.channels[topic].metadata)
     if all(is_person(name) for name in names.values()):
         return PEOPLE
     return nouns_of((), opened.frame_columns(topic, TRACKS), ({}, names))
@@ -181,11 +188,10 @@ def opening_moment(opened: log.Log, moments: Sequence[LinkedEvent]) -> tuple[int
 
 def _tracks_over_time(opened: log.Log, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return times in ns and the number of tracks at each: as they were counted, or else of the tracks themselves."""
-    counts, channel = opened.channels.get(f"{topic}/counts"), opened.channels[topic]
-    if counts is not None and counts.holds(COUNTS):
-        joined = join_frames(COUNTS, opened.frame_columns(counts.topic, COUNTS))
+    if opened.holds(f"{topic}/counts", COUNTS):
+        joined = join_frames(COUNTS, opened.frame_columns(f"{topic}/counts", COUNTS))
         return joined.row_ns, joined.rows["tracked"].astype(np.int64)
-    if not channel.holds(TRACKS):
+    if not opened.holds(topic, TRACKS):
         return _NO_TRACKS
     frames = opened.frame_columns(topic, TRACKS)
     return frame_times(frames), np.diff(row_ends(frames))

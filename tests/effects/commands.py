@@ -145,7 +145,7 @@ CASES: dict[str, dict[str, Case]] = {
         camera="--camera other",
         ground_plane=(SCORED, "--ground-plane plane.txt"),
         fps=("evaluate truth.txt --truth walk.txt --ground-plane plane.txt", "--fps 10"),
-        fail_under="--fail-under idf1=2",
+        fail_under="--fail-under idf1=1",
         csv="--csv",
         all="--all",
         output="-o scores.txt",

@@ -22,6 +22,8 @@ __all__ = ["LEVELS", "Displacement", "forecast_scores"]
 
 #: The association threshold in m^2 at which single numbers are reported (tau in the paper).
 TAU_M2: Final = 2.0
+#: The number of past positions by which tracks are assigned to people.
+_PAST: Final = 4
 
 
 # Scores of forecasts when the true future is known: displacement errors, likelihood, and calibration.
@@ -217,26 +219,21 @@ class Displacement:
         best = np.argsort(self.d_obs_m2, kind="stable")[:count]
         return float(self.ade_squared_m2[best].mean()) if 0 < count == len(best) else float("nan")
 
-    def errors_by_step(self, tau_m2: float = TAU_M2) -> Floats:
-        """The distance of each step from the ground truth, (pairs, T) in m, for the pairs below a threshold."""
-        return self.error_m[self.d_obs_m2 < tau_m2]
+    def errors_by_step(self) -> Floats:
+        """The distance of each step from the ground truth, (pairs, T) in m, for the pairs below the threshold."""
+        return self.error_m[self.d_obs_m2 < TAU_M2]
 
-    def constant_velocity(self, tau_m2: float = TAU_M2) -> dict[str, float | None]:
+    def constant_velocity(self) -> dict[str, float | None]:
         """ADE_m and FDE_m of constant velocity for the same tracks at the same times, as in ``summary``."""
-        away_m = self.straight_error_m[self.d_obs_m2 < tau_m2]
+        away_m = self.straight_error_m[self.d_obs_m2 < TAU_M2]
         if not len(away_m):
             return {"ADE_m": None, "FDE_m": None}
         steps = np.isfinite(away_m).sum(axis=1)
         last_m = away_m[np.arange(len(away_m)), steps - 1]
         return {"ADE_m": float((np.nansum(away_m, axis=1) / steps).mean()), "FDE_m": float(last_m.mean())}
 
-    def summary(self, tau_m2: float = TAU_M2) -> dict[str, float | None]:
-        """Compute the scores at one threshold.
-
-        Parameters
-        ----------
-        tau_m2 : float, m^2
-            The largest mean squared distance of matched pasts.
+    def summary(self) -> dict[str, float | None]:
+        """Compute the scores of the pairs below the threshold.
 
         Returns
         -------
@@ -247,7 +244,7 @@ class Displacement:
             step, in nats. coverage_P: share of future steps inside the P % ellipse. None if there is no value to
             average.
         """
-        kept = self.d_obs_m2 < tau_m2
+        kept = self.d_obs_m2 < TAU_M2
 
         def mean(values: Floats) -> float | None:
             return float(values.mean()) if len(values) and np.isfinite(values).all() else None
@@ -269,12 +266,12 @@ class Displacement:
             },
         }
 
-    def reliability(self, tau_m2: float = TAU_M2) -> list[dict[str, float]]:
-        """The share of future steps inside the ellipse of each level, at one threshold.
+    def reliability(self) -> list[dict[str, float]]:
+        """The share of future steps inside the ellipse of each level, for the pairs below the threshold.
 
         Each member has ``level``, the probability of the ellipse, and ``held``, the share. Empty without covariances.
         """
-        kept = self.covered[self.d_obs_m2 < tau_m2]
+        kept = self.covered[self.d_obs_m2 < TAU_M2]
         if not len(kept) or not np.isfinite(kept).all():
             return []
         return [
@@ -305,10 +302,10 @@ def combine_displacements(parts: list[Displacement]) -> Displacement:
 # Pairing of forecasts with people: at each time tracks and people are assigned by their last positions.
 #
 # At each prediction time, tracks with a forecast are assigned to people of the ground truth by how well their last
-# ``t_obs`` positions agree (Yu and Zhou 2021, Eq. 4). One assignment at each time serves all thresholds.
+# ``_PAST`` positions agree (Yu and Zhou 2021, Eq. 4). One assignment at each time serves all thresholds.
 #
-# People count if ``t_obs`` past positions and all future positions are known, forecasts if their track has
-# ``t_obs`` past positions (gaps inside a track are interpolated from positions known at that time). Others are not
+# People count if ``_PAST`` past positions and all future positions are known, forecasts if their track has
+# ``_PAST`` past positions (gaps inside a track are interpolated from positions known at that time). Others are not
 # counted at all.
 #
 # Letters: N rows, S people of the ground truth at one time, F forecasts at one time, T future steps, P matched
@@ -411,11 +408,7 @@ class PairedForecasts(NamedTuple):
 
 
 def pair_forecasts(
-    ground_truth: Positions,
-    tracks: Positions,
-    forecasts: Forecasts,
-    t_obs: int = 4,
-    labelled: Ints | None = None,
+    ground_truth: Positions, tracks: Positions, forecasts: Forecasts, labelled: Ints | None = None
 ) -> PairedForecasts:
     """Assign the forecasts made for tracks to people by their past positions.
 
@@ -426,8 +419,6 @@ def pair_forecasts(
         The positions from which the forecasts were made.
     forecasts : Forecasts
         On the same clock as the other two. The order of rows has no influence.
-    t_obs : int
-        The number of past positions to compare.
     labelled : int array, optional
         The steps that the ground truth describes. Forecasts with another one from 0 on in their past are not judged.
 
@@ -449,20 +440,20 @@ def pair_forecasts(
     horizon = forecasts.mean_m.shape[1]
     people, paths = _sorted_positions(ground_truth, fill=False), _sorted_positions(tracks, fill=True)
     counts = np.ones(len(forecasts.step), bool)
-    for back in range(t_obs) if labelled is not None else ():
+    for back in range(_PAST) if labelled is not None else ():
         step = forecasts.step - back
         counts &= (step < 0) | np.isin(step, np.asarray(labelled))
     steps = np.unique(forecasts.step[counts])
-    has_past, has_future = people.is_continuous(1 - t_obs), people.is_continuous(horizon)
+    has_past, has_future = people.is_continuous(1 - _PAST), people.is_continuous(horizon)
     place = paths.find(forecasts.id, forecasts.step)
-    is_judged = (place >= 0) & paths.is_continuous(1 - t_obs)[place] if len(paths.slot) else np.zeros(len(place), bool)
+    is_judged = (place >= 0) & paths.is_continuous(1 - _PAST)[place] if len(paths.slot) else np.zeros(len(place), bool)
     is_judged &= counts
     subject = np.flatnonzero(has_past & np.isin(people.step, steps))
     subject = subject[np.argsort(people.step[subject], kind="stable")]
     judged = np.flatnonzero(is_judged)
     judged = judged[np.lexsort((forecasts.id[judged], forecasts.step[judged]))]
-    past_true = people.window(subject, 1 - t_obs, 0)
-    past = paths.window(place[judged], 1 - t_obs, 0)
+    past_true = people.window(subject, 1 - _PAST, 0)
+    past = paths.window(place[judged], 1 - _PAST, 0)
     row, column, d_obs = _assigned(past_true, past, people.step[subject], forecasts.step[judged], steps)
     at, number = subject[row], judged[column]
     offset = np.full((len(at), horizon, 2), np.nan)
@@ -475,7 +466,7 @@ def pair_forecasts(
 def _assigned(past_true: Floats, past: Floats, true_step: Ints, step: Ints, steps: Ints) -> tuple[Ints, Ints, Floats]:
     """Assign pasts to each other at each of ``steps``: rows (P,), columns (P,) and mean squared distances (P,).
 
-    Pasts (S, t_obs, 2) and (F, t_obs, 2) are ordered by step.
+    Pasts (S, 4, 2) and (F, 4, 2) are ordered by step.
     """
     true_ends, ends = (np.searchsorted(those, np.append(steps, np.iinfo(np.int64).max)) for those in (true_step, step))
     size = np.diff(true_ends) * np.diff(ends)
@@ -516,14 +507,11 @@ def _best(cost: Floats, row: Ints, column: Ints, which: Ints, down: Ints, across
 
 
 def displacement(
-    ground_truth: Positions,
-    tracks: Positions,
-    forecasts: Forecasts,
-    t_obs: int = 4,
-    tau_m2: float = TAU_M2,
-    labelled: Ints | None = None,
+    ground_truth: Positions, tracks: Positions, forecasts: Forecasts, labelled: Ints | None = None
 ) -> Displacement:
     """Compare the forecasts made for tracks with the true future of the people assigned to the tracks.
+
+    Forecasts of tracks with a past that is farther than ``TAU_M2`` from that of a person count as false [1]_.
 
     Parameters
     ----------
@@ -532,10 +520,6 @@ def displacement(
         The positions from which the forecasts were made.
     forecasts : Forecasts
         On the same clock as the other two.
-    t_obs : int
-        The number of past positions by which tracks are assigned to people.
-    tau_m2 : float, m^2
-        Forecasts of tracks farther than this from a person count as false [1]_.
     labelled : int array, optional
         The steps that the ground truth describes, as in ``pair_forecasts``.
 
@@ -558,34 +542,30 @@ def displacement(
     >>> round(found["ADE_m"], 3), round(found["FDE_m"], 3), found["recall"]
     (0.8, 1.2, 1.0)
     """
-    pairs = pair_forecasts(ground_truth, tracks, forecasts, t_obs, labelled)
+    pairs = pair_forecasts(ground_truth, tracks, forecasts, labelled)
     is_known = np.isfinite(pairs.offset_m).all(axis=(1, 2))
     number = pairs.forecast[is_known]
     errors = forecast_errors(pairs.offset_m[is_known], forecasts.cov_m2[number], forecasts.shapes(number))
     return Displacement(
         d_obs_m2=pairs.d_obs_m2[is_known],
         people=pairs.people,
-        false_forecasts=int(pairs.is_judged.sum() - (pairs.d_obs_m2 < tau_m2).sum()),
+        false_forecasts=int(pairs.is_judged.sum() - (pairs.d_obs_m2 < TAU_M2).sum()),
         frames=pairs.frames,
         consistency_m=_consistency_m(forecasts),
-        straight_error_m=_straight_error_m(tracks, forecasts, number, pairs.offset_m[is_known], t_obs),
+        straight_error_m=_straight_error_m(tracks, forecasts, number, pairs.offset_m[is_known]),
         **errors._asdict(),
     )
 
 
-#: The steps back from which constant velocity is taken, as that of the predictor ``cv``.
+#: The steps back from which constant velocity is taken, as that of the predictor ``cv``; all pasts have them.
 _VELOCITY_STEPS: Final = 3
 
 
-def _straight_error_m(tracks: Positions, forecasts: Forecasts, number: Ints, offset_m: Floats, t_obs: int) -> Floats:
-    """The errors (P, T) of constant velocity instead of the forecasts ``number`` (P,), which are off by ``offset_m``.
-
-    Each of them has ``t_obs`` past positions.
-    """
+def _straight_error_m(tracks: Positions, forecasts: Forecasts, number: Ints, offset_m: Floats) -> Floats:
+    """The errors (P, T) of constant velocity instead of forecasts ``number`` (P,), which are off by ``offset_m``."""
     paths = _sorted_positions(tracks, fill=True)
     place = paths.find(forecasts.id[number], forecasts.step[number])
-    steps = min(_VELOCITY_STEPS, t_obs - 1)
-    now, velocity = paths.xy_m[place], (paths.xy_m[place] - paths.xy_m[place - steps]) / max(steps, 1)
+    now, velocity = paths.xy_m[place], (paths.xy_m[place] - paths.xy_m[place - _VELOCITY_STEPS]) / _VELOCITY_STEPS
     ahead = np.arange(1, forecasts.mean_m.shape[1] + 1)[:, None]
     away = now[:, None] + ahead * velocity[:, None] - (forecasts.mean_m[number] - offset_m)
     return np.asarray(np.hypot(away[..., 0], away[..., 1]))

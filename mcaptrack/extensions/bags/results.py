@@ -26,7 +26,7 @@ from mcaptrack.foxglove.views import ground
 from mcaptrack.foxglove.views.people import base_heights, bodies_of
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, TRACKS, Frame, Rows, Schema
 from mcaptrack.schema.classes import class_name, class_names
 from mcaptrack.schema.encodings import CDR, encoded, ros_definition, ros_name
@@ -35,7 +35,6 @@ from mcaptrack.sources.cameras import cameras
 from mcaptrack.sources.fixed_frame import namespaces_of, transforms_of
 from mcaptrack.sources.foreign.definitions import typestore_of
 
-Progress = Callable[[str, int, int], None]
 #: The version of the format of metadata.yaml: readers accept earlier ones, not later ones.
 _VERSION: Final = 8
 #: ROS stamps have seconds of 32 bits.
@@ -71,12 +70,9 @@ class Rosbag2:
                 raise McaptrackError(f"{opened.path} has no detections, tracks or predictions to write as ROS messages")
             streams += job.transforms()
             try:
-                counts = _write(path, streams, self.storage, lambda count: progress("export", count, job.total))
+                return _write(path, streams, self.storage, lambda count: progress("export", count, job.total))
             except sqlite3.Error as error:
                 raise McaptrackError(f"{path.name} can't be written: {error}") from error
-        for note in job.notes:
-            warn(note, "left-out")
-        return counts
 
 
 class Rosbag2Sqlite3(Rosbag2):
@@ -344,10 +340,10 @@ def _with(stream: _Stream, connection: Any) -> Iterator[tuple[int, _Stream, Any,
 
 
 class _Job:
-    """The streams of a log for a bag: ``total`` counts their messages so far, ``notes`` say what is left out."""
+    """The streams of a log for a bag: ``total`` counts their messages so far."""
 
     def __init__(self, opened: log.Log) -> None:
-        self._opened, self.notes = opened, list[str]()
+        self._opened = opened
         self._prefixes = {topic: camera.prefix for camera in cameras(opened) for topic in camera.topics}
         self.total = 0
 
@@ -389,7 +385,7 @@ class _Job:
         lost = int((~pixels if is_flat else ~places).sum())
         if lost:
             lacking = "box in pixels" if is_flat else "position in metres"
-            self.notes.append(f"{topic}: {lost:,} rows without a {lacking} are not in the bag")
+            warn(f"{topic}: {lost:,} rows without a {lacking} are not in the bag", "left-out")
         if is_flat:
             flat = prefix.strip("/")
             boxes = ((frame.t_ns, boxes_2d(frame, flat, names)) for frame in frames)
@@ -415,8 +411,7 @@ class _Job:
         """The heights of the tracks of forecasts, by id, for each frame; empty if they have no 3D boxes."""
         beside = topic.removesuffix("/predictions")
         for name in (f"{beside}/online", beside, input_of(self._opened.channel(topic).metadata)):
-            channel = self._opened.channels.get(name)
-            if channel is None or channel.schema_name != TRACKS.name:
+            if not self._opened.holds(name, TRACKS):
                 continue
             tracks = self._opened.frames(name, TRACKS)
             out: list[Mapping[int, float]] = []

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import unreadable
+from mcaptrack.files import reading, writing
 from mcaptrack.sources.ingest.decompression import WINDOW_BYTES, NotUnpackedError, limit_of, too_large
 
 #: Small enough that Python handles signals between two pieces.
@@ -51,27 +51,22 @@ def copy(path: Path, out: Path) -> None:
     """Copy a file to a temporary folder. Raises McaptrackError if there is not enough space."""
     size = path.stat().st_size
     try:
-        with path.open("rb") as stream:
+        with reading(path) as stream:
             _write(stream, out, size, size)
     except NotUnpackedError:
         raise McaptrackError(f"{path} grows while it is being read; is it still being recorded?") from None
-    except OSError as error:
-        raise unreadable(path, error) from None
 
 
 def _write(stream: Any, out: Path, expected: int, most: int) -> None:
     """Write a stream to a file, limited to ``most`` bytes and the free disk space."""
     free = int(shutil.disk_usage(out.parent).free * _DISK_SHARE)
     size = expected
-    try:
-        with out.open("wb") as file:
-            done = 0
-            while size <= min(most, free) and (piece := stream.read(_PIECE_BYTES)):
-                done += len(piece)
-                size = max(done, expected)
-                file.write(piece)
-    except OSError as error:
-        raise McaptrackError(f"{out} can't be written: {error.strerror or error}") from None
+    with writing(out), out.open("wb") as file:
+        done = 0
+        while size <= min(most, free) and (piece := stream.read(_PIECE_BYTES)):
+            done += len(piece)
+            size = max(done, expected)
+            file.write(piece)
     if size > most:
         raise too_large(None, most)
     if size > free:

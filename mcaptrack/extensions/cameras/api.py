@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mcaptrack import log as logs
     from mcaptrack import pipeline
     from mcaptrack.extensions.cameras.calibrating import CorrectedPlanes, Refined
-    from mcaptrack.pipeline.scenes import Say
+    from mcaptrack.notices import Say
     from mcaptrack.pipeline.write import Made
     from mcaptrack.sources.fixed_frame import BoxesRead
 

@@ -14,7 +14,7 @@ from mcaptrack.geometry.arrays import Bools, Floats, Indices, Ints
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.neighbours import squared_sigmas
-from mcaptrack.geometry.plane import GroundPlane, Planes, plane_at, runs_of_planes
+from mcaptrack.geometry.plane import Planes, plane_at, runs_of_planes
 from mcaptrack.geometry.ragged import group_index, ragged_range, table_of
 from mcaptrack.schema import BOX_PX, COVARIANCE_M2, DETECTIONS, SIGHTINGS, Frame, Rows, Schema
 from mcaptrack.schema.framing import split_rows
@@ -173,7 +173,7 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
     for number, (group_, of_camera) in enumerate(zip(owner, cameras, strict=True)):
         slots[group_][of_camera] = number
     for group_ in tried[np.argsort(size[tried], kind="stable")].tolist():
-        moves = _moves(group_, slots, cameras, choices)
+        moves = _moves(group_, slots, choices)
         if moves is None:
             continue
         for number, _ in moves:
@@ -185,7 +185,7 @@ def _dissolved(camera: Ints, places: Places, of: Ints, gate: float, farthest_m: 
 
 
 def _moves(
-    group_: int, slots: list[dict[int, int]], cameras: list[int], choices: dict[int, list[tuple[float, int]]]
+    group_: int, slots: list[dict[int, int]], choices: dict[int, list[tuple[float, int]]]
 ) -> list[tuple[int, int]] | None:
     """The boxes that move if a group is dissolved, each with its new group; None if one has no place."""
     moves: list[tuple[int, int]] = []
@@ -383,7 +383,7 @@ class CameraView:
             return np.zeros(len(xy_m))
         foot = plane.metres_to_pixels(xy_m)
         x, y = foot.T
-        height = self.heights_at(plane, foot)
+        height = self.heights_at(foot)
         is_there: Bools = np.asarray(np.isfinite(x) & (height > 1))
         half = self.width / 2 * height
         left, right, top = x - half, x + half, y - height
@@ -406,7 +406,7 @@ class CameraView:
         out: Floats = np.minimum(seen, 1.0) * np.prod(1 - np.clip(hidden, 0, 1, out=hidden), axis=2)[table >= 0]
         return out
 
-    def heights_at(self, plane: GroundPlane, foot: Floats) -> Floats:
+    def heights_at(self, foot: Floats) -> Floats:
         """The heights (G,) in px of boxes that touch the ground at these points (G, 2)."""
         if self.heights is None:
             return np.full(len(foot), 2.0)

@@ -5,7 +5,7 @@ Letters: C cameras.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from typing import Final, NamedTuple
@@ -22,7 +22,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.geometry.plane import is_assumed, runs_of_planes
 from mcaptrack.geometry.ragged import group_index, ragged_range
 from mcaptrack.location import Location
-from mcaptrack.notices import collected, warn
+from mcaptrack.notices import Progress, Say, collected, warn
 from mcaptrack.pipeline.checks import cameras_named, describe_origin, may_replace, read_named_frames
 from mcaptrack.pipeline.rebuild import plugins_of
 from mcaptrack.pipeline.several import split_by_lack
@@ -41,8 +41,8 @@ def fuse_again(
     opened: log.Log,
     prefix: str,
     force: bool,
-    say: Callable[[str], None],
-    progress: Callable[[str, int, int], None],
+    say: Say,
+    progress: Progress,
     adds: bool = False,
     fuser: Transform | None = None,
 ) -> dict[str, Made] | None:
@@ -361,7 +361,7 @@ def fuse_cameras(
     prefix: str,
     fuser: Transform,
     clock_offset_s: Mapping[str, float],
-    progress: Callable[[str, int, int], None],
+    progress: Progress,
     is_chosen: bool,
     takes_strangers: bool,
 ) -> dict[str, Made]:
@@ -442,7 +442,7 @@ def fuse_cameras(
     return {target: scene, below: Made.of(SIGHTINGS, sightings, of_scene)}
 
 
-def _results(fuser: Transform, compared: Compared, progress: Callable[[str, int, int], None]) -> list[Sequence[Frame]]:
+def _results(fuser: Transform, compared: Compared, progress: Progress) -> list[Sequence[Frame]]:
     """Run the fuser; return the frames of detections, and those of the sightings that they are made of."""
     collectors = {"": FrameCollector(DETECTIONS), "sightings": FrameCollector(SIGHTINGS)}
     gathered = compared.gathered

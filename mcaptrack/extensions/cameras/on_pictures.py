@@ -129,7 +129,7 @@ def _standing(view: CameraView, xy_m: Floats, t_ns: Ints) -> Floats:
         return box
     for plane, held in by_plane(view.planes, t_ns):
         foot = plane.metres_to_pixels(xy_m[held])
-        high = view.heights_at(plane, foot)
+        high = view.heights_at(foot)
         boxes = plane.standing_boxes(xy_m[held], np.stack([view.width * high, high], axis=-1))
         size = np.array([plane.width_px, plane.height_px], float)
         low, up = boxes[:, :2], boxes[:, :2] + boxes[:, 2:]

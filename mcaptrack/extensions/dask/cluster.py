@@ -15,7 +15,7 @@ from typing import Any, Final
 from uuid import uuid4
 
 from mcaptrack import __version__
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, in_one_line, needing
 from mcaptrack.fleet import Running
 from mcaptrack.fleet.worker import Child, Reply, Request, WorkerLimits
 from mcaptrack.location import Location
@@ -32,10 +32,8 @@ class Cluster:
     """Processes logs on a cluster. ``places`` is how many it can be busy with: one for each thread of its workers."""
 
     def __init__(self, address: str, limits: WorkerLimits, most: int | None) -> None:
-        try:
+        with needing("`scheduler=`", "Dask", "fleet"):
             from distributed import Client
-        except ImportError:
-            raise McaptrackError("`scheduler=` needs Dask: `pip install 'mcaptrack[fleet]'` installs it") from None
         self._address, self._most = address, most
         loggers = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] in _LOGGERS]
         self._levels = {name: logging.getLogger(name).level for name in (*_LOGGERS, *loggers)}
@@ -46,8 +44,7 @@ class Cluster:
             self._client = make(address, timeout=_ANSWER_S, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError) as error:
             self._restore_logging()
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise McaptrackError(f"no Dask scheduler answers at {address}: {text:.200}") from error
+            raise McaptrackError(f"no Dask scheduler answers at {address}: {in_one_line(error, 200)}") from error
         self._futures: dict[Location, tuple[Any, float]] = {}
         self._places, self._looked = 0, 0.0
         self._limits = limits
@@ -69,10 +66,8 @@ class Cluster:
         try:
             theirs = self._client.run(versions)
         except Exception as error:
-            text = " ".join(str(error).split())
-            raise McaptrackError(
-                f"workers of {self._address} can't use this version of mcaptrack: {text:.200}"
-            ) from error
+            text = f"workers of {self._address} can't use this version of mcaptrack"
+            raise McaptrackError(f"{text}: {in_one_line(error, 200)}") from error
         for name, version in own.items():
             others = sorted({worker_versions[name] for worker_versions in theirs.values()} - {version})
             if others:
@@ -113,8 +108,7 @@ class Cluster:
         except CancelledError:
             out.cancel()
         except Exception as error:
-            text = " ".join(str(error).split()) or type(error).__name__
-            out.set_result(Reply(request.log, "failed", error=f"{request.log}: {text:.500}"))
+            out.set_result(Reply(request.log, "failed", error=f"{request.log}: {in_one_line(error, 500)}"))
         self._futures.pop(request.log, None)
         return out
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError
-from mcaptrack.files import unreadable
+from mcaptrack.files import reading
 from mcaptrack.geometry.arrays import Floats, Ints
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
 from mcaptrack.sources.ingest.labels.table import NO_CLASS, Asked, BoxTable, LabelFacts
@@ -116,10 +116,8 @@ class _Table:
 
         self.path = path
         try:
-            with path.open("rb") as stream:
+            with reading(path) as stream:
                 table = feather.read_table(stream)
-        except OSError as error:
-            raise unreadable(path, error) from None
         except (pa.ArrowException, ValueError) as error:
             raise McaptrackError(f"{path} is no table in Feather format: {str(error).splitlines()[0][:80]}") from None
         if missing := [name for name in names if name not in table.column_names]:

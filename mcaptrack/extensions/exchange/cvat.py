@@ -27,7 +27,7 @@ from typing import IO, Any, Final
 import numpy as np
 
 from mcaptrack.errors import McaptrackError, list_names
-from mcaptrack.files import unreadable
+from mcaptrack.files import reading
 from mcaptrack.geometry.arrays import Bools, Floats, Ints
 from mcaptrack.sources.box_files import BoxFile, ExportedBoxes
 from mcaptrack.sources.ingest.labels.format import Format, LabelFile
@@ -85,18 +85,17 @@ _SHOWN: Final = 5
 @contextmanager
 def opened_xml(path: Path) -> Iterator[IO[bytes]]:
     """The XML of a file or of a zip file. Raises McaptrackError if it can't be read, or if there is none or several."""
-    try:
-        with path.open("rb") as stream:
-            if stream.read(4) not in (_ZIP, _EMPTY_ZIP):
-                stream.seek(0)
-                yield stream
-                return
-        with zipfile.ZipFile(path) as archive, archive.open(_member(path, archive.namelist())) as member:
-            yield member
-    except (zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
-        raise McaptrackError(f"{path} is a zip file with an {_MEMBER} that can't be read: {error}") from None
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with reading(path) as stream:
+        is_packed = stream.read(4) in (_ZIP, _EMPTY_ZIP)
+        stream.seek(0)
+        if not is_packed:
+            yield stream
+            return
+        try:
+            with zipfile.ZipFile(stream) as archive, archive.open(_member(path, archive.namelist())) as member:
+                yield member
+        except (zipfile.BadZipFile, zlib.error, KeyError, NotImplementedError, RuntimeError, EOFError) as error:
+            raise McaptrackError(f"{path} is a zip file with an {_MEMBER} that can't be read: {error}") from None
 
 
 def _member(path: Path, names: list[str]) -> str:

@@ -12,11 +12,11 @@ from typing import Annotated, Any
 
 from mcaptrack.api.declared import Argument, declared, done_by
 from mcaptrack.api.options import PathLike
-from mcaptrack.errors import McaptrackError, call
+from mcaptrack.errors import McaptrackError, call, needing
 from mcaptrack.extensions.networks import catalogue
 from mcaptrack.extensions.networks.catalogue import Model
 from mcaptrack.extensions.networks.network import digest_of, providers
-from mcaptrack.files import publish_bytes, refuse_special, unreadable
+from mcaptrack.files import make_folder, publish_bytes, reading, refuse_special
 from mcaptrack.notices import warn
 
 #: How long to wait for a connection, and for the next bytes, in seconds.
@@ -103,14 +103,14 @@ def get_model(name: str, *, source: PathLike | None = None) -> Path:
     text = "" if source is None else str(source)
     if text and not text.startswith(("http://", "https://")):
         data = _read(model, Path(text))
-        _make_folder(model)
+        make_folder(model.path.parent)
         publish_bytes(model.path, data)
         return model.path
     if not text and model.path.is_file():
         if digest_of(model.path) == model.sha256:
             return model.path
         warn(f"{model.path} is damaged, or another file; it is fetched again", "other")
-    _make_folder(model)
+    make_folder(model.path.parent)
     failures = []
     for url in (text,) if text else model.urls:
         try:
@@ -130,31 +130,17 @@ def _read(model: Model, path: Path) -> bytes:
     Raises McaptrackError if it can't be read, or is not the model's.
     """
     refuse_special(path)
-    try:
-        with path.open("rb") as file:
-            data, size = file.read(model.size_bytes + 1), path.stat().st_size
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with reading(path) as file:
+        data, size = file.read(model.size_bytes + 1), path.stat().st_size
     catalogue.check(model, hashlib.sha256(data).hexdigest(), max(size, len(data)), path)
     return data
 
 
-def _make_folder(model: Model) -> None:
-    try:
-        model.path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise McaptrackError(f"{model.path.parent} can't be made: {error.strerror}") from None
-
-
 def _fetch(model: Model, url: str) -> Path:
     """Fetch a file that has to have the known digest. Raises McaptrackError if that fails."""
-    try:
+    with needing("fetching", "pooch", "onnx"):
         import pooch
         import requests
-    except ImportError:
-        raise McaptrackError(
-            "fetching needs pooch, which is not installed; `pip install 'mcaptrack[onnx]'` installs it"
-        ) from None
 
     def download(address: str, output: Any, _: Any) -> None:
         """Save what an address gives; refuse more bytes than the model has."""

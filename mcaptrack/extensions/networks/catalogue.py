@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -57,8 +58,9 @@ class Model:
         return folder() / f"{self.name}-{self.sha256[:12]}.onnx"
 
 
+_yolox = partial(Model, licence="Apache-2.0", source=_YOLOX, trained_on="COCO")
 _MODELS: Final = (
-    Model(
+    _yolox(
         name="yolox-nano",
         urls=(
             f"https://raw.githubusercontent.com/{_SAMPLE}/3d4f111/model/yolox_nano.onnx",
@@ -66,22 +68,16 @@ _MODELS: Final = (
         ),
         sha256="695e750a5d5754bb5a8d5325643b59282191a7e7a564e435a415fd3c578eab14",
         size_bytes=3_660_092,
-        licence="Apache-2.0",
-        source=_YOLOX,
-        trained_on="COCO",
         good_for="people and vehicles on a CPU, at any multiple of 32 pixels",
     ),
-    Model(
+    _yolox(
         name="yolox-tiny",
         urls=(f"{_RELEASE}/yolox_tiny.onnx",),
         sha256="427cc366d34e27ff7a03e2899b5e3671425c262ea2291f88bb942bc1cc70b0f7",
         size_bytes=20_219_662,
-        licence="Apache-2.0",
-        source=_YOLOX,
-        trained_on="COCO",
         good_for="the same with more certainty, several times slower; not measured with mcaptrack",
     ),
-    Model(
+    _yolox(
         name="yolox-s",
         urls=(
             f"https://media.githubusercontent.com/media/{_ZOO}/object_detection_yolox_2022nov.onnx",
@@ -89,9 +85,6 @@ _MODELS: Final = (
         ),
         sha256="c5c2d13e59ae883e6af3b45daea64af4833a4951c92d116ec270d9ddbe998063",
         size_bytes=35_858_002,
-        licence="Apache-2.0",
-        source=_YOLOX,
-        trained_on="COCO",
         good_for="the same on a GPU; not measured with mcaptrack",
     ),
 )

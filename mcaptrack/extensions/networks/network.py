@@ -18,7 +18,7 @@ from typing import Any, Final, Self
 from numpy.typing import NDArray
 
 from mcaptrack import environment
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, lacks
 from mcaptrack.extensions.networks.child import NetworkProcess
 from mcaptrack.extensions.networks.session import (
     Device,
@@ -30,7 +30,7 @@ from mcaptrack.extensions.networks.session import (
     is_installed,
     providers,
 )
-from mcaptrack.files import unreadable
+from mcaptrack.files import reading
 from mcaptrack.notices import warn
 
 __all__ = [
@@ -112,11 +112,8 @@ class NetworkFile:
 
 def digest_of(path: Path) -> str:
     """The SHA-256 of a file. Raises McaptrackError if it can't be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise unreadable(path, error) from None
+    with reading(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_file(path: Path, limits: NetworkLimits) -> NetworkFile:
@@ -124,15 +121,13 @@ def read_file(path: Path, limits: NetworkLimits) -> NetworkFile:
 
     ``limits`` are those of the network.
     """
-    try:
+    with reading(path) as file:
         if path.stat().st_size > limits.memory_bytes:
             raise McaptrackError(
                 f"{path} holds {path.stat().st_size / 1e6:,.0f} MB; a network may take "
                 f"{limits.memory_bytes / 1e6:,.0f} MB ({limits.setting})"
             )
-        data = path.read_bytes()
-    except OSError as error:
-        raise unreadable(path, error) from None
+        data = file.read()
     return NetworkFile(path, data, hashlib.sha256(data).hexdigest())
 
 
@@ -183,9 +178,7 @@ class OnnxNetwork:
         self._file, self._limits, self._device = file, limits, device
         self._session: Session | NetworkProcess | None = None
         if not is_installed():
-            raise McaptrackError(
-                f"{file.path} needs ONNX Runtime, which is not installed; `pip install 'mcaptrack[onnx]'` installs it"
-            )
+            raise McaptrackError(lacks(str(file.path), "ONNX Runtime", "onnx"))
         with self._blamed():
             if _runs_apart(is_trusted):
                 self._session = NetworkProcess(lanes, device, limits.memory_bytes, limits.seconds)

@@ -262,9 +262,8 @@ def _player_page(
         "ground": "#" + bytes(BACKGROUND[::-1]).hex(),
     }
     pictures = " ".join(_base64(jpeg) for jpeg in taken.jpegs)
-    return str(
-        render("player.html", __package__ or "", caption=caption, pictures=pictures, data=_base64(_packed(data)))
-    )
+    packed = zlib.compress(json.dumps(data, allow_nan=False, separators=(",", ":")).encode(), 9)
+    return str(render("player.html", __package__ or "", caption=caption, pictures=pictures, data=_base64(packed)))
 
 
 def _tracks_of(layer: str) -> str:
@@ -279,10 +278,6 @@ def _name(topic: str) -> str:
     for suffix in SUFFIXES:
         topic = topic.partition(suffix)[0]
     return topic.lstrip("/").partition("/")[2] or topic
-
-
-def _packed(data: Any) -> bytes:
-    return zlib.compress(json.dumps(data, allow_nan=False, separators=(",", ":")).encode(), 9)
 
 
 def _base64(data: bytes) -> str:

@@ -20,7 +20,7 @@ from mcaptrack.foxglove.messages import message_class
 from mcaptrack.foxglove.views import SCENE_SUFFIX
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.schema import PREDICTIONS, Schema
 from mcaptrack.schema.classes import class_names
 from mcaptrack.schema.framing import has_any
@@ -47,8 +47,6 @@ _TRIED: Final = 5
 _DRAWN_BYTES: Final = 500
 #: The growth of bytes that are written as text (base64).
 _AS_TEXT: Final = 4 / 3
-
-Progress = Callable[[str, int, int], None]
 
 
 # Annotation messages as lines and texts in JSON, for a page that draws them over pictures.

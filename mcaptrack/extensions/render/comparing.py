@@ -32,6 +32,7 @@ from mcaptrack.extensions.render.video import (
 from mcaptrack.foxglove import views
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.notices import Progress
 from mcaptrack.pipeline import RobotPath
 from mcaptrack.schema import EVENTS, TRACKS, EventKind
 from mcaptrack.schema.framing import frame_times, joined_parts
@@ -105,7 +106,7 @@ def compare(
     output: Path,
     options: RenderOptions,
     path_of_robot: Callable[[Ints], RobotPath | None] = lambda _: None,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
 ) -> int:
     """Draw panels side by side on the pictures of a channel, or from above, and write a video, .mp4 or .gif.
 

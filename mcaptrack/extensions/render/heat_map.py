@@ -113,10 +113,9 @@ def _channel(opened: log.Log, prefix: str, topics: Sequence[str]) -> str:
         if not channel.holds(TRACKS):
             raise McaptrackError(f"{opened.path}: {topics[0]} holds {channel.schema_name}, not tracks to count")
         return channel.topic
-    for name in _BEST:
-        channel_found = opened.channels.get(f"{prefix}/{name}")
-        if channel_found is not None and channel_found.holds(TRACKS):
-            return channel_found.topic
+    for topic in (f"{prefix}/{name}" for name in _BEST):
+        if opened.holds(topic, TRACKS):
+            return topic
     raise McaptrackError(f"{opened.path} has no tracks of {prefix} yet; {call('run', opened.path)} makes them")
 
 

@@ -22,6 +22,7 @@ from mcaptrack.extensions.render.legend import LabelPlaces, with_legend
 from mcaptrack.foxglove.views.ground import lifetime_ns
 from mcaptrack.geometry.arrays import Image, Ints
 from mcaptrack.geometry.clocks import NS_PER_S, seconds_to_ns
+from mcaptrack.notices import Progress
 from mcaptrack.pipeline import RobotPath
 from mcaptrack.sources.foreign.flatten import message_decoder
 from mcaptrack.sources.pictures import Pictures
@@ -52,7 +53,7 @@ def render(
     view_topics: Sequence[str],
     output: Path,
     options: RenderOptions,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
     hidden: HiddenPeople | None = None,
 ) -> int:
     """Draw views on the pictures of a channel and write a video, .mp4 or .gif by the suffix of ``output``.
@@ -120,7 +121,7 @@ def render_from_above(
     output: Path,
     options: RenderOptions,
     path_of_robot: Callable[[Ints], RobotPath | None] = lambda _: None,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
 ) -> int:
     """Draw scenes, seen from above, and write a video, .mp4 or .gif by the suffix of ``output``.
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -201,9 +202,15 @@ def _add_sections(opened: log.Log, out: LogReport) -> None:
             out.sections[name] = section
 
 
-def _without_path(error: McaptrackError, opened: log.Log) -> str:
-    """The text of an error without the folder of the log, which readers of the page need not know."""
-    return str(error).replace(str(opened.path), opened.path.name)
+@contextmanager
+def _noting(opened: log.Log, note: Callable[[str], object]) -> Iterator[None]:
+    """Note an error without the folder of the log, which readers of the page need not know; damage ends the page."""
+    try:
+        yield
+    except DamagedError:
+        raise
+    except McaptrackError as error:
+        note(str(error).replace(str(opened.path), opened.path.name))
 
 
 def _read(opened: log.Log, out: LogReport) -> None:
@@ -227,24 +234,15 @@ def _read(opened: log.Log, out: LogReport) -> None:
         if not channel.holds(TRACKS):
             out.notes.append(f"{topic} holds {channel.schema_name or 'no schema'}, not tracks; it is left out")
             continue
-        try:
+        with _noting(opened, out.notes.append):
             frames = read_ground_truth(opened, out.prefix) if role == "truth" else opened.frames(topic, TRACKS)
-        except DamagedError:
-            raise
-        except McaptrackError as error:
-            out.notes.append(_without_path(error, opened))
-            continue
-        out.track_sets[role] = TrackSet(topic, role, names[role], frames)
+            out.track_sets[role] = TrackSet(topic, role, names[role], frames)
     out.has_only_people = all(
         nouns_of(track_set.frames, (), (class_names(opened.channel(track_set.topic).metadata), {})) is PEOPLE
         for track_set in out.track_sets.values()
     )
-    try:
+    with _noting(opened, out.notes.append):
         out.planes = pipeline.read_planes(opened, out.prefix) or ()
-    except DamagedError:
-        raise
-    except McaptrackError as error:
-        out.notes.append(_without_path(error, opened))
 
 
 def _score(opened: log.Log, out: LogReport) -> None:
@@ -255,19 +253,14 @@ def _score(opened: log.Log, out: LogReport) -> None:
             f"{command('ingest', 'LABELS', '--as', 'truth', '--into', Path(path))}."
         )
         return
-    try:
+    with _noting(opened, lambda text: out.missing.update(scores=f"Nothing could be scored: {text}.")):
         out.sequence = sequence_of_log(opened, out.prefix, ())
         out.sequence.name = out.name
         outcome = evaluate([out.sequence], EvaluateOptions())
-    except DamagedError:
-        raise
-    except McaptrackError as error:
-        out.missing["scores"] = f"Nothing could be scored: {_without_path(error, opened)}."
-        return
-    out.results = outcome.results
-    out.notes += outcome.notes
-    if out.sequence.labelled.frames is not None:
-        out.notes.append(f"only the frames {out.sequence.labelled.frames} of the ground truth were labelled and scored")
+        out.results = outcome.results
+        out.notes += outcome.notes
+        if (labelled := out.sequence.labelled.frames) is not None:
+            out.notes.append(f"only the frames {labelled} of the ground truth were labelled and scored")
 
 
 def _classes(opened: log.Log, out: LogReport, topic: str) -> tuple[dict[int, str], dict[int, str]]:
@@ -319,17 +312,15 @@ def _find_events(opened: log.Log, out: LogReport) -> None:
 
 def _decisions(opened: log.Log, topic: str) -> list[Frame]:
     """The decisions of re-tracking about a channel of tracks; none if there are none, or if they are out of date."""
-    channel = opened.channels.get(f"{topic}/decisions")
-    if channel is None or not channel.holds(DECISIONS) or pipeline.is_stale(opened, channel.topic):
-        return []
-    return list(opened.frames(channel.topic, DECISIONS))
+    below = f"{topic}/decisions"
+    is_known = opened.holds(below, DECISIONS) and not pipeline.is_stale(opened, below)
+    return opened.frames(below, DECISIONS) if is_known else []
 
 
 def _recorded(opened: log.Log, topic: str) -> tuple[list[Frame], MatchRule | None] | None:
     """The events in the log and the rule of their matches; None if there are none or they are out of date."""
-    channel = opened.channels.get(topic)
-    provenance = Provenance.from_metadata(channel.metadata) if channel else None
-    if channel is None or provenance is None or channel.schema_name != EVENTS.name or pipeline.is_stale(opened, topic):
+    provenance = provenance_of(opened, topic)
+    if provenance is None or not opened.holds(topic, EVENTS) or pipeline.is_stale(opened, topic):
         return None
     similarity: Any = provenance.parameters.get("similarity")
     gate = provenance.parameters.get("gate")
@@ -344,7 +335,7 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
     if topic is None:
         out.missing["pictures"] = "The log has no pictures of the scene"
         return
-    try:
+    with _noting(opened, lambda text: out.missing.update(pictures=f"The pictures can't be shown: {text}")):
         pictures = Pictures(opened, topic)
         out.background = background_picture(pictures)
         out.forecast_scene = _forecast_scene(opened, out, pictures)
@@ -353,23 +344,18 @@ def _read_pictures(opened: log.Log, out: LogReport) -> None:
         if out.doubts and out.repairs is not None:
             tracks = _with_boxes(out, out.repairs.topic)
             add_thumbnails([doubt.event for doubt in out.doubts], tracks, pictures, out.start_ns)
-    except DamagedError:
-        raise
-    except McaptrackError as error:
-        out.missing["pictures"] = f"The pictures can't be shown: {_without_path(error, opened)}"
-        return
-    if out.background is None:
-        out.missing["pictures"] = f"{topic} holds no pictures"
+        if out.background is None:
+            out.missing["pictures"] = f"{topic} holds no pictures"
 
 
 def _forecast_scene(opened: log.Log, out: LogReport, pictures: Pictures) -> dict[str, Any] | None:
     """The forecasts of the time with the most of them, over its picture; None without forecasts or a ground plane."""
     for below, role in _FORECASTS.items():
-        channel = opened.channels.get(f"{out.prefix}/{below}")
-        if channel is None or not channel.holds(PREDICTIONS):
+        topic = f"{out.prefix}/{below}"
+        if not opened.holds(topic, PREDICTIONS):
             continue
         chosen = max(
-            opened.frames(channel.topic, PREDICTIONS),
+            opened.frames(topic, PREDICTIONS),
             key=lambda frame: len(np.unique(frame.rows["track_id"])),
             default=None,
         )
@@ -380,7 +366,7 @@ def _forecast_scene(opened: log.Log, out: LogReport, pictures: Pictures) -> dict
         past = out.track_sets.get(role)
         future = out.track_sets["truth"].frames if "truth" in out.track_sets else []
         drawn = forecast_map(chosen.rows, past.frames if past else [], future, chosen.t_ns, behind, plane)
-        names = {"name": short(past.name) if past else channel.topic, "role": role}
+        names = {"name": short(past.name) if past else topic, "role": role}
         at = clock((chosen.t_ns - out.start_ns) / NS_PER_S)
         return drawn | names | {"t_ns": chosen.t_ns, "clock": at, "has_truth": bool(future)}
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -87,11 +88,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 def _versions(rows: Sequence[Row]) -> dict[str, int]:
     """The number of logs with results of each version; "" for those without results."""
-    counts: dict[str, int] = {}
-    for row in rows:
-        text = row.get("versions") or ""
-        counts[text] = counts.get(text, 0) + 1
-    return dict(sorted(counts.items()))
+    return dict(sorted(Counter(row.get("versions") or "" for row in rows).items()))
 
 
 def worst(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -102,12 +99,9 @@ def worst(rows: Sequence[Row]) -> dict[str, list[Row]]:
         ranking = sorted((number, name, at) for at, (number, name, _) in enumerate(valued) if number is not None)
         return [rows[at] for _, _, at in ranking[:_LISTED]]
 
-    def most(name: str) -> Callable[[Row], float | None]:
-        return lambda row: -value if (value := per_hour(row, name)) else None
-
     return {
         "IDF1": ranked(lambda row: row.get("IDF1")),
-        "IDSW": ranked(most("IDSW")),
+        "IDSW": ranked(lambda row: -value if (value := per_hour(row, "IDSW")) else None),
         "warnings": ranked(lambda row: -row["warnings"] if row.get("warnings") else None),
     }
 
@@ -143,14 +137,10 @@ def warnings_by_code(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """The codes of warnings: how many logs have each, one of its messages, and a log with it."""
     by_code: dict[str, dict[str, Any]] = {}
     for row in rows:
-        first_messages: dict[str, str] = {}
-        for code, message in _notices_in(row.get("warning_texts")):
-            first_messages.setdefault(code, message)
-        for code, message in first_messages.items():
-            entry = by_code.setdefault(
-                code, {"code": code, "logs": 0, "message": message, "recording": row["recording"]}
-            )
-            entry["logs"] += 1
+        # The first message of each code.
+        for code, message in dict(reversed([*_notices_in(row.get("warning_texts"))])).items():
+            first = {"code": code, "logs": 0, "message": message, "recording": row["recording"]}
+            by_code.setdefault(code, first)["logs"] += 1
     return sorted(by_code.values(), key=lambda entry: (-entry["logs"], entry["code"]))
 
 

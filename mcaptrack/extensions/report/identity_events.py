@@ -307,7 +307,7 @@ class DoubtfulTrack(NamedTuple):
 
 
 def find_doubts(
-    repairs: ChannelEvents | None,
+    repairs: ChannelEvents,
     tracks: Sequence[Frame],
     people: PersonScores | None,
     decisions: Sequence[Frame] = (),
@@ -318,8 +318,6 @@ def find_doubts(
     person was expected, going on as in the last two seconds before the gap. ``people`` are the scores of ``tracks`` by
     person, if there is ground truth. Repairs without positions in metres are left out.
     """
-    if repairs is None:
-        return []
     rows, t_ns = rows_by_track(tracks)
     joins = {
         (frame.t_ns, int(row["track_id"]), int(row["source_id"])): row

@@ -12,7 +12,7 @@ Rerun notes when it wrote each message, so that two files of one log differ in t
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,12 +22,12 @@ from urllib.parse import urlencode
 import numpy as np
 
 from mcaptrack import log
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, lacks, needing
 from mcaptrack.foxglove.palette import colours
 from mcaptrack.geometry.arrays import Floats
 from mcaptrack.geometry.boxes import columns_to_boxes
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.schema import DETECTIONS, PREDICTIONS, SCHEMAS, Frame
 from mcaptrack.schema.classes import PERSON, class_name, class_names
 from mcaptrack.sources import foreign
@@ -36,9 +36,8 @@ from mcaptrack.sources.cameras import Camera, cameras
 from mcaptrack.sources.video import is_video_codec
 from mcaptrack.viewing.serving import WebViewer
 
-Progress = Callable[[str, int, int], None]
 _APPLICATION: Final = "mcaptrack"
-_MISSING: Final = 'needs rerun-sdk, which is not installed; install it with: pip install "mcaptrack[rerun]"'
+_NEEDED: Final = ("a recording of Rerun", "rerun-sdk", "rerun")
 #: Times are dates from here on, and durations before.
 _DATES_NS: Final = 10**9 * NS_PER_S
 #: How long trails are.
@@ -52,10 +51,8 @@ _RADIUS_M: Final = 0.15
 
 def library() -> Any:
     """Rerun's library. Raises McaptrackError if it is not installed."""
-    try:
+    with needing(*_NEEDED):
         import rerun
-    except ImportError:
-        raise McaptrackError(f"a recording of Rerun {_MISSING}") from None
     return rerun
 
 
@@ -96,7 +93,7 @@ def _why_not(opened: log.Log) -> str:
         version("rerun-sdk")
         boxes_topic(opened)
     except PackageNotFoundError:
-        return _MISSING
+        return lacks(*_NEEDED)
     except McaptrackError as error:
         return str(error)
     return ""
@@ -119,8 +116,6 @@ def write_recording(opened: log.Log, output: Path, topic: str, progress: Progres
         progress("export", min(done, total), total)
     recording.flush()
     recording.disconnect()
-    for note in job.notes:
-        warn(note, "left-out")
     return {topic: job.rows}
 
 
@@ -130,7 +125,6 @@ class _Job:
     def __init__(self, rerun: Any, recording: Any, opened: log.Log) -> None:
         self._rr, self._recording, self._opened = rerun, recording, opened
         self.rows = 0
-        self.notes: list[str] = []
 
     def blueprint(self) -> Any:
         """Pictures with boxes on the left, the ground on the right."""
@@ -154,11 +148,8 @@ class _Job:
             yield from self._pictures(camera.pictures)
         yield from self._tracks(topic, frames)
         names = [f"{camera.prefix}/{name}" for name in _FORECASTS] if camera else []
-        for name in names:
-            channel = self._opened.channels.get(name)
-            if channel is not None and channel.holds(PREDICTIONS):
-                yield from self._forecasts(name)
-                break
+        for name in [name for name in names if self._opened.holds(name, PREDICTIONS)][:1]:
+            yield from self._forecasts(name)
 
     def _at(self, t_ns: int, number: int | None) -> None:
         when = np.datetime64(t_ns, "ns") if t_ns >= _DATES_NS else None
@@ -187,7 +178,7 @@ class _Job:
                 lost += 1
             yield
         if lost:
-            self.notes.append(f"{topic}: {lost} pictures that are neither video, JPEG, PNG nor WebP are left out")
+            warn(f"{topic}: {lost} pictures that are neither video, JPEG, PNG nor WebP are left out", "left-out")
 
     def _tracks(self, topic: str, frames: Any) -> Iterator[None]:
         rr, names = self._rr, class_names(self._opened.channel(topic).metadata)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import webbrowser
 from typing import TYPE_CHECKING, Annotated, Any
 
+from mcaptrack.api.common import warn_unused
 from mcaptrack.api.declared import Option
 from mcaptrack.cli import common
-from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.declared import Once
 from mcaptrack.cli.text import show
 from mcaptrack.errors import command
@@ -40,9 +40,9 @@ class ReviewCommand(Once["Review"]):
                 done.finish(talk.progress)
             talk.clear()
         else:
-            warn_unused("no page is served", "open", "port", "host")
+            warn_unused("no page is served", open=True, port=True, host=True)
             if done.result is not None:
-                warn_unused("answers are taken, and no questions are printed", "print")
+                warn_unused("answers are taken, and no questions are printed", print=True)
         super().print_result(done, talk)
 
     def data(self, done: Review) -> dict[str, Any]:

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import mcaptrack
+from mcaptrack.api.common import warn_unused
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import PathLike
 from mcaptrack.cli import common
-from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once, Printed
 from mcaptrack.cli.text import console, print_table, printable, show
@@ -69,7 +69,7 @@ class Query(Once[Any]):
         given, output = self.values, self.values["output"]
         paths, sql = _asked(given["words"] or [], given["file"], given["tables"])
         if given["tables"]:
-            warn_unused("--tables lists what could be asked", "form", "rows", "worlds")
+            warn_unused("--tables lists what could be asked", form=True, rows=True, worlds=True)
         logs = expand(paths, folders=True)
         if output is not None:
             refuse_overwrite(output, given["force"])
@@ -93,7 +93,7 @@ class Query(Once[Any]):
             if note:
                 talk.say(note)
         else:
-            warn_unused(f"{self._form} has all rows", "rows")
+            warn_unused(f"{self._form} has all rows", rows=True)
             with self.printed() if json else nullcontext():
                 _write(done, self._form, output, json)
 

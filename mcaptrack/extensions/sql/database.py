@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mcaptrack import log, tables
-from mcaptrack.errors import McaptrackError, call, did_you_mean
+from mcaptrack.errors import McaptrackError, call, did_you_mean, needing
 from mcaptrack.evaluation.world_tracks import WorldInterval, WorldTracks, lacks_intervals, tracks_in_worlds
 from mcaptrack.files import place_of, publish
 from mcaptrack.geometry.arrays import Floats
@@ -212,11 +212,11 @@ class Database:
             raise McaptrackError(f"tables come in when a query names them; {call('list_tables', 'LOG')} lists them")
         statements = self._connection.extract_statements(query)
         _refuse_writing([statement.type.name for statement in statements])
-        answer = None
-        for statement in statements:
-            result = self._run(statement)
-            answer = result if statement.type.name in _ANSWERING else answer
-        return answer
+        answers = [self._run(each) for each in statements]
+        answers = [answer for answer, each in zip(answers, statements, strict=True) if each.type.name in _ANSWERING]
+        if len(answers) > 1:
+            warn(f"the query asks {len(answers)} questions; only the last is answered", "left-out")
+        return answers[-1] if answers else None
 
     def _worlds_answer(self, query: str) -> Any:
         """As ``ask_worlds``."""
@@ -463,12 +463,8 @@ def _of_world(samples: Any, frames: Any, xy_m: Floats, world: WorldTracks) -> An
 
 def _duckdb() -> Any:
     """DuckDB, if it is installed."""
-    try:
+    with needing("SQL", "DuckDB", "sql"):
         import duckdb
-    except ImportError:
-        raise McaptrackError(
-            'SQL needs DuckDB, which is not installed; install it with: pip install "mcaptrack[sql]"'
-        ) from None
     return duckdb
 
 

@@ -6,20 +6,20 @@ import csv
 import io
 import json
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, needing
 from mcaptrack.evaluation.metrics.displacement import forecast_scores
 from mcaptrack.extensions.training.api import TrainResult
 from mcaptrack.extensions.training.recipe import Recipe
 from mcaptrack.extensions.training.windows import Windows, ar1
 from mcaptrack.files import publish_bytes
 from mcaptrack.geometry.mixtures import mahalanobis_squared
+from mcaptrack.notices import Progress, Say
 from mcaptrack.predictors import make, red
 from mcaptrack.predictors.forecast import Predictor
 from mcaptrack.predictors.lstm import Lstm
@@ -30,8 +30,6 @@ _STATE: Final = "state.safetensors"
 _COLUMNS: Final = ("epoch", "loss", "validation_ade_m", "rate", "seconds")
 #: Noise of the second set of validation windows; the first has none.
 _NOISE_M: Final = 0.2
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass
@@ -54,7 +52,7 @@ def train(
     threads: int | None = None,
     resume: bool = False,
     progress: Progress = lambda *_: None,
-    say: Callable[[str], None] = lambda _: None,
+    say: Say = lambda _: None,
 ) -> TrainResult:
     """Train a network; write weights, a log of the epochs and a state to resume from into ``folder``.
 
@@ -118,7 +116,9 @@ def train(
     run.publish(validation, card)
     predictor = f"{recipe.network}:{run.weights}"
     scores = compare(make(predictor, recipe.steps, recipe.step_s), validation, recipe)
-    run.publish(validation, card | {f"scores_{k}": _to_text(part[recipe.network]) for k, part in scores.items()})
+    for kind, part in scores.items():
+        card[f"scores_{kind}"] = " ".join(f"{name}={value:.3f}" for name, value in part[recipe.network].items())
+    run.publish(validation, card)
     return TrainResult(
         weights=run.weights,
         predictor=predictor,
@@ -146,17 +146,9 @@ def _noisy(windows: Windows) -> Windows:
     return Windows(windows.past + noise, windows.known, windows.future, windows.scene)
 
 
-def _to_text(scores: dict[str, float]) -> str:
-    return " ".join(f"{name}={value:.3f}" for name, value in scores.items())
-
-
 def _torch() -> Any:
-    try:
+    with needing("training", "torch", "train"):
         import torch
-    except ImportError:
-        raise McaptrackError(
-            "training needs torch, which is not installed; `pip install 'mcaptrack[train]'` installs it"
-        ) from None
     return torch
 
 

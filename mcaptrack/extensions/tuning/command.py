@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+from mcaptrack.api.common import warn_unused
 from mcaptrack.api.declared import Option
 from mcaptrack.api.options import FILES, PathLike
 from mcaptrack.cli import common
 from mcaptrack.cli.chosen import has_flag, options_of
-from mcaptrack.cli.command import warn_unused
 from mcaptrack.cli.common import expand
 from mcaptrack.cli.declared import Once
 from mcaptrack.cli.settings import BOM, NAME, read_toml
@@ -66,13 +66,14 @@ class Tune(Once["TuneResult"]):
         """Write the settings to the file, and print them with their scores."""
         given, output, metric = self.values, self.values["output"], done.metric
         if given["truth"]:
-            warn_unused("files of detections are of no camera", "topic", "camera")
+            warn_unused("files of detections are of no camera", topic=True, camera=True)
         else:
-            warn_unused("it is about label files; logs have theirs inside", "fps")
+            warn_unused("it is about label files; logs have theirs inside", fps=True)
         if not self._has_tracker:
-            warn_unused(f"{given['stage']} has no trackers", "tracker")
+            warn_unused(f"{given['stage']} has no trackers", tracker=True)
         by_overlap = done.similarity == "iou"
-        warn_unused(*(("overlap is compared", "gate_m") if by_overlap else ("distance is compared", "min_iou")))
+        compared = "overlap" if by_overlap else "distance"
+        warn_unused(f"{compared} is compared", gate_m=by_overlap, min_iou=not by_overlap)
         score, before = done.scores[metric], done.default_scores[metric]
         if done.best == 0:
             talk.say(f"nothing that was tried beats the defaults ({metric} {before:.4f}); {output} stays")

@@ -19,6 +19,7 @@ import numpy as np
 
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import Candidate, EvaluateOptions, EvaluationInput, evaluate
+from mcaptrack.files import writing
 from mcaptrack.registry import Entry, blamed
 from mcaptrack.schema import Frame
 from mcaptrack.transforms import Transform
@@ -219,11 +220,8 @@ class _Study:
         self.trials.append(trial)
         if self._path is not None:
             line = {"number": trial.number, "parameters": trial.parameters, "scores": trial.scores}
-            try:
-                with self._path.open("a", encoding="utf-8") as stream:
-                    stream.write(json.dumps(line) + "\n")
-            except OSError as error:
-                raise McaptrackError(f"{self._path} can't be written: {error.strerror}") from None
+            with writing(self._path), self._path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(line) + "\n")
 
 
 class _Random:

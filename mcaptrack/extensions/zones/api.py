@@ -145,15 +145,10 @@ def zones(
     from mcaptrack.extensions.zones.counting import ZoneWatch, counted_zones
     from mcaptrack.extensions.zones.visits import ZoneOptions
 
-    wanted, usual = zones_of(zones), ZoneOptions()
-    options = None
-    if margin_m is not None or max_gap_s is not None:
-        changed = {"margin_m": margin_m, "max_gap_s": max_gap_s}
-        options = ZoneOptions(
-            **{name: getattr(usual, name) if value is None else value for name, value in changed.items()}
-        )
-    elif zones is not None:
-        options = usual
+    wanted = zones_of(zones)
+    limits = {"margin_m": margin_m, "max_gap_s": max_gap_s}
+    changed = {name: value for name, value in limits.items() if value is not None}
+    options = ZoneOptions(**changed) if changed or zones is not None else None
 
     def plan(opened: logs.Log, prefix: str, *_: object) -> list[pipeline.Job]:
         if not wanted and not counted_zones(opened, prefix):

@@ -96,10 +96,11 @@ def print_zones(result: RunResult) -> None:
 
 def _print_worlds(topic: str, zones: Sequence[tuple[str, ZoneInWorlds]]) -> None:
     """Print what worlds of re-tracking say of zones, by their names."""
+    from mcaptrack.extensions.zones.visits import medians_of
+
     if not zones:
         return
-    has_intervals = any(zone.tracks.low is not None for _, zone in zones)
-    show(f"{topic} in {zones[0][1].worlds} worlds: medians{', and intervals of 90 %' * has_intervals}")
+    show(f"{topic} in {zones[0][1].worlds} worlds: {medians_of(zone for _, zone in zones)}")
     head = ("zone", "tracks", "mean stay")
     rows = [
         (name, zone.tracks.words(), zone.mean_dwell_s.words(1, " s") if zone.mean_dwell_s else "")

@@ -63,7 +63,7 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
         low = (float(middle[0] - extent[0] / 2), float(middle[1] + extent[1] / 2))
     counted = counted_zones(opened, prefix)
     before = counted[0].zones if counted else ()
-    zones = [zone for zone in before if zone.units == units and _is_simple(zone)]
+    zones = [zone for zone in before if zone.units == units and [*map(len, zone.parts)] == [1]]  # of one outline
     left_out = [zone.name for zone in before if zone not in zones]
     if left_out:
         names = ", ".join(left_out)
@@ -91,11 +91,6 @@ def zones_page(opened: log.Log, prefix: str, file: str) -> str:
     )
 
 
-def _is_simple(zone: Zone) -> bool:
-    """Whether the page can change a zone: it has one outline."""
-    return len(zone.parts) == 1 and len(zone.parts[0]) == 1
-
-
 def _drawn(zones: Sequence[Zone]) -> list[dict[str, Any]]:
     drawn = ({"name": zone.name, "line": zone.is_line, "points": zone.parts[0][0]} for zone in zones)
     return [
@@ -107,8 +102,7 @@ def _places(opened: log.Log, prefix: str) -> Floats:
     """Places of tracks on the ground (N, 2) in m, some of them."""
     for name in _PLACES:
         topic = f"{prefix}/{name}"
-        channel = opened.channels.get(topic)
-        if channel is None or not channel.holds(TRACKS):
+        if not opened.holds(topic, TRACKS):
             continue
         rows = join_frames(TRACKS, thinned(opened.frame_columns(topic, TRACKS), _MOST_PLACES)).rows
         xy = np.stack([rows["x_m"], rows["y_m"]], axis=1)

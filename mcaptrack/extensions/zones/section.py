@@ -14,7 +14,7 @@ from mcaptrack import log
 from mcaptrack.contracts import ReportSection, SectionTable
 from mcaptrack.extensions.zones.counting import counted_zones
 from mcaptrack.extensions.zones.shapes import Zone
-from mcaptrack.extensions.zones.visits import ZoneInWorlds, ZoneTotals
+from mcaptrack.extensions.zones.visits import ZoneInWorlds, ZoneTotals, medians_of
 from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.schema import ZONE_COUNTS
 from mcaptrack.schema.framing import joined_parts
@@ -69,13 +69,8 @@ def section(opened: log.Log, prefix: str, names: Mapping[str, str]) -> ReportSec
         if total.in_worlds
     ]
     if in_worlds:
-        has_intervals = any(
-            total.in_worlds.tracks.low is not None
-            for channel, _ in shown
-            for total in channel.totals
-            if total.in_worlds
-        )
-        caption = f"Medians over worlds of re-tracking{', and intervals of 90 %' * has_intervals}."
+        of_all = medians_of(total.in_worlds for channel in counted for total in channel.totals if total.in_worlds)
+        caption = f"Over worlds of re-tracking: {of_all}."
         tables.append(SectionTable(caption, _IN_WORLDS, in_worlds))
     some = [zone for zone in zones if not zone.is_line][:_CHARTS]
     inside = {channel.topic: _inside(opened, channel.topic, channel.zones) for channel in counted}

@@ -5,7 +5,7 @@ Letters: F frames, N rows, V visits, C crossings, Z zones and lines.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import isnan
 from typing import Any, Final, NamedTuple
@@ -97,6 +97,11 @@ class ZoneTotals:
         lines = ("forward", "backward")
         kept = {"zone", "is_line", "tracks", *lines} if self.is_line else values.keys() - set(lines)
         return {name: value for name, value in values.items() if name in kept}
+
+
+def medians_of(zones: Iterable[ZoneInWorlds]) -> str:
+    """The numbers that worlds have of zones, in words: medians, and intervals if any zone has these."""
+    return "medians" + ", and intervals of 90 %" * any(zone.tracks.low is not None for zone in zones)
 
 
 class ZoneEvents(NamedTuple):

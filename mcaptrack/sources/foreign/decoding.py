@@ -19,7 +19,7 @@ import numpy as np
 from mcap.well_known import MessageEncoding
 
 from mcaptrack import foxglove
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, in_one_line
 from mcaptrack.geometry.clocks import NS_PER_S, utc_ns
 from mcaptrack.schema.names import plain_name
 from mcaptrack.sources.foreign.definitions import MessageType, ros_types, unpacked
@@ -53,10 +53,9 @@ def decoder_with_errors(
         except McaptrackError:
             raise
         except Exception as error:  # untrusted bytes in third-party parsers, which raise various exceptions
-            why = f"it has no field {error.name!r}" if isinstance(error, AttributeError) else str(error)
-            why = " ".join(why.split())[:120] or type(error).__name__
+            why = f"it has no field {error.name!r}" if isinstance(error, AttributeError) else in_one_line(error)
             name = kind.name or kind.encoding
-            raise McaptrackError(f"{len(payload)} bytes are not a {name} message ({why})") from None
+            raise McaptrackError(f"{len(payload)} bytes are not a {name} message ({why:.120})") from None
 
     return decode
 
@@ -96,10 +95,8 @@ def protobuf_class(kind: MessageType) -> Any:
             pool.Add(files[name])
         return GetMessageClass(pool.FindMessageTypeByName(kind.name.lstrip(".").replace("/", ".")))
     except Exception as error:  # a third-party parser that raises various exceptions
-        why = " ".join(str(error).split())[:120] or type(error).__name__
-        raise McaptrackError(
-            f"{kind.name} can't be read: the log's definition of it can't be understood ({why})"
-        ) from None
+        why = f"the log's definition of it can't be understood ({in_one_line(error, 120)})"
+        raise McaptrackError(f"{kind.name} can't be read: {why}") from None
 
 
 def _ros_unpacker(kind: MessageType) -> Unpack:

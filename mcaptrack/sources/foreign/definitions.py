@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from mcaptrack import foxglove
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, in_one_line
 from mcaptrack.files import read_beginning
 from mcaptrack.log.recording_files import ZSTD
 from mcaptrack.notices import warn
@@ -196,7 +196,7 @@ def parsed(name: str, schema_encoding: str, data: bytes) -> Types:
         plain = _IDL_ENUM.sub(lambda part: f"typedef uint{part[1] or 32} {part[2]}" if part[2] else part[0], plain)
         parts = [get_types_from_idl(part) for part in _IDL_HEAD.split(plain) if part.strip()]
     except Exception as error:  # third-party parsers, which raise various exceptions
-        raise ValueError(" ".join(str(error).split())[:120] or type(error).__name__) from None
+        raise ValueError(in_one_line(error, 120)) from None
     return _as_in_ros({inner: fields for part in parts for inner, fields in part.items()}, name)
 
 
@@ -290,7 +290,7 @@ def _typestore(name: str, kind: MessageType, folders: tuple[Path, ...]) -> Any:
     except Exception as error:  # noqa: BLE001, RUF100  # a third-party parser that raises various exceptions
         why = "the log has no definition of it that fits its messages"
         if kind.schema:
-            why = f"the log's definition of it can't be understood ({' '.join(str(error).split())[:120]})"
+            why = f"the log's definition of it can't be understood ({in_one_line(error, 120)})"
         raise McaptrackError(f"{kind.name} can't be read: {why}; {_ADVICE}") from None
     return store
 

@@ -21,7 +21,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.files import is_same_file, missing, refuse_special
 from mcaptrack.geometry.clocks import LAST_NS
 from mcaptrack.geometry.plane import GroundPlane
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.schema import DETECTIONS
 from mcaptrack.schema.encodings import CDR
 from mcaptrack.schema.provenance import CLOCK, Provenance
@@ -38,7 +38,6 @@ from mcaptrack.sources.ingest.job import (
     IngestJob,
     IngestOptions,
     IngestReport,
-    Progress,
 )
 from mcaptrack.sources.ingest.label_job import Boxes3DJob, LabelJob, label_frames
 from mcaptrack.sources.ingest.labels.of_packages import FormatOfPackage, format_named

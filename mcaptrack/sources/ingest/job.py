@@ -40,7 +40,6 @@ from mcaptrack.sources.ingest.labels.timeline import Placed, Timeline, frames_of
 from mcaptrack.sources.sidecar import encoding_for
 from mcaptrack.sources.video import VideoOptions
 
-Progress = Callable[[str, int, int], None]
 #: A function that yields frames, from the beginning with each call.
 Frames = Callable[[], Iterator[Frame]]
 

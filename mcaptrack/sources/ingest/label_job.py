@@ -71,10 +71,10 @@ def with_new_ids(into: log.Log, prefix: str, labels: BoxTable) -> BoxTable:
 
     Otherwise the half of a track that was split could get the id of a track that was removed.
     """
-    topics = [f"{prefix}/{name}" for name in CORRECTED_FROM]
-    written = [topic for topic in topics if topic in into.channels and into.channels[topic].holds(TRACKS)]
     used = [
-        int(unique_values(TRACKS, into.frame_columns(topic, TRACKS), "track_id").max(initial=0)) for topic in written
+        int(unique_values(TRACKS, into.frame_columns(topic, TRACKS), "track_id").max(initial=0))
+        for topic in (f"{prefix}/{name}" for name in CORRECTED_FROM)
+        if into.holds(topic, TRACKS)
     ]
     made = labels.facts.made_ids
     if made is None or not used:
@@ -87,7 +87,7 @@ def with_new_ids(into: log.Log, prefix: str, labels: BoxTable) -> BoxTable:
 
 def warn_uncovered(into: log.Log, topic: str, placed: Placed) -> None:
     """Warn of pictures that were corrected before, and that new corrections don't cover: they take the place of all."""
-    if topic not in into.channels or not into.channels[topic].holds(TRACKS) or not len(placed.t_ns):
+    if not into.holds(topic, TRACKS) or not len(placed.t_ns):
         return
     before = frame_times(into.frame_columns(topic, TRACKS))
     lost = before[(before < placed.t_ns[0]) | (before > placed.t_ns[-1])]

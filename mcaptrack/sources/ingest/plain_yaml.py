@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, NoReturn
 from xml.parsers import expat
 
-from mcaptrack.errors import McaptrackError
+from mcaptrack.errors import McaptrackError, in_one_line
 
 #: Larger than the metadata of a recording with thousands of topics and files.
 MAX_BYTES: Final = 8 * 2**20
@@ -46,7 +46,7 @@ def load(data: bytes, tags: Collection[str] = ()) -> Any:
     try:
         return _build(yaml, yaml.parse(text, Loader=loader), tags)
     except yaml.YAMLError as error:
-        raise UnsupportedYamlError(" ".join(str(error).split())) from None
+        raise UnsupportedYamlError(in_one_line(error)) from None
 
 
 def _build(yaml: Any, events: Iterator[Any], tags: Collection[str]) -> Any:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from mcaptrack.errors import in_one_line
 from mcaptrack.geometry.arrays import Image
 
 #: Before NAL units in Annex B; the first byte may be missing.
@@ -548,7 +549,7 @@ def _encoded() -> tuple[bytes, str]:
     try:
         return H264Encoder(_SIZE_PX, _SIZE_PX, Fraction(25)).encode(_picture(), 0), ""
     except Exception as error:  # whatever an incomplete FFmpeg raises
-        return b"", _words(error)
+        return b"", in_one_line(error)
 
 
 def _decoding_fault(name: str, data: bytes) -> str:
@@ -558,13 +559,9 @@ def _decoding_fault(name: str, data: bytes) -> str:
     try:
         pictures = [frame.rows for frame in decode_gray([EncodedPicture(0, 0, name, data)])]
     except Exception as error:  # as above
-        return _words(error)
+        return in_one_line(error)
     wanted = _picture()[:, :, 0]
     if len(pictures) != 1 or pictures[0].shape != wanted.shape:
         return f"one picture became {len(pictures)}" if len(pictures) != 1 else "the picture has another size"
     error_mean = np.abs(pictures[0].astype(float) - wanted).mean()
     return "" if error_mean < _MAX_ERROR else f"the picture looks different (by {error_mean:.0f} of 255 on average)"
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -27,9 +27,10 @@ from typing import Any, Final, NamedTuple
 from mcaptrack import __version__, environment, log, tables
 from mcaptrack.choices import TableFormat
 from mcaptrack.errors import McaptrackError, call
-from mcaptrack.files import place_of, publish_bytes, sweep
+from mcaptrack.files import make_folder, place_of, publish_bytes, sweep, writing
 from mcaptrack.location import Location, Url, is_remote, local_name, parse
 from mcaptrack.log.messages import Payloads, Span
+from mcaptrack.notices import Progress
 from mcaptrack.schema.provenance import INGEST, Provenance
 from mcaptrack.sources import foreign
 from mcaptrack.sources.fixed_frame import BoxesRead
@@ -162,11 +163,9 @@ def refuse_tables_of_another(opened: log.Log, path: Location, folder: Path) -> N
 def claimed(folder: Path, name: str) -> Iterator[None]:
     """Let no other process write tables of this recording in a folder: one that tries waits."""
     place = folder / _TABLE / f"{_PREFIX}{name}"
-    try:
-        place.mkdir(parents=True, exist_ok=True)
+    make_folder(place)
+    with writing(place):
         handle = os.open(place, os.O_RDONLY)
-    except OSError as error:
-        raise McaptrackError(f"{place} can't be written: {error.strerror or error}") from error
     try:
         with suppress(OSError):  # a file system without locks
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -244,7 +243,7 @@ def _first_row(file: Path, form: TableFormat) -> Mapping[str, Any]:
 def export(
     opened: log.Log,
     folder: Path,
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
     *,
     form: TableFormat = "parquet",
     topics: Sequence[str] | None = (),
@@ -303,7 +302,7 @@ def _write_all(
     topics: Sequence[str],
     part: MessagesPart,
     are_all: bool,
-    progress: Callable[[str, int, int], None],
+    progress: Progress,
 ) -> None:
     opened = job.contents.opened
     *names, last = TABLES
@@ -551,10 +550,8 @@ class ChannelFile:
         return self._writing
 
     def _add(self, piece: Any) -> None:
-        try:
+        with writing(self.file.path):
             self.file.add(piece)
-        except OSError as error:
-            raise McaptrackError(f"{self.file.path} can't be written: {error.strerror or error}") from error
 
     def _finish_writing(self) -> None:
         if self._writing is not None:

@@ -116,9 +116,7 @@ class LogWarning(NamedTuple):
 def warnings_of(topic: str, camera: str, how: Provenance) -> Iterator[LogWarning]:
     """The warnings that a channel carries, and those that follow from its parameters."""
     yield from (LogWarning(topic, camera, code, message) for code, message in how.warnings)
-    if how.parameters.get("poor_scale") and not how.parameters.get("side_view"):
-        is_linked = how.parameters.get("retracker", "likelihood") == "likelihood" and how.parameters.get("link_s") != 0
-        done = "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
+    if done := how.held_back:
         message = f"tracks were {done}: the ground plane was not measured, and the camera looks along the ground"
         yield LogWarning(topic, camera, "held-back", message)
 

@@ -322,7 +322,7 @@ class TestCommand:
 
     def test_a_recording_of_rerun_needs_its_library(self, template, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, "rerun", None)
-        with pytest.raises(McaptrackError, match=r"pip install \"mcaptrack\[rerun\]\""):
+        with pytest.raises(McaptrackError, match=r"pip install 'mcaptrack\[rerun\]'"):
             mcaptrack.export(template, tmp_path / "a.rrd", form="rerun")
         assert not list(tmp_path.iterdir())
 

@@ -139,7 +139,7 @@ class TestFetching:
         monkeypatch.setitem(sys.modules, "pooch", None)
         assert "pip install 'mcaptrack[onnx]'" in refused()
         monkeypatch.setenv("MCAPTRACK_MODELS", str(tmp_path / "known.onnx"))
-        assert "known.onnx can't be made: File exists" in refused()
+        assert "known.onnx can't be written: File exists" in refused()
 
     def test_names_that_are_not_there_are_refused_with_the_nearest(self, model):
         assert "no model yolox-nan; did you mean yolox-nano?" in call("models", "get", "yolox-nan").err

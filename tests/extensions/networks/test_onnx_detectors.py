@@ -419,6 +419,12 @@ class TestInLogs:
         outcome = call("run", log, "--detector", f"onnx:{second}", "--no-tables")
         assert "/camera/detections was made by another detector: running detect again" in outcome.err
 
+    def test_a_file_that_is_not_there_is_refused_before_a_plan_is_said(self, log, tmp_path):
+        err = call("run", log, "--detector", f"onnx:{tmp_path / 'none.onnx'}").err
+        assert err.startswith(f"mcaptrack: detector onnx: {tmp_path / 'none.onnx'} does not exist")
+        assert err.count("\n") == 1
+        assert call("run", log, "--detector", "onnx").err == "mcaptrack: detector onnx needs a file, as in onnx:FILE\n"
+
     def test_names_and_files_that_do_not_go_together_are_refused(self, log):
         assert "detector knn takes no file" in call("detect", log, "--detector", "knn:file").err
         assert "are two files; give one" in call("detect", log, "--detector", "onnx:a", "--file", "b").err

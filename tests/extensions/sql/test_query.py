@@ -453,7 +453,7 @@ def test_a_damaged_table_is_refused(exported, tmp_path):
 
 def test_missing_duckdb_is_named_with_the_command_that_installs_it(known, monkeypatch):
     monkeypatch.setitem(sys.modules, "duckdb", None)
-    assert re.search(r'pip install "mcaptrack\[sql\]"', refusal(known, "select 1"))
+    assert "`pip install 'mcaptrack[sql]'`" in refusal(known, "select 1")
 
 
 EVERYTHING = """select t, t_ns, 0.1 + 0.2 as d, sum(track_id) over () as s, 1.25::decimal(9, 2) as e, date '2026-05-01' as f,
@@ -537,6 +537,13 @@ def test_answers_as_a_table(known):
     assert lines[0].split() == ["track_id", "third", "nothing", "word"]
     assert lines[2].split() == ["7", "0", "null", "\\x1b[31mred"]
     assert lines[4].split()[1] == "0.133333"
+
+
+def test_only_the_last_of_several_questions_is_answered_and_that_is_said(known):
+    outcome = run(known, "select 1 as a; create temp table t as select 5 as c; select c from t", "--format", "csv")
+    assert outcome.out.split() == ['"c"', "5"]
+    assert "warning: the query asks 2 questions; only the last is answered" in outcome.err
+    assert "questions" not in run(known, "create temp table t as select 5 as c; select c from t").err
 
 
 def test_the_tables_are_listed_with_columns_units_and_meanings(known):

@@ -21,7 +21,7 @@ from mcaptrack.errors import McaptrackError, call
 from mcaptrack.extensions.render.blur.people import HiddenPeople, hide
 from mcaptrack.extensions.render.video import rate_of
 from mcaptrack.geometry.arrays import Bools, Image
-from mcaptrack.notices import warn
+from mcaptrack.notices import Progress, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of
 from mcaptrack.sources import foreign
 from mcaptrack.sources.cameras import Camera, cameras, find_camera
@@ -36,8 +36,6 @@ BLURRED: Final = "mcaptrack.blurred"
 #: Words in the names of schemas of messages that may show people and are not pictures that are read.
 _MAY_SHOW: Final = ("image", "video", "pointcloud", "disparity", "laserscan")
 _JPEG: Final = ("jpeg", "jpg")
-
-Progress = Callable[[str, int, int], None]
 
 
 class Blurred(NamedTuple):

@@ -49,6 +49,8 @@ _ALONG: Final = np.pi / 4
 _WIDE_M, _FLAT_M = 20.0, 3.0
 #: Positions of people that a camera sees don't spread more, in m, from the first to the last hundredth of them.
 _MOST_SPREAD_M: Final = 200.0
+#: Nor do those of objects without sizes in recordings, as far as they are metres.
+_WIDEST_M: Final = 2000.0
 _SIZE: Final = slice(3, 6)
 #: Mixes the bits of columns.
 _ODD: Final = np.uint64(0x9E3779B97F4A7C15)
@@ -105,7 +107,11 @@ def check_positions(table: BoxTable, _: Asked) -> None:
     _check_places(table, xy_m, "a position")
     spread = float(np.ptp(np.percentile(xy_m, [1, 99], axis=0), axis=0).max())
     if spread > _MOST_SPREAD_M:
-        table.find(": positions spread over {most:.0f} m, as pixels do; they have to be metres", "units", most=spread)
+        table.find(
+            ": positions spread over {most:.0f} m, as pixels or millimetres do; they have to be metres",
+            "units",
+            most=spread,
+        )
 
 
 def check_boxes_3d(table: BoxTable, _: Asked) -> None:
@@ -127,7 +133,8 @@ def check_boxes_3d(table: BoxTable, _: Asked) -> None:
     length = sizes[:, np.isfinite(sizes).all(axis=0)].max(axis=1, initial=-np.inf)
     usual = float(np.median(length)) if np.isfinite(length).all() else 1.0
     if not _LEAST_LENGTH_M <= usual <= _MOST_LENGTH_M:
-        raise McaptrackError(f"{table.path}: the median length of its boxes is {usual:g}; sizes have to be in metres")
+        text = f"{table.path}: the median length of its boxes is {usual:g}; sizes have to be in metres"
+        raise McaptrackError(f"{text}, as positions have, not in centimetres or millimetres")
     table.refuse(
         np.abs(boxes[:, 6]) > _MOST_HEADING,
         lambda row: (
@@ -137,6 +144,8 @@ def check_boxes_3d(table: BoxTable, _: Asked) -> None:
     )
     boxes[:, 6] = wrapped(boxes[:, 6])
     x, y, z = (float(np.ptp(np.percentile(part, [5, 95]))) for part in boxes[:, :3].T)
+    if not np.isfinite(length).all() and max(x, y) > _WIDEST_M:
+        table.find(f": positions spread over {max(x, y):.0f} m, as millimetres do; they have to be metres", "units")
     if z > _WIDE_M and min(x, y) < _FLAT_M:
         text = f": positions spread over {z:.0f} m along z, and {min(x, y):.1f} m along {'x' if x < y else 'y'}"
         table.find(f"{text}; z has to be the vertical axis", "units")
