@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import mcaptrack
 from mcaptrack import log, pipeline
 from mcaptrack.errors import McaptrackError
 from mcaptrack.evaluation import EvaluateOptions, evaluate, sequence_of_log
+from mcaptrack.notices import collected
 from mcaptrack.schema import DETECTIONS, GROUND_PLANE, PREDICTIONS
 from mcaptrack.schema.as_rows import rows_to_plane
 from mcaptrack.schema.provenance import Provenance
@@ -138,3 +140,23 @@ def test_a_log_of_many_channels_is_refused_in_few_words(tmp_path):
         with pytest.raises(McaptrackError, match="/sensor/0029 and 970 more") as error:
             stage(path)
         assert len(str(error.value)) < 1000
+
+
+@thorough
+def test_what_an_older_version_made_is_left_as_it_is_until_all_is_made_again(fresh, monkeypatch):
+    written = Provenance.to_metadata
+    with monkeypatch.context() as before:
+        before.setattr(Provenance, "to_metadata", lambda self: written(replace(self, version="0.2.0")))
+        run_stage(fresh, "track", Sort(max_age_s=0.7))
+        run_all(fresh)
+    was = fresh.read_bytes()
+    with collected() as warnings:
+        assert run_all(fresh)[0].stages == []
+    assert fresh.read_bytes() == was
+    (words,) = [one.message for one in warnings if one.code == "out-of-date"]
+    assert "was made by an older version (0.2.0)" in words
+    assert "force=True)` makes all again" in words
+    with log.read(fresh) as opened:
+        jobs = pipeline.plan_all(opened, "/camera", force=True)
+        assert [job.stage for job in jobs] == ["detect", "track", "sample", "predict", "retrack"]
+        assert jobs[1].transform == Sort()

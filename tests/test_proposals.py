@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -18,6 +19,7 @@ from mcaptrack import log, pipeline
 from mcaptrack.cli.text import with_flags
 from mcaptrack.errors import McaptrackError, command
 from mcaptrack.schema import TRACKS
+from mcaptrack.schema.provenance import Provenance
 from mcaptrack.viewing import serving
 from tests.commands import GROUP, call, done
 from tests.extension_cases import of_extensions
@@ -107,6 +109,13 @@ class Scene:
         Path("mcaptrack.toml").write_text("[track]\nmax-age-s = 7.0\n")
         return self.says("run", "LOG", "--no-tables")
 
+    def of_an_older_version(self) -> str:
+        written = Provenance.to_metadata
+        with pytest.MonkeyPatch.context() as before:
+            before.setattr(Provenance, "to_metadata", lambda made: written(replace(made, version="0.2.0")))
+            self.says("detect", "LOG")
+        return self.says("run", "LOG", "--no-tables")
+
     def by_own_tracker(self) -> str:
         """Track with a class in a file, and make the tracks out of date."""
         text = "from mcaptrack.transforms import Sort\n\n\nclass Own(Sort):\n    pass\n"
@@ -183,6 +192,7 @@ SCENES: dict[str, Callable[[Scene], str]] = {
     "pipeline/planes.py:plane_in_words:ingest": Scene.side_view,
     "pipeline/runner.py:_warn_held_back:retrack": Scene.side_view,
     "pipeline/plan.py:_warn_settings:run": Scene.of_a_later_version,
+    "pipeline/plan.py:_replace_older:run": Scene.of_an_older_version,
     "pipeline/plan.py:_refusal:run": Scene.by_own_tracker,
     "pipeline/plan.py:_not_made:*": Scene.elsewhere,
     "tables/compared.py:_read:ingest": lambda s: s.timed("tracks.csv").says(

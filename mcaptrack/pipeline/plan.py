@@ -19,7 +19,7 @@ from mcaptrack.notices import Say, warn
 from mcaptrack.pipeline import motion
 from mcaptrack.pipeline.checks import Job, check_inputs, describe_origin, first_stage, main_topic, superseded
 from mcaptrack.pipeline.planes import AS_BEFORE, PlaneChoice, is_plane_due, warn_unused
-from mcaptrack.pipeline.rebuild import MissingPluginError, differing, rebuild
+from mcaptrack.pipeline.rebuild import MissingPluginError, OlderVersionError, differing, rebuild
 from mcaptrack.pipeline.scenes import Scenes
 from mcaptrack.pipeline.staleness import changed_source, is_of_corrections, is_stale, read_planes
 from mcaptrack.schema import DETECTIONS, TRACKS, VIDEO
@@ -209,6 +209,7 @@ class _Planner:
         self._notes: list[str] = []
         self._unnamed: dict[str, MissingPluginError] = {}
         self._differing: set[str] = set()
+        self._is_of_older_version = False
 
     def checked(self, say: Say) -> list[Job]:
         """Check the jobs and return them; only after that report which run and why."""
@@ -296,11 +297,22 @@ class _Planner:
         provenances = (provenance_of(self.opened, output) for output in topics)
         return next((provenance for provenance in provenances if provenance and provenance.transform == stage), None)
 
-    def _make(self, stage: str, topic: str) -> bool:
+    def _replace_older(self, provenance: Provenance, stage: str, topic: str) -> bool:
+        """With ``force`` plan the stage of a channel of an older version by its defaults; or else say that it stays."""
+        if self.force:
+            return self._make(stage, topic, f"was made by version {provenance.version}")
+        if not self._is_of_older_version:
+            self._is_of_older_version = True
+            force = call("run", self.opened.path, force=True)
+            text = f"made by an older version ({provenance.version}), and left as it is; {force} makes all again"
+            warn(f"{topic} was {text}", "out-of-date")
+        return False
+
+    def _make(self, stage: str, topic: str, why: str = "is missing") -> bool:
         """Plan the job for a missing channel. Returns True: the channel will change."""
         source = self.source_of(stage)
         self.ensure(source)
-        self._notes.append(f"{topic} is missing: running {stage}")
+        self._notes.append(f"{topic} {why}: running {stage}")
         chosen = self.defaults.get(stage) or self._suited(stage, source) or STAGES[stage].default()
         transform = self._with_choice(chosen)
         self.ensure_motion(transform, source)
@@ -359,6 +371,8 @@ class _Planner:
         if not is_moved and self._is_kept(provenance, stage, topic):
             return False
         before, why_not = self._before(stage, provenance)
+        if isinstance(why_not, OlderVersionError):
+            return self._replace_older(provenance, stage, topic)
         main = main_topic(self.opened, stage, topic)
         result = self._with_choices(_Result(STAGES[stage], topic, main, provenance, had, source, before, before))
         is_due = is_moved or self._is_due(result)
@@ -399,6 +413,7 @@ class _Planner:
         if (
             is_asked
             or is_chosen_otherwise(self.opened, provenance.input)
+            or provenance.is_of_older_version
             or provenance.plugins
             or topic not in self.opened.channels
         ):

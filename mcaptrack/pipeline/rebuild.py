@@ -35,6 +35,10 @@ class MissingPluginError(McaptrackError):
         self.options = options
 
 
+class OlderVersionError(McaptrackError):
+    """A channel was made by a version with other parameters than this one."""
+
+
 def plugins_of(stage: Stage, transform: Transform) -> dict[str, Plugin]:
     """Return the classes of other packages in a transform: "transform" for itself, "predictor" for its predictor."""
     own = stage.entry(type(transform))
@@ -51,9 +55,11 @@ def rebuild(stage: Stage, provenance: Provenance, named_by_user: Mapping[str, Tr
     """Return the transform that made a channel, with the same parameters.
 
     ``named_by_user`` are transforms by stage; their classes may be used in addition to installed ones.
-    Raises MissingPluginError if a class of another package is not available, and McaptrackError for parameters that
-    don't exist.
+    Raises OlderVersionError if an older version made it, MissingPluginError if a class of another package is not
+    available, and McaptrackError for parameters that no longer exist.
     """
+    if provenance.is_of_older_version:
+        raise OlderVersionError(f"it was made by an older version ({provenance.version}); `force=True` makes it again")
     parameters = dict(provenance.parameters)
     cls = _class_of(stage, provenance, parameters, named_by_user)
     _check_predictor(provenance, parameters.get("predictor"), named_by_user)

@@ -30,6 +30,8 @@ SCENE_SUFFIX: Final = "/view/scene"
 WRITTEN_BY: Final = "written_by"
 #: The metadata record with the start time of a log's cameras, ``start_ns``.
 CLOCK: Final = "mcaptrack.clock"
+#: Beginnings of older versions: their results are read, but not made again with the same parameters.
+_OLDER: Final = ("0.1.", "0.2.")
 
 
 class Plugin(NamedTuple):
@@ -99,6 +101,11 @@ class Provenance:
         by_likelihood = self.parameters.get("retracker", "likelihood") == "likelihood"
         is_linked = by_likelihood and self.parameters.get("link_s") != 0
         return "only linked over gaps, by their boxes in the picture" if is_linked else "not re-tracked but passed on"
+
+    @property
+    def is_of_older_version(self) -> bool:
+        """Whether it was made by a version with other parameters than this one."""
+        return self.version.startswith(_OLDER)
 
     def warn_again(self) -> None:
         """Repeat the warnings when it was made."""

@@ -34,8 +34,9 @@ NONE: Final = "\N{EN DASH}"
 _MAX_FIXED: Final = 1e6
 
 
-#: How trackers are called.
+#: How trackers are called; channels of earlier versions that name none were made by the first.
 _TRACKERS: Final = {"sort": "SORT", "bytetrack": "ByteTrack", "ocsort": "OC-SORT"}
+_FIRST_TRACKER: Final = next(iter(_TRACKERS))
 
 
 def tracker_name(provenance: Provenance | None) -> str:
@@ -43,7 +44,7 @@ def tracker_name(provenance: Provenance | None) -> str:
     stage = STAGES.get(provenance.transform) if provenance else None
     if provenance is None or stage is None or stage.reads is not DETECTIONS:
         return "tracks as given"
-    return _TRACKERS.get(str(provenance.parameters.get(stage.option)), "tracker")
+    return _TRACKERS.get(str(provenance.parameters.get(stage.option, _FIRST_TRACKER)), "tracker")
 
 
 def number(value: float | int | None, digits: int = 2, unit: str = "") -> str:
