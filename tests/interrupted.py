@@ -8,6 +8,8 @@ import signal
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from select import select
+from typing import Final
 
 import pytest
 from mcap.reader import make_reader
@@ -46,6 +48,8 @@ def add_results(path: Path, seed: int, count: int) -> None:
             writer.add_attachment("layout", "application/json", noise.randbytes(100))
 
 
+#: The longest time until a child begins. One that took over a lock of another thread never does: another is tried.
+_BEGINS_S: Final = 20.0
 CALLS = ("pwrite", "write", "fsync", "replace", "unlink", "ftruncate", "chmod", "fchown")
 
 
@@ -71,14 +75,23 @@ def sabotage(at: int, fault: Callable[[], object], calls: Sequence[str] = CALLS)
 
 def killed(work: Callable[[], object], at: int, calls: Sequence[str] = CALLS) -> bool:
     """Whether a process that does this work is killed at its ``at``-th call that changes something on the disk."""
+    ready, begin = os.pipe()
     child = os.fork()
     if child == 0:  # in the child: nothing of pytest is to run again
         try:
+            os.write(begin, b"1")
             sabotage(at, lambda: os.kill(os.getpid(), signal.SIGKILL), calls)
             work()
             os._exit(0)
         finally:
             os._exit(1)
+    has_begun = bool(select([ready], [], [], _BEGINS_S)[0])
+    os.close(ready)
+    os.close(begin)
+    if not has_begun:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return killed(work, at, calls)
     _, status = os.waitpid(child, 0)
     assert status in (0, signal.SIGKILL), status
     return status != 0
