@@ -225,7 +225,7 @@ def _remove_left(folder: Path, pattern: re.Pattern[str], name: str = "") -> None
             with suppress(OSError):
                 if ended or (ended is None and time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED_S):
                     if entry.is_dir(follow_symlinks=False):
-                        rmtree(entry.path, ignore_errors=True)
+                        rmtree(entry.path)
                     else:
                         os.unlink(entry.path)
 

@@ -20,7 +20,7 @@ from mcaptrack.sources.fixed_frame import Recorded3d, named_detections
 from mcaptrack.sources.foreign import MessageType
 from mcaptrack.sources.foreign import things as things_of_messages
 from mcaptrack.sources.foreign.boxes import choosing
-from mcaptrack.sources.foreign.fields import Message3d
+from mcaptrack.sources.foreign.fields import Message3d, rotated
 from tests.box_reading import boxes_of, boxes_of_each, recorded
 from tests.logs import recorder
 from tests.ros_messages import BAR, Ros, plain
@@ -341,6 +341,12 @@ def test_derived_objects_have_a_shape_and_a_certainty_out_of_255_and_move_if_the
     np.testing.assert_array_equal([box.velocity for box in found.boxes], moving)
     assert {box.centre for box in found.boxes} == {tuple(SEEN.centre)}
     assert found.ignored == {}
+
+
+def test_points_are_turned_as_scipy_turns_them():
+    turns, points = Rotation.random(9, random_state=1), np.random.default_rng(1).normal(size=(9, 3))
+    for length in (1, 2):
+        np.testing.assert_allclose(rotated(length * turns.as_quat(), points), turns.apply(points))
 
 
 def test_derived_objects_without_a_shape_have_the_box_around_their_polygon():

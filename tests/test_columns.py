@@ -458,3 +458,14 @@ def test_only_fields_that_are_wanted_are_read() -> None:
     everything = RosColumns(store.fielddefs, name).read(*laid_out(payloads, None))
     assert list(columns := wanted.read(*laid_out(payloads, None))) == [("angular_velocity", "z")]
     assert same(columns["angular_velocity", "z"].to_pylist(), everything["angular_velocity", "z"].to_pylist())
+
+
+def test_only_fields_of_protobuf_that_are_wanted_are_read() -> None:
+    image = importlib.import_module("foxglove_schemas_protobuf.CompressedImage_pb2").CompressedImage
+    without = ProtobufColumns(image.DESCRIPTOR, blobs=False)
+    columns = without.read(*laid_out([image(format="jpeg", data=b"x").SerializeToString()], None))
+    assert (("format",) in columns, ("data",) in columns, list(without.left_out)) == (True, False, [("data",)])
+    scene = importlib.import_module("foxglove_schemas_protobuf.SceneUpdate_pb2").SceneUpdate
+    bare = ProtobufColumns(scene.DESCRIPTOR, wanted=lambda path: path == ("entities",))
+    payload = scene(entities=[{"id": "a"}, {"id": "b"}]).SerializeToString()
+    assert bare.read(*laid_out([payload, b""], None))["entities",].to_pylist() == [[{}, {}], []]

@@ -96,6 +96,8 @@ def test_every_run_repeats_the_warnings_even_with_quiet(path):
     assert "assumed-ground-plane" in codes
     assert len(codes) == len(set(codes))
     assert again.err.count("warning: ") == len(codes)
+    alone = json.loads(done("detect", "b.mcap", "--force", "-o", "c.mcap", "--json", "-q").out)["warnings"]
+    assert "assumed-ground-plane" not in [one["code"] for one in alone]
     lines = done("run", "b.mcap", "--no-tables").err
     assert f"{len(codes)}, see above: {', '.join(codes)}" in lines
     assert "the scale of the ground, from the heights of boxes" in lines

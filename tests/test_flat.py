@@ -167,7 +167,7 @@ def test_fields_of_json_become_columns_with_names_of_their_own(tmp_path):
     rows = [
         {"i": 1, "a.b": 1, "t": 5, "T_2": 6, "only": [], "half": "\ud800x"},
         {"i": -(2**63), "a": {"b": 2}, "deep": {"l": [1, 2.5]}},
-        {"mixed": [1, {"a": 1}], "recording": 3},
+        {"mixed": [1, {"a": 1}], "recording": 3, "far": {"sec": 10**10, "nanosec": 5}},
     ]
     table = one_channel(tmp_path / "a.mcap", "", "", b"", "json", [json.dumps(row).encode() for row in rows])
     got = {name: table.column(name).to_pylist() for name in fields(table)}
@@ -178,6 +178,7 @@ def test_fields_of_json_become_columns_with_names_of_their_own(tmp_path):
     assert got["deep_l"] == [None, [1.0, 2.5], None]
     assert got["mixed"] == [None, None, '[1,{"a":1}]']
     assert got["half"] == ["?x", None, None]
+    assert (got["far_sec"][2], got["far_nanosec"][2]) == (10**10, 5)  # no time that 64 bits hold
 
 
 def test_messages_that_protobuf_merges_are_those_that_are_written_merged(tmp_path):

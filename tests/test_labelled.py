@@ -82,7 +82,7 @@ WAYS = {
     "every third of a part": Way(lambda p: mot(p / "t.txt", THIRD), THIRD, "labels"),
     "every twelfth": Way(lambda p: mot(p / "t.txt", TWELFTH), TWELFTH, None),
     "all": Way(lambda p: mot(p / "t.txt", range(PICTURES)), range(PICTURES), None),
-    "nearly all": Way(lambda p: mot(p / "t.txt", range(3, 58)), range(PICTURES), None),
+    "nine tenths": Way(lambda p: mot(p / "t.txt", range(3, 57)), range(PICTURES), None),
     "a range": Way(lambda p: mot(p / "t.txt", [22, 25]), PART, "frames", frames="21:31"),
     "two ranges": Way(lambda p: mot(p / "t.txt", [5, 6, 22]), [5, 6, *PART], "frames", frames="6:8, 21:31"),
     "all by a range": Way(lambda p: mot(p / "t.txt", PART), range(PICTURES), "frames", frames=":"),

@@ -15,6 +15,7 @@ from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.boxes import columns_to_oriented_boxes
 from mcaptrack.schema import DETECTIONS, TRACKS
 from mcaptrack.schema.framing import join_frames
+from mcaptrack.schema.provenance import CLOCK
 from tests.commands import call
 from tests.logs import recorder
 from tests.space_logs import START_NS, WAYS, Robot, write
@@ -166,6 +167,9 @@ def test_3d_labels_do_not_go_with_pictures(tmp_path):
     boxes.write_text("1,-1,10,20,30,40,0.9\n")
     with pytest.raises(McaptrackError, match=r"truth\.csv holds 3D boxes, and .*det\.txt does not"):
         mcaptrack.ingest(boxes, tmp_path / "log.mcap", fps=10, truth=table(tmp_path))
+    both = mcaptrack.ingest(table(tmp_path, *LINES[2:], name="b.csv"), tmp_path / "b.mcap", truth=table(tmp_path)).log
+    with log.read(both) as opened:
+        assert opened.metadata(CLOCK) == {"start_ns": str(T0)}  # of the first of all labels
 
 
 def test_frames_of_labels_have_the_stamps_of_recorded_boxes(tmp_path):

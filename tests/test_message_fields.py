@@ -602,8 +602,9 @@ def test_positions_that_may_be_of_anything_are_read_where_their_channel_is_named
         assert list(foreign.uncertain_boxes(opened)) == ["/particles"]
         with choosing("/particles", None, None):
             assert foreign.holds_boxes(opened, "/particles")
-    for topic, class_id in zip(arrays, (0, 1), strict=True):
+    for topic, class_id, source in zip(arrays, (0, 1), ("none", "the name of the channel"), strict=True):
         found, said = read(path, topic)
+        assert found.facts["classes"] == source
         assert found.frames[0].rows["x_m"].tolist() == [0, 1, 2]
         assert set(found.frames[0].rows["class_id"].tolist()) == {class_id}
         assert next(code for code, _ in said) == "fields"

@@ -165,6 +165,15 @@ def test_pictures_of_files_are_bounded(tmp_path, monkeypatch, name):
     assert ingest(path, tmp_path / "a.mcap", options).lost == []
 
 
+def test_videos_that_are_too_large_for_h264_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("mcaptrack.sources.video.limits._H264_PIXELS", 3_000)
+    write_clip(tmp_path / "a.avi", frames=2, codec="mpeg4")
+    with pytest.raises(
+        McaptrackError, match=r"a\.avi has pictures of 64 x 48 pixels, and those of H\.264 have at most"
+    ):
+        ingest(tmp_path / "a.avi", tmp_path / "a.mcap", IngestOptions())
+
+
 @pytest.mark.parametrize("given", ["x", "0", "-1", "1e3", "9" * 20])
 def test_a_limit_that_is_no_number_is_refused(monkeypatch, given):
     monkeypatch.setenv(ENVIRONMENT, given)

@@ -155,12 +155,14 @@ def frames(path: Path, topic: str = TOPIC) -> list[np.ndarray]:
     return [frame.rows for frame in found]
 
 
+#: What a record has of high profiles besides (ISO 14496-15, 5.3.3.1.2): 4:2:0, 9 bits, and no further sets.
+HIGH = {"h264": b"\xfd\xf9\xf9\0", "h265": b""}
 PACKED = {
     "start codes": lambda name, parts: parts,
     "lengths": lambda name, parts: [with_lengths(part) for part in parts],
     "lengths of two bytes": lambda name, parts: [with_lengths(part, 2) for part in parts],
     "a record, then lengths": lambda name, parts: [
-        record(name, parts[0]) + without_sets(name, parts[0]),
+        record(name, parts[0]) + HIGH[name] + without_sets(name, parts[0]),
         *[without_sets(name, part) for part in parts[1:]],
     ],
     "sets, then lengths": lambda name, parts: [with_lengths(parts[0]), *[without_sets(name, p) for p in parts[1:]]],

@@ -139,6 +139,9 @@ def test_averages_are_given_at_the_largest_gate_for_tracks_with_scores():
         mean = np.mean([found["metres", 2.0, one][name] for one in NAMES.values()])
         assert found["metres", 2.0, None][name] == pytest.approx(mean)
     assert 0.3 <= found["bev-iou", 0.3, "car"]["AMOTP"] < 1
+    for one in tracks:
+        one.rows["score"][one.rows["track_id"] == 9] = np.nan  # those without a score count as the least likely
+    assert "AMOTA" in scored(truth, tracks, EvaluateOptions(("metres",), (2.0,)))[0]["metres", 2.0, "car"]
     found, notes = scored(truth, drawn(3, scores=False)[1], EvaluateOptions(("metres",), (2.0,)))
     assert "AMOTA" not in found["metres", 2.0, None]
     assert notes == ["a: /lidar/tracks has no scores; there is no AMOTA and no sAMOTA"]

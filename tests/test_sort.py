@@ -139,7 +139,7 @@ def walking(rng: np.random.Generator, count: int = 45) -> list[Frame]:
     for number in range(count):
         if rng.random() < 0.02:
             period = float(rng.choice([0.033, 0.1]))
-        steps = int(rng.choice([1, 1, 1, 1, 1, 1, 3]))
+        steps = int(rng.choice([1, 1, 1, 1, 1, 2, 3]))
         now += period * (steps + rng.uniform(-0.05, 0.05))
         speed = speed + rng.normal(0, 1, speed.shape)
         place = place + steps * speed

@@ -73,6 +73,12 @@ DIGESTED = [
         (pa.timestamp("ns"), [1, 2, 0], [1, 3, 0], [1, 2, None]),
         (pa.list_(pa.int32()), [[1, 2], [], [3]], [[1], [2], [3]], [[1, 2], None, [3]], [[1, 2], [], [4]]),
         (pa.list_(pa.string()), [["a", "b"], [], []], [["ab"], [], []], [["a", "c"], [], []]),
+        (
+            pa.struct({"x": pa.int8()}),
+            [{"x": 1}, {"x": 2}, {"x": 0}],
+            [{"x": 1}, {"x": 3}, {"x": 0}],
+            [{"x": 1}, {"x": 2}, None],
+        ),
         (pa.dictionary(pa.int8(), pa.string()), ["a", "b", "a"], ["a", "b", "b"], ["a", "b", None]),
         (pa.null(), [None, None, None]),
     ]

@@ -420,6 +420,13 @@ def test_a_car_that_has_just_stopped_may_go_on():
     assert stopped > 3 * stands
 
 
+@pytest.mark.usefixtures("as_predicted")
+def test_a_car_that_hardly_moves_goes_on_from_where_it_is():
+    way_m = last_forecast(3, 0.1, True, predictor="cv")["x_m"] - 0.1 * (STEPS - 1) / 2.5
+    np.testing.assert_allclose(way_m / way_m[0], np.arange(1, len(way_m) + 1), rtol=1e-5)
+    assert way_m[0] < 0.02  # of 4 cm, since it may stand
+
+
 # Ellipses corrected by what they have held, and the noise of positions as far as tracks show it
 
 

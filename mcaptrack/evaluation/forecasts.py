@@ -382,7 +382,7 @@ class SmoothedHistories:
         self._ids: Ints = np.empty(0, np.int64)
         self._history = self._begin(np.empty((0, 2)))
 
-    def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
+    def push(self, ids: Ints, xy_m: Floats, steps: int) -> tuple[Floats, Bools]:
         """Add the positions (N, 2) of the tracks of the next frame; returns pasts (N, L, 2) and what is known (N, L).
 
         Positions are rebuilt backwards from the current one, which stays as it was measured.

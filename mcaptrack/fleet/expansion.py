@@ -219,7 +219,7 @@ def _logs_of(named: str | os.PathLike[str], leave_out: str, read_list: Callable[
         yield from _matching(argument, leave_out)
 
 
-def _logs_in(folder: Path, leave_out: str, *, is_named: bool = False) -> Iterator[NamedLog]:
+def _logs_in(folder: Path, leave_out: str, *, is_named: bool) -> Iterator[NamedLog]:
     """Yield all logs in a folder and below it, in order of their names.
 
     A folder below it that is a recording of another format, or of which the files are listed as parts of one, is left
@@ -261,7 +261,8 @@ def _matching(pattern: Path, leave_out: str | None) -> Iterator[NamedLog]:
     for name in names:
         path = Path(name)
         if leave_out is not None and path.is_dir():
-            yield from (replace(log, below=path.relative_to(fixed) / log.below) for log in _logs_in(path, leave_out))
+            logs = _logs_in(path, leave_out, is_named=False)
+            yield from (replace(log, below=path.relative_to(fixed) / log.below) for log in logs)
         else:
             yield NamedLog(path, path.relative_to(fixed))
 

@@ -24,7 +24,7 @@ class Histories:
     def __post_init__(self) -> None:
         self.xy_m = np.empty((0, self.length, 2))
 
-    def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
+    def push(self, ids: Ints, xy_m: Floats, steps: int) -> tuple[Floats, Bools]:
         """Advance by ``steps`` and add the positions ``xy_m`` (N, 2) of the tracks ``ids`` (N,).
 
         Returns the histories of these tracks, (N, L, 2) with NaN at unknown positions, and which are known, (N, L).

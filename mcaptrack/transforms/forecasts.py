@@ -39,7 +39,7 @@ _CREEP_PER_S: Final = 0.03
 class PastPositions(Protocol):
     """The pasts of tracks, as ``Histories`` keeps them."""
 
-    def push(self, ids: Ints, xy_m: Floats, steps: int = 1) -> tuple[Floats, Bools]:
+    def push(self, ids: Ints, xy_m: Floats, steps: int) -> tuple[Floats, Bools]:
         """Add the next positions; returns the past of each track, and which positions of it are known."""
         ...
 

@@ -155,8 +155,6 @@ class Databases(_Described):
     def extras(self, writer: log.LogWriter, has_clock: bool, is_copied: bool) -> None:
         """Write metadata.yaml and the metadata in the databases, as rosbag2 writes them to MCAP files."""
         super().extras(writer, has_clock, is_copied)
-        if self._distro:
-            writer.add_metadata("mcaptrack.bag", {"file": self.whole.name, "ros_distro": self._distro})
         for database in self._databases:
             if "metadata" in database.columns("metadata"):
                 for (text,) in database.rows("metadata", ["metadata"]):

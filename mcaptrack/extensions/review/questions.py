@@ -168,7 +168,7 @@ def _asked(track: Ints, decided: Ints, tracklets: Sequence[Tracklet], frames: In
 def _following(track: Ints, begins: Ints) -> Ints:
     """Pairs (2, E) of tracklets that follow each other in a track (K,)."""
     order = np.lexsort((begins, track))
-    same = np.flatnonzero((track[order][1:] == track[order][:-1]) & (track[order][1:] >= 0))
+    same = np.flatnonzero(track[order][1:] == track[order][:-1])
     return np.stack([order[same], order[same + 1]])
 
 

@@ -405,7 +405,7 @@ class _Picture(NamedTuple):
     t_ns: int
     image: Image
     to_reference: Floats
-    is_lost: bool = False
+    is_lost: bool
 
 
 def _of_next_view(unknown: Sequence[_Picture], reference: Image) -> list[_Picture]:

@@ -256,6 +256,7 @@ class TestRosbag2:
         assert recorded(tmp_path / "a.mcap") == sorted(said)
         counts = {topic: count for topic, *_, count in channels(tmp_path / "a.mcap")}
         assert [*counts.items()] == [("/talk", 330), ("/image", 110), ("/silent", 0)]
+        assert summary(tmp_path / "a.mcap")[0].profile == "ros2"
         assert report.lost == []
         (tmp_path / "bag" / names[5]).unlink()
         if with_metadata:

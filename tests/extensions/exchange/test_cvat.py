@@ -77,6 +77,7 @@ def test_sizes_of_files_have_limits(read, monkeypatch, tmp_path):
 def test_frames_and_classes_have_limits(read, monkeypatch):
     monkeypatch.setattr(cvat, "_MAX_FRAMES", 5)
     assert len(read(track(box(0), box(5))).id) == 6
+    assert read(track(box(0)), track(box(4))).labelled.tolist() == [0, 1, 2, 3, 4]
     refused(read, "5 boxes would be interpolated; at most 5 are", track(box(0), box(6)))
     assert len(read(track(box(0, more='outside="1"'), box(60))).id) == 1
     monkeypatch.setattr(texts, "MAX_NAMES", 2)

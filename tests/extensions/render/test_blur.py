@@ -223,6 +223,7 @@ def test_videos_that_few_viewers_play_become_h264_and_are_hidden(tmp_path, codec
 def test_pictures_of_a_robot_keep_their_messages_and_cameras_without_boxes_are_named(tmp_path):
     path = tmp_path / "robot.mcap"
     shots = write_log(path, "/front/image", "/rear/image", boxes="/front/boxes")
+    tracks = mcaptrack.track(path, topic="/front/boxes", sidecar=True)
     code, out, err = call("render", path, "--blur", "people", "-o", tmp_path / "out.mcap", "--json")
     assert code == 0, err
     assert json.loads(out)["results"][0]["blurred"] == ["/front/image"]
@@ -230,6 +231,7 @@ def test_pictures_of_a_robot_keep_their_messages_and_cameras_without_boxes_are_n
     before, after = messages(path), messages(tmp_path / "out.mcap")
     for topic in ("/rear/image", "/front/boxes"):
         assert before[topic] == after[topic]
+    assert messages(tracks.written_to)["/front/tracks"] == after["/front/tracks"]
     with (tmp_path / "out.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         found = [m for _, _, _, m in reader.iter_decoded_messages(topics=["/front/image"])]

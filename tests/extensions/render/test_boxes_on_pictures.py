@@ -232,6 +232,16 @@ def test_a_video_of_3d_boxes_is_on_the_pictures_of_a_calibrated_camera_or_from_a
         assert mcaptrack.render(path, tmp_path / "b.mp4", topic=topic, camera="lidar", force=True).views == result.views
     above = mcaptrack.render(path, tmp_path / "c.mp4", topic="/lidar/retracks/view/scene", camera="lidar", end_s=0.1)
     assert (above.pictures, above.views) == (2, ("/lidar/retracks/view/scene",))
+    with log.read(path) as opened, log.extend(opened, tmp_path / "two.mcap") as writer:
+        other = opened.channel(result.views[0])
+        writer.add_channel(
+            "/lidar/retracks/view/image/rear/image",
+            foxglove.schema_record(foxglove.ANNOTATIONS),
+            "protobuf",
+            other.metadata,
+        )
+    two = mcaptrack.render(tmp_path / "two.mcap", tmp_path / "d.mp4", camera="lidar", end_s=0.1)
+    assert (two.views, [one.code for one in two.warnings]) == (result.views, ["chosen-camera"])
 
 
 # People who are hidden

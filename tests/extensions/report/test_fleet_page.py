@@ -179,7 +179,8 @@ def test_the_page_about_tables_links_to_pages_beside_logs(folder, tmp_path):
 def test_what_a_page_about_tables_cannot_do_is_one_line(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words, said in (
-        ([folder / "tables"], "needs a name"),
+        ([folder / "tables"], "all logs of the tables needs a name"),
+        ([folder / "a.mcap", folder / "b.mcap"], "2 logs needs a name"),
         ([folder / "tables", folder / "a.mcap", "-o", "x.html"], "one folder of tables"),
     ):
         outcome = call("report", *words)

@@ -685,7 +685,9 @@ def test_the_page_has_scores_of_classes(tmp_path):
     for role, place in (("tracks", "output"), ("truth", "into")):
         mcaptrack.ingest(tmp_path / "a.csv", role=role, fps=10, **{place: tmp_path / "a.mcap"})
     mcaptrack.report(tmp_path / "a.mcap", tmp_path / "a.html")
-    assert "within 1 m on the ground, cart" in (tmp_path / "a.html").read_text()
+    text = (tmp_path / "a.html").read_text()
+    assert "within 1 m on the ground, cart" in text
+    assert ("Objects over time" in text, "People over time" in text) == (True, False)
 
 
 # The report about people: identities over time, numbers that agree, doubts and intervals
@@ -785,6 +787,8 @@ def test_the_page_has_one_number_of_switches_for_each_kind_of_tracks(told, text)
     assert [int(one.switches.sum()) for one in told.people.values()] == values
     assert f"<dd>{before}\N{NO-BREAK SPACE}→ {after}" in text
     assert all(len(one.events) == count for one, count in zip(told.channel_events, values, strict=True))
+    described = [one.to_json() for one in told.channel_events]
+    assert [len(one["births"]) * one["bin_s"] for one in described] == pytest.approx([59 * 0.4] * len(described))
 
 
 # Identities over time

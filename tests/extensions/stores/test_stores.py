@@ -254,6 +254,10 @@ def test_credentials_come_from_a_profile_and_are_never_shown(store, bare, monkey
     with store.counted() as requests:
         done("info", url)
     assert {request.key_id for request in requests} == {"AKIDROBOTS"}
+    monkeypatch.setenv("AWS_DEFAULT_REGION", "eu-north-1")
+    assert "region" not in objects.store_of(parse(url)).config  # the library reads AWS_REGION
+    monkeypatch.delenv("AWS_REGION")
+    assert objects.store_of(parse(url)).config["region"] == "eu-north-1"
     monkeypatch.setenv("AWS_PROFILE", "default")
     code, _, err = call("info", url)
     assert (code, err.count("\n")) == (1, 1)

@@ -92,6 +92,11 @@ class TestWindows:
         assert np.all(out.past[:, -1] == 0)
         same = np.isclose(out.future[:, -1], crowd.future[:, -1] - crowd.past[:, -1], atol=1e-3).all(axis=1)
         assert same.mean() < 0.05
+        bends = [
+            np.linalg.det(np.stack([one.past[:, -1] - one.past[:, 0], one.future[:, -1] - one.past[:, -1]], 1))
+            for one in (crowd, out)
+        ]
+        assert 0.3 < (np.sign(bends[0]) != np.sign(bends[1])).mean() < 0.7  # mirrored
         larger = Corruption(scale=0.2)(crowd, np.random.default_rng(1)).future[:, -1]
         ratio = np.linalg.norm(larger, axis=1) / np.linalg.norm(out.future[:, -1], axis=1)
         assert np.exp(-0.2) <= ratio.min() < 0.85
@@ -222,6 +227,7 @@ class TestRecipes:
         rates = [RED.rate_at(step, 10) for step in range(RED.epochs * 10)]
         assert max(rates) == pytest.approx(RED.rate_at(RED.epochs, 10)) == pytest.approx(RED.rate)
         assert (np.diff(rates[1:21]) > 0).all()
+        assert RED.rate_at(RED.epochs // 2, 10) == pytest.approx(RED.rate / 2)  # halfway through the first tenth
         assert (np.diff(rates[20:]) <= 0).all()
 
     def test_the_paper_compares_displacements_alone(self):

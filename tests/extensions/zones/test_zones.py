@@ -353,6 +353,12 @@ class TestFiles:
             ("pixels", "a", 2),
         ]
 
+    def test_zones_have_a_limit(self):
+        squares = [feature(None, "Polygon", [SQUARE])] * 501
+        assert len(parse_zones(collection(*squares[1:]))) == 500
+        with pytest.raises(McaptrackError, match="it holds 501 features; at most 500 zones and lines are counted"):
+            parse_zones(collection(*squares))
+
     def test_made_names_are_not_those_of_others_and_a_reference_system_is_said(self):
         content = collection(feature("zone 2", "Polygon", [SQUARE]), feature(None, "Polygon", [SQUARE]), crs={})
         with notices.collected() as said:
