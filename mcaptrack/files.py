@@ -390,7 +390,7 @@ def refuse_overwrite(path: Path, force: bool) -> None:
     """Raise McaptrackError if ``path`` can't be written to, or exists and ``force`` is not given."""
     if path.is_dir():
         raise McaptrackError(f"{path} is a folder; give the name of a file")
-    if not path.parent.is_dir():
-        raise McaptrackError(f"the folder {missing(path.parent)}")
+    if not (folder := path.parent).is_dir():
+        raise McaptrackError(f"{folder} is a file, no folder" if folder.exists() else f"the folder {missing(folder)}")
     if path.exists() and not force:
         raise McaptrackError(f"{path} exists; give another name with `output=`, or `force=True` to replace it")

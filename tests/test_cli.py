@@ -83,6 +83,7 @@ class TestErrors:
         "ingest clip.mp4 --truth bad.txt -o x.mcap": "bad.txt:2: not MOTChallenge",
         "ingest clip.mp4 -o a.mcap": "a.mcap exists; give another name with -o, or --force",
         "ingest clip.mp4 -o no/x.mcap": "the folder no does not exist",
+        "ingest clip.mp4 -o good.txt/x.mcap": "good.txt is a file, no folder",
         "ingest clip.mp4 -o clip.mp4 --force": "clip.mp4 is both input and output",
         "run a.mcap -o a.mcap --force": "a.mcap is both input and output",
         "run text.mp4": "text.mp4 can't be read as an MCAP file",

@@ -21,7 +21,8 @@ class Datumaro(PictureFormat):
     def pictures(self, file: LabelFile) -> Iterator[LabelledPicture]:
         """The pictures of a file."""
         content = file.json
-        labels = [entry["name"] for entry in content["categories"].get("label", {}).get("labels", [])]
+        entries = content["categories"].get("label", {}).get("labels", [])
+        labels = {f"label_id {number}": entry["name"] for number, entry in enumerate(entries)}
         for item in content["items"]:
             height, width = (item.get("image") or {}).get("size") or (None, None)
             picture = LabelledPicture(str(item["id"]), [], (width, height) if width else None)
@@ -34,6 +35,6 @@ class Datumaro(PictureFormat):
                 else:
                     picture.other[str(each["type"])] += 1
                     continue
-                label = None if number is None else labels[number]
+                label = None if number is None else labels[f"label_id {number}"]
                 picture.shapes.append(LabelledShape(box, label, more.get("score"), more.get("track_id")))
             yield picture

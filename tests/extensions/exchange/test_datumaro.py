@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from tests.label_cases import Row, Writer, as_json, by_frame
+import pytest
+
+from tests.label_cases import Row, Writer, as_json, by_frame, refused
 
 
 def datumaro(rows: Sequence[Row]) -> Any:
@@ -22,3 +24,10 @@ def datumaro(rows: Sequence[Row]) -> Any:
 WRITERS = {
     "datumaro": Writer(as_json(datumaro), size=True, first="listed"),
 }
+
+
+@pytest.mark.parametrize("number", [-1, 1, 2**63])
+def test_a_label_that_the_file_does_not_list_is_named(tmp_path, number):
+    content = datumaro([Row()])
+    content["items"][0]["annotations"][0]["label_id"] = number
+    assert refused(tmp_path, content).endswith(f": no 'label_id {number}'")
