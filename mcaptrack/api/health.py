@@ -402,15 +402,13 @@ def _plugins() -> dict[str, str]:
 
 def _parts() -> dict[str, str]:
     """Return the lines of extensions and packages, by their headings; warn of those that can't say theirs."""
-    from mcaptrack.registry import blamed, find, names, of_type
+    from mcaptrack.registry import answer_of, find, names
 
     lines: dict[str, str] = {}
     for name in names("doctor_line"):
         try:
             entry = find("doctor_line", name)
-            with blamed(entry, "failed"):
-                own = entry.cls()
-            lines |= of_type(entry, own, dict, "it")
+            lines |= answer_of(entry, dict, "it", entry.cls)
         except McaptrackError as error:
             warn(str(error), "other")
     return {str(heading): str(text) for heading, text in lines.items()}

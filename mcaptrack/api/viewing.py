@@ -25,7 +25,7 @@ from mcaptrack.geometry.clocks import NS_PER_S
 from mcaptrack.installed import missing_extension
 from mcaptrack.notices import Notice, collected, warn
 from mcaptrack.pipeline import LAYOUTS, attachment_of, layout_path, with_views
-from mcaptrack.registry import BUILT_IN, Entry, Kind, blamed, find, names, of_type, others
+from mcaptrack.registry import BUILT_IN, Kind, answer_of, blamed, find, names, of_type, others
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.tables import export
 from mcaptrack.viewing import links
@@ -103,18 +103,15 @@ def _parts(kind: Kind) -> dict[str, Any]:
                 gave = entry.cls()
             part: Any = of_type(entry, gave, LogPage if kind == "page" else WebViewer, "its function")
             parts[name] = part._replace(
-                **{each: partial(_given, entry, each, getattr(part, each)) for each in _GIVEN if hasattr(part, each)}
+                **{
+                    each: partial(answer_of, entry, _GIVEN[each], each, getattr(part, each))
+                    for each in _GIVEN
+                    if hasattr(part, each)
+                }
             )
         except McaptrackError as error:
             warn(str(error), "left-out")
     return {name: part for name, part in parts.items() if re.fullmatch(r"\w[\w-]*", name)}
-
-
-def _given(entry: Entry, name: str, function: Callable[[Any], Any], argument: Any) -> Any:
-    """Return what a function of a part gives."""
-    with blamed(entry, "failed"):
-        gave = function(argument)
-    return of_type(entry, gave, _GIVEN[name], name)
 
 
 def _why_not(viewer: WebViewer, opened: logs.Log) -> str:
@@ -218,11 +215,9 @@ class LogServer:
         pages = {}
         for number, (_, camera, is_above) in enumerate(contents.views):
             entry, maker = log_player()
-            with blamed(entry, "failed"):
-                gave = maker.page(camera, is_above)
-            player = of_type(entry, gave, LogPage, "page")
+            player = answer_of(entry, LogPage, "page", maker.page, camera, is_above)
             pages[f"{_FOLDER}/player-{number}.html"] = Page(
-                made(partial(_given, entry, "make", player.make)), player.policy
+                made(partial(answer_of, entry, _GIVEN["make"], "make", player.make)), player.policy
             )
         for name, page in contents.pages.items():
             pages[f"{_FOLDER}/{name}.html"] = Page(made(page.make), page.policy)

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
@@ -395,6 +395,13 @@ def of_type(entry: Entry, value: Any, wanted: type[T], function: str) -> T:
         gave, kind = type(value).__name__, wanted.__name__
         raise McaptrackError(f"{entry} gave {_a(gave)} {gave}; {function} has to give {_a(kind)} {kind}")
     return value
+
+
+def answer_of(entry: Entry, wanted: type[T], name: str, function: Callable[..., Any], *arguments: object) -> T:
+    """Return what a function of an entry, ``name``, gives. Raises McaptrackError if it fails, or gives another type."""
+    with blamed(entry, "failed"):
+        gave = function(*arguments)
+    return of_type(entry, gave, wanted, name)
 
 
 def is_interruption(error: BaseException) -> bool:

@@ -41,7 +41,7 @@ from mcaptrack.sources.ingest.labels.reading import read_by
 from mcaptrack.sources.ingest.labels.roles import WantedClasses
 from mcaptrack.sources.ingest.labels.table import COLUMNS, Asked
 from mcaptrack.sources.ingest.recording import RecordingOfPackage, compare_counts
-from mcaptrack.testing.transforms import LawError, law, present, same_process
+from mcaptrack.testing.transforms import LawError, content_of, law, same_process, unchanged
 
 #: What a label format may raise for a file that isn't of it.
 _REFUSALS: Final = (McaptrackError, ValueError)
@@ -103,9 +103,7 @@ def check_label_format(label_format: LabelFormat | Format, path: PathLike) -> No
     >>> check_label_format(Corners(), "a.corners")
     """
     made, name = _made_format(label_format)
-    file = present(path)
-    with same_process(name), TemporaryDirectory() as folder:
-        before = _content(file)
+    with same_process(name), unchanged(path, "its file") as file, TemporaryDirectory() as folder:
         with law("conforms"):
             boxes = _labels(made, file)
         others = []
@@ -126,8 +124,6 @@ def check_label_format(label_format: LabelFormat | Format, path: PathLike) -> No
             raise LawError(f"recognises: it doesn't recognise {file}")
         if takes_any:
             raise LawError(f"recognises: it takes a file of noise, {other.name}, for one of its own")
-        if _content(file) != before:
-            raise LawError("pure: it changes its file")
 
 
 def _made_format(label_format: LabelFormat | Format) -> tuple[Format, str]:
@@ -267,9 +263,7 @@ def check_recording_format(recording_format: RecordingFormat, path: PathLike) ->
     """
     entry = object_entry("recording", recording_format, "open")
     object_entry("recording", recording_format, "recognises")
-    file = present(path)
-    with same_process(entry.name), TemporaryDirectory() as folder:
-        before = _content(file)
+    with same_process(entry.name), unchanged(path, "its file") as file, TemporaryDirectory() as folder:
         _check_description(entry, recording_format, file)
         with law("conforms"):
             first = _messages(entry, recording_format, file)
@@ -285,8 +279,6 @@ def check_recording_format(recording_format: RecordingFormat, path: PathLike) ->
             if _messages(entry, recording_format, file) != first:
                 raise LawError("pure: the same recording gives other messages when it is read again")
         _check_description(entry, recording_format, file)
-        if _content(file) != before:
-            raise LawError("pure: it changes its file")
 
 
 def _check_description(entry: Entry, recording_format: RecordingFormat, path: Path) -> None:
@@ -352,7 +344,6 @@ def check_exporter(
     entry = object_entry("exporter", exporter, "write")
     with law("declares"):
         by = exporter_for(entry, exporter)
-    source = present(log)
 
     def written(path: Path, file: Path) -> tuple[dict[str, int], Any]:
         file.parent.mkdir()
@@ -360,10 +351,9 @@ def check_exporter(
             rows = write_by(by, recording, file, {"topic": topic} if topic else {})
         if beside := [other.name for other in file.parent.iterdir() if other != file]:
             raise LawError(f"conforms: it writes {beside[0]}, too; it has to write the path that it gets alone")
-        return rows, _content(file)
+        return rows, content_of(file)
 
-    with same_process(entry.name), TemporaryDirectory() as folder:
-        before = _content(source)
+    with same_process(entry.name), unchanged(log, "the log") as source, TemporaryDirectory() as folder:
         places = [Path(folder, name, f"{name}{by.end}") for name in ("a", "other", "empty")]
         with law("conforms"):
             first, again = (written(source, place) for place in places[:2])
@@ -371,8 +361,6 @@ def check_exporter(
             raise LawError("pure: the same log gives other bytes when it is written again, under another name")
         if label_format is not None:
             _check_read_again(label_format, places[0], source, topic)
-        if _content(source) != before:
-            raise LawError("pure: it changes the log")
         with open_log(Path(folder, "empty.mcap"), create=True) as empty:
             places[2].parent.mkdir()
             try:
@@ -414,10 +402,3 @@ def object_entry(kind: Kind, made: Any, method: str) -> Entry:
     if not callable(getattr(made, method, None)):
         raise LawError(f"declares: {cls.__name__} has no method {method}, so it is no {in_words(kind)}")
     return Entry(cls.__name__, kind, cls, cls.__module__, "", "")
-
-
-def _content(path: Path) -> Any:
-    """All bytes of a file or folder."""
-    if path.is_dir():
-        return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
-    return path.read_bytes()

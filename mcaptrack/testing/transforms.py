@@ -54,6 +54,25 @@ def present(path: PathLike) -> Path:
     return file.absolute()
 
 
+@contextmanager
+def unchanged(path: PathLike, what: str) -> Iterator[Path]:
+    """Check that this block leaves a file or folder, ``what``, as it was; gives its absolute path."""
+    file = present(path)
+    before = content_of(file)
+    try:
+        yield file
+    finally:
+        if content_of(file) != before:
+            raise LawError(f"pure: it changes {what}")
+
+
+def content_of(path: Path) -> Any:
+    """All bytes of a file or folder."""
+    if path.is_dir():
+        return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+    return path.read_bytes()
+
+
 def check_transform(transform: Transform, frames: Sequence[Frame] | None = None, *, seed: int = 0) -> None:
     """Check a transform against the laws that hold for every transform.
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeVar
 from urllib.parse import unquote_plus
 
@@ -19,11 +18,11 @@ from mcaptrack.api.options import PathLike, no_progress
 from mcaptrack.errors import McaptrackError
 from mcaptrack.geometry.arrays import Image
 from mcaptrack.geometry.clocks import NS_PER_S
-from mcaptrack.registry import Entry, blamed, of_type
+from mcaptrack.registry import Entry, answer_of, blamed
 from mcaptrack.sources.cameras import cameras
 from mcaptrack.testing.formats import object_entry
-from mcaptrack.testing.functions import function_entry
-from mcaptrack.testing.transforms import LawError, law, present, same_process
+from mcaptrack.testing.functions import function_entry, without_channels
+from mcaptrack.testing.transforms import LawError, law, same_process, unchanged
 from mcaptrack.viewing.serving import AS_MANY_AS_FIT, LogPage, WebViewer
 
 T = TypeVar("T")
@@ -127,8 +126,8 @@ def check_page(function: Callable[[], LogPage], log: PathLike) -> None:
     >>> check_page(lambda: LogPage(lambda opened: b"<p>" + opened.path.name.encode(), policy()), "log.mcap")
     """
     entry = function_entry("page", function)
-    with _unchanged(entry, log) as path:
-        page = _given(entry, LogPage, "its function", function)
+    with _on_log(entry, log) as path:
+        page = answer_of(entry, LogPage, "its function", function)
         _check_page(entry, page, path)
         _check_without_channels(entry, page.make)
 
@@ -178,7 +177,7 @@ def check_player(player: Any, log: PathLike) -> None:
         has_bundle = hasattr(shown, "_repr_mimebundle_")
         return bytes((shown._repr_mimebundle_()["text/html"] if has_bundle else shown._repr_html_()).encode())
 
-    with _unchanged(entry, log) as path:
+    with _on_log(entry, log) as path:
         with logs.read(path) as opened:
             middle_s = (opened.end_ns - opened.start_ns) / NS_PER_S / 2
             views = [(camera.prefix, False) for camera in cameras(opened)]
@@ -190,7 +189,7 @@ def check_player(player: Any, log: PathLike) -> None:
             if first != again:
                 raise LawError("pure: the same log is shown in another way when it is shown again")
         for view in views:
-            _check_page(entry, _given(entry, LogPage, "page", player.page, *view), path)
+            _check_page(entry, answer_of(entry, LogPage, "page", player.page, *view), path)
         _check_without_channels(entry, html)
 
 
@@ -225,15 +224,15 @@ def check_viewer(function: Callable[[], WebViewer], log: PathLike) -> None:
     >>> check_viewer(topics, "log.mcap")
     """
     entry = function_entry("viewer", function)
-    with _unchanged(entry, log) as path:
-        viewer = _given(entry, WebViewer, "its function", function)
+    with _on_log(entry, log) as path:
+        viewer = answer_of(entry, WebViewer, "its function", function)
         if not (isinstance(viewer.end, str) and re.fullmatch(r"\.[\w.-]+", viewer.end)):
             raise LawError(f"declares: its end is {viewer.end!r:.40}; it is the end of a name, as in '.rrd'")
         with logs.read(path) as opened:
-            if why := _given(entry, str, "why_not", viewer.why_not, opened):
+            if why := answer_of(entry, str, "why_not", viewer.why_not, opened):
                 raise LawError(f"conforms: it makes no file of this log: {why}")
         _made_of(entry, viewer.make, path)
-        link = _given(entry, str, "link", viewer.link, _ADDRESS)
+        link = answer_of(entry, str, "link", viewer.link, _ADDRESS)
         if not re.match("https?://", link) or _ADDRESS not in unquote_plus(link) or "b&c" in link:
             raise LawError(
                 f"conforms: its link to {_ADDRESS!r} is {link!r}; it has the address, escaped as by urlencode"
@@ -242,34 +241,19 @@ def check_viewer(function: Callable[[], WebViewer], log: PathLike) -> None:
 
 
 @contextmanager
-def _unchanged(entry: Entry, log: PathLike) -> Iterator[Path]:
+def _on_log(entry: Entry, log: PathLike) -> Iterator[Path]:
     """Check that this block leaves a log and the process as they were; a McaptrackError in it is a LawError."""
-    path = present(log)
-    before = path.read_bytes()
-    try:
-        with same_process(entry.name), law("conforms"):
-            yield path
-    finally:
-        if path.read_bytes() != before:
-            raise LawError("pure: it changes the log")
-
-
-def _given(entry: Entry, wanted: type[T], name: str, function: Callable[..., Any], *arguments: object) -> T:
-    """The answer of a function of a part. Raises McaptrackError if it fails, or gives another type."""
-    with blamed(entry, "failed"):
-        gave = function(*arguments)
-    return of_type(entry, gave, wanted, name)
+    with unchanged(log, "the log") as path, same_process(entry.name), law("conforms"):
+        yield path
 
 
 def _made_of(entry: Entry, make: Callable[[logs.Log], bytes], path: Path) -> bytes:
     with logs.read(path) as opened:
-        return _given(entry, bytes, "make", make, opened)
+        return answer_of(entry, bytes, "make", make, opened)
 
 
 def _check_without_channels(entry: Entry, make: Callable[[logs.Log], bytes]) -> None:
-    with TemporaryDirectory() as folder:
-        with logs.create(empty := Path(folder, "empty.mcap")):
-            pass
+    with without_channels() as empty:
         try:
             _made_of(entry, make, empty)
         except McaptrackError as error:
